@@ -24,7 +24,8 @@ from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.evaluate import lifecycle
 from harness.evaluate import run as evaluation
-from harness.studies import repeats, study
+from harness.report.drawing import pictures
+from harness.studies import repeats
 
 RUN, DRIVEN, SEEDS = "run", "driven", ("--seeds", "0:4")
 POINTS = ("--condition", "single-local", "--condition", "6g")
@@ -157,5 +158,5 @@ def stands_still() -> Iterator[None]:
         patch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
         patch.setattr(lifecycle, "datetime", Then)
         patch.setattr(repeats, "open_backend", opens)
-        patch.setattr(study, "FORMATS", ("svg",))  # the pictures of a study take longer than all else
+        patch.setattr(pictures, "FORMATS", ("svg",))  # the pictures of a study take longer than all else
         yield

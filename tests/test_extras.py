@@ -11,7 +11,7 @@ import pytest
 from harness.core.extras import OPTIONAL
 
 ROOT = Path(__file__).parent.parent
-# Each command line in turn, in one process that finds none of these packages.
+# A process that finds none of these packages.
 BARE = """
 import sys
 from importlib.machinery import PathFinder
@@ -24,6 +24,9 @@ class Bare(PathFinder):
         return None if name in hidden.split() else super().find_spec(name, *place)
 
 sys.meta_path = [Bare if finder is PathFinder else finder for finder in sys.meta_path]
+"""
+# Each command line in turn.
+TYPED = """
 from harness.cli import main
 for line in lines:
     sys.argv = ["harness", *line.split()]
@@ -34,12 +37,28 @@ for line in lines:
 """
 
 
-def bare(folder: Path, *lines: str) -> str:
-    """What these commands say on stderr where no optional package is installed."""
+FROM_PYTHON = """
+import harness
+
+run = harness.run(model="proxy", limit=1, seeds="0", out="a", quiet=True)
+tables = harness.load("a")
+assert len(tables.episodes) == 3 and len(tables.agents) == 0 and len(tables.answers) > 3
+assert list(harness.ls(".").name) == ["a"]
+for shown in (tables, harness.compare(run, "a"), harness.sweep(run, "loss", "0,0.4", quiet=True)):
+    assert shown._repr_html_()
+try:
+    harness.environment()
+except harness.UserError as error:
+    print(error, file=sys.stderr)
+"""
+
+
+def bare(folder: Path, *lines: str, script: str = TYPED) -> str:
+    """What these commands, or a script, say on stderr where no optional package is installed."""
     blocked = " ".join({*OPTIONAL, "gymnasium", "pygame"})
-    done = subprocess.run(
-        [sys.executable, "-c", BARE, blocked, *lines], cwd=folder, capture_output=True, text=True, check=True
-    )
+    python = [sys.executable, "-c", BARE + script, blocked, *lines]
+    done = subprocess.run(python, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     return done.stderr
 
 
@@ -78,7 +97,6 @@ NEEDS = {
     "dataset scenario drive occluded-intersection": ("highway-env", "sim"),
     "dataset build occluded-intersection --episodes 1 --out built": ("highway-env", "sim"),
     "dataset show occluded-intersection-v2 00000-0 --out scene.svg": ("matplotlib", "report"),
-    "study paper --out paper": ("matplotlib", "report"),
     "eval --model swarm-tiny": ("llama-cpp-python", "llama-cpp"),
     "model distill do-not-pass --out student": ("torch", "transformers"),
 }
@@ -93,6 +111,56 @@ def test_what_needs_an_extra_says_in_one_line_which(tmp_path: Path) -> None:
         assert needs.endswith(f" needs {package}, which is not installed; run `{install}`"), line
         assert ended == "exit 2", line
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_python_needs_no_extra_for_what_the_commands_need_none_for(tmp_path: Path) -> None:
+    said = bare(tmp_path, script=FROM_PYTHON)
+    needs = "an environment needs highway-env, which is not installed"
+    assert said == f"{needs}; run `pip install 'swarmdrive-harness[sim]'`\n"
+
+
+SWEEP = "study sweep a --over loss --grid 0,0.4 --seeds 0"
+NO_FIGURES = (
+    "harness: drawing figures needs matplotlib, which is not installed; "
+    "run `pip install 'swarmdrive-harness[report]'`\n"
+)
+
+
+@pytest.mark.slow
+def test_a_study_without_matplotlib_has_its_tables_and_page_and_says_what_figures_need(
+    tmp_path: Path,
+) -> None:
+    ask = "eval --model proxy --limit 1 --seeds 0 --quiet --out a"
+    lines = (ask, f"{SWEEP} --out swept", f"{SWEEP} --out silent --quiet", f"{SWEEP} --out told --json")
+    said = bare(tmp_path, *lines)
+    assert said == f"exit 0\n{NO_FIGURES}exit 0\nexit 0\n{NO_FIGURES}exit 0\n"
+    files = {"conditions.csv", "conditions.jsonl", "episodes.csv", "episodes.jsonl"}
+    for study in ("swept", "silent", "told"):
+        assert {file.name for file in (tmp_path / study).iterdir()} == {*files, "index.html", "sweep.json"}
+    assert "<img" not in (tmp_path / "swept/index.html").read_text()
+
+
+STUDIES = {  # what draws besides, and where it writes by itself
+    "study contents a --condition 6g --over loss --grid 0,0.4": "a/contents",
+    "study schedule compare a --out s --schedule always": "s",
+    "study trust a": "a/trust",
+    "study twins --model proxy --limit 2 --out t": "t",
+    "study grid --model proxy --prompt v2,v3 --limit 2 --out g": "g",
+    "study sweep a --over loss --over tau --grid 0,0.4 --grid 0.5,0.7 --out m": "m",
+    "study paper --out paper": "paper",
+}
+
+
+@pytest.mark.exhaustive
+def test_every_study_ends_well_without_matplotlib(tmp_path: Path) -> None:
+    said = bare(tmp_path, "eval --model proxy --limit 2 --quiet --out a", *STUDIES)
+    assert re.findall(r"^exit (\S+)", said, re.MULTILINE) == ["0"] * (1 + len(STUDIES)), said
+    assert said.count(NO_FIGURES) == len(STUDIES)
+    for folder in STUDIES.values():
+        assert (tmp_path / folder / "index.html").is_file()
+        assert list((tmp_path / folder).glob("*.json")), "its manifest"
+        assert not list((tmp_path / folder).glob("*.svg"))
 
 
 @pytest.mark.slow

@@ -50,12 +50,10 @@ def command(
     Each is played at every point from stored answers. The model is asked only where the runs have no answer.
     If the study is stopped, the same command continues it.
     """
-    from harness.core import extras
     from harness.studies.contents import asked_at_most, folders, models, panels_of, run_contents
     from harness.studies.contents_page import contents_study
     from harness.studies.replayed_run import ReplayedRun
 
-    extras.need("harness study contents", "matplotlib")
     with bar("points", quiet=as_json or quiet or dry_run, grows=True) as progress:
         own = options.cards(model)
         given = [

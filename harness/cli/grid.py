@@ -12,7 +12,6 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
 from harness.cli.show import finish
-from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.evaluate.settings import FrozenSettings, Settings, changed
 
@@ -47,7 +46,6 @@ def command(
     from harness.studies.grid import grid_study, run_cells
     from harness.studies.study import refuse_taken
 
-    extras.need("harness study grid", "matplotlib")
     world: Any = settings.world
     source = resolve.frozen(world, world.dataset)
     frozen = source.dataset

@@ -82,7 +82,7 @@ def command(
     from harness.studies.optimize.layouts import built, counted, given, only_for
     from harness.studies.optimize.search import Search, choices, search
 
-    extras.need("harness prompt optimize", "matplotlib", *(() if tune else ("highway_env",)))
+    extras.need("harness prompt optimize", *(() if tune else ("highway_env",)))
     extras.need("--reflect", *(("gepa",) if reflect else ()))
     settings = structs.replace(settings, condition=settings.condition or (CONDITION,))
     names = suites.datasets(settings.world.dataset)  # type: ignore[union-attr]

@@ -9,7 +9,6 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
-from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
 from harness.evaluate.settings import parse_seeds
 
@@ -91,7 +90,6 @@ def compare(
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.schedules import run_schedules, schedule_study
 
-    extras.need("harness study schedule compare", "matplotlib")
     names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:
         if name not in SCHEDULES:

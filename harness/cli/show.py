@@ -19,9 +19,11 @@ CELL = 80
 
 def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False) -> None:
     """Write a study, and print it as JSON or as text, unless `quiet`."""
-    from harness.studies.study import write_study
+    from harness.studies.study import undrawn, write_study
 
     page = write_study(study, out)
+    if (error := undrawn(study)) and not quiet:
+        typer.echo(f"harness: {error}", err=True)
     if as_json:
         echo_answer(study)
     elif not quiet:

@@ -19,14 +19,13 @@ from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import ClosedLoop, Score
 from harness.studies.axes import AXES, CORE, Setting, described, grid
-from harness.studies.figures.bars import operating_points
-from harness.studies.figures.lines import along
 from harness.studies.play import ENDS, PER_DECISION
 from harness.studies.study import Study
 from harness.studies.sweep import in_a_sentence, tables
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 SHOWN = (*ENDS, *PER_DECISION)
 VEHICLES = 4  # the ego and the scenario's three helpers
@@ -75,8 +74,15 @@ def run_closed_loop(
             "conditions.csv has all figures with their n, and run/ the driven episodes."
         ],
         shown, {"conditions": summary}, {"run": RUN, "panels": described(grids), "versions": m.versions},
-        summary, {"figure-a": operating_points(core), "figure-b": along(sweeps)},
+        summary, lambda: _figures(core, sweeps),
     )  # fmt: skip
+
+
+def _figures(core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]") -> "dict[str, Figure]":
+    from harness.studies.figures.bars import operating_points
+    from harness.studies.figures.lines import along
+
+    return {"figure-a": operating_points(core), "figure-b": along(sweeps)}
 
 
 def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":

@@ -31,13 +31,14 @@ from harness.studies.contents import (
     manifest_of,
     place,
 )
-from harness.studies.figures.lines import along
-from harness.studies.figures.points import Steps, fronts
 from harness.studies.ledger import paper_numbers
 from harness.studies.study import Study, p_cell, percent
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+
+    from harness.studies.figures.points import Steps
 
 BESIDE = 3  # panels of a figure
 SPENDING = ("tau_nats", "max_helpers")  # axes that vary the bits
@@ -48,13 +49,7 @@ PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size"
 def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
     """Declare the study of what some models' runs came to."""
     manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
-    points, by_group, figures = points_table(results), groups_table(results), {}
-    for n, result in enumerate(results, 1):
-        figures[f"cost-{n}"] = fronts(list(_costs(result)), result.words)
-        curves, colours = _curves(result), dict(zip(result.model.contents, cycle(COLOURS)))
-        for first in range(0, len(curves), BESIDE):
-            beside = curves[first : first + BESIDE]
-            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside), colours)
+    points, by_group = points_table(results), groups_table(results)
     runs = [run for result in results for run in result.model.runs.values()]
     lags_s = sorted({run.dataset.scenario.parameters.decision_lag_s for run in runs})
     return Study(
@@ -77,9 +72,24 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
             "plain success.",
         ],
         [table for result in results for table in _tables(result, by_group)],
-        {"points": points, "groups": by_group}, {**manifest, "versions": versions()}, points, figures,
+        {"points": points, "groups": by_group}, {**manifest, "versions": versions()}, points,
+        lambda: _figures(results),
         [*_left_out(results), *(caveat for run in runs for caveat in run.caveats)],
     )  # fmt: skip
+
+
+def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
+    from harness.studies.figures.lines import along
+    from harness.studies.figures.points import fronts
+
+    figures = {}
+    for n, result in enumerate(results, 1):
+        figures[f"cost-{n}"] = fronts(list(_costs(result)), result.words)
+        curves, colours = _curves(result), dict(zip(result.model.contents, cycle(COLOURS)))
+        for first in range(0, len(curves), BESIDE):
+            beside = curves[first : first + BESIDE]
+            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside), colours)
+    return figures
 
 
 def headline(result: Result) -> list[str]:
@@ -273,8 +283,10 @@ def _by_group(result: Result, rows: "pd.DataFrame") -> Table:
     return Table(title, heads, cells, "Episodes of all families together; n is their number.")
 
 
-def _costs(result: Result) -> Iterator[tuple[str, str, list[Steps]]]:
+def _costs(result: Result) -> "Iterator[tuple[str, str, list[Steps]]]":
     """Yield success against bits, and against age, of all points, a front a content."""
+    from harness.studies.figures.points import Steps
+
     costs = (("bits of an episode, kbit", _kbit), ("age when the ego acts, ms", _age))
     for title, cost in costs:
         steps = []

@@ -26,6 +26,7 @@ from harness.world.drivers import DRIVERS
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
     from harness.studies.study import Study
 
@@ -148,7 +149,6 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
 
 def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
     """Declare the study of a comparison."""
-    from harness.studies.figures.points import scatter
     from harness.studies.study import Study, percent
 
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
@@ -178,8 +178,14 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
         ],
         {"fidelity": result.table, "episodes": result.episodes},
         {"sources": [{"name": str(run)} for run in runs], "versions": versions()}, result.table,
-        {"fidelity": scatter(result.table, [_who(row) for row in rows])},
+        lambda: {"fidelity": _scatter(result)},
     )  # fmt: skip
+
+
+def _scatter(result: Fidelity) -> "Figure":
+    from harness.studies.figures.points import scatter
+
+    return scatter(result.table, [_who(row) for row in result.table.to_dict("records")])
 
 
 def headline(result: Fidelity) -> list[str]:

@@ -35,12 +35,11 @@ from harness.runs.leading import lead_of
 from harness.runs.metrics import LATENCY, METRICS, SUCCESS, by_episode, mean_by_place, over_episodes
 from harness.runs.records import Answer
 from harness.runs.success import Success
-from harness.studies.figures.heat_map import heat_map
-from harness.studies.figures.points import Steps, fronts
 from harness.studies.study import Study, corrected, ends, p_cell
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 RESAMPLES = 4000
 FIELDS = ("model", "prompt", "answer")
@@ -291,22 +290,7 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
     """Declare the study of a grid in its folder."""
     data, episodes = tables(grid), grid.cells[0].run.grid.episodes
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
-    last, colours = grid.conditions[-1], conditions(grid.conditions)
-    rates = {c: [100 * grid.success(cell, c).value for cell in grid.cells] for c in grid.conditions}
-    steps = []
-    for c, colour in colours.items():
-        best = front(grid, c)
-        look: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
-        steps += [
-            Steps(
-                c, [cell.estimate(LATENCY, c).value for cell in grid.cells], rates[c],
-                look | {"linestyle": ""},
-            ),
-            Steps(
-                "", [cell.estimate(LATENCY, c).value for cell in best],
-                [100 * grid.success(cell, c).value for cell in best], look, pair(grid, best[-1]),
-            ),
-        ]  # fmt: skip
+    last = grid.conditions[-1]
     return Study(
         "grid", f"{grid.rows} egos × {grid.columns} helpers on {spec.source.name}", headline(grid),
         [
@@ -330,16 +314,38 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
             "dataset": spec.source.name, "conditions": list(grid.conditions), "seeds": list(spec.seeds),
             "versions": versions(),
         },
-        data,
-        {
-            "heat-map": heat_map(
-                {c: np.array(rates[c]).reshape(grid.rows, grid.columns) for c in grid.conditions},
-                [grid.name(grid.cells[i * grid.columns].ego, "ego") for i in range(grid.rows)],
-                [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]], "ego", "helpers",
-            ),
-            "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
-        },
+        data, lambda: _figures(grid),
     )  # fmt: skip
+
+
+def _figures(grid: Grid) -> "dict[str, Figure]":
+    """Draw success of every combination, and against its latency, where the best are joined."""
+    from harness.studies.figures.heat_map import heat_map
+    from harness.studies.figures.points import Steps, fronts
+
+    rates = {c: [100 * grid.success(cell, c).value for cell in grid.cells] for c in grid.conditions}
+    steps = []
+    for c, colour in conditions(grid.conditions).items():
+        best = front(grid, c)
+        look: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
+        steps += [
+            Steps(
+                c, [cell.estimate(LATENCY, c).value for cell in grid.cells], rates[c],
+                look | {"linestyle": ""},
+            ),
+            Steps(
+                "", [cell.estimate(LATENCY, c).value for cell in best],
+                [100 * grid.success(cell, c).value for cell in best], look, pair(grid, best[-1]),
+            ),
+        ]  # fmt: skip
+    return {
+        "heat-map": heat_map(
+            {c: np.array(rates[c]).reshape(grid.rows, grid.columns) for c in grid.conditions},
+            [grid.name(grid.cells[i * grid.columns].ego, "ego") for i in range(grid.rows)],
+            [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]], "ego", "helpers",
+        ),
+        "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
+    }  # fmt: skip
 
 
 def headline(grid: Grid) -> list[str]:

@@ -9,14 +9,13 @@ from harness.core.versions import versions
 from harness.report.document import Table
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
 from harness.studies.calibrated import Calibrated
-from harness.studies.figures.bars import operating_points
-from harness.studies.figures.lines import along
 from harness.studies.ledger import headline, ledger, marks, tables
 from harness.studies.play import joined, play
 from harness.studies.study import Study, percent
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 WEIGHTS = "min_distance_m"  # the setting that flattens the weights of Equation 2
 EQUAL_M = 1000.0  # beyond every distance, so that all weights are equal
@@ -92,8 +91,17 @@ def run_paper(panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[
             "study": "paper", "seeds": list(seeds), "episodes_per_seed": episodes, "source": proxy,
             "panels": described({p.name: p.settings for p in panels}), "versions": versions(),
         },
-        numbers, {"figure-a": operating_points(core, theirs), "figure-b": along(sweeps, theirs)},
+        numbers, lambda: _figures(core, sweeps, theirs),
     )  # fmt: skip
+
+
+def _figures(
+    core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]", theirs: "pd.DataFrame"
+) -> "dict[str, Figure]":
+    from harness.studies.figures.bars import operating_points
+    from harness.studies.figures.lines import along
+
+    return {"figure-a": operating_points(core, theirs), "figure-b": along(sweeps, theirs)}
 
 
 def equation_2(weights: "pd.DataFrame") -> str:

@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from harness.backends.registry import open_backend
 from harness.coordination.trigger import entropy_nats
@@ -34,8 +33,10 @@ from harness.report.drawing.colours import conditions
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
 from harness.runs.records import Score
-from harness.studies.figures.points import Rows, intervals
 from harness.studies.study import Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 RESAMPLES = 4000
 FLIPS, STABLE, BETWEEN = "flip_rate", "stable_rate", "between_episodes_share"
@@ -270,12 +271,14 @@ def repeats_study(repeats: Repeats) -> Study:
         caveats=merged(
             {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
         ),
-        more=Markup("\n").join(links), figures={"repeats": _figure(repeats)},
+        more=Markup("\n").join(links), figures=lambda: {"repeats": _figure(repeats)},
     )  # fmt: skip
 
 
-def _figure(repeats: Repeats) -> Figure:
+def _figure(repeats: Repeats) -> "Figure":
     """Draw how often decisions stay the same, and what is left of success over several repeats."""
+    from harness.studies.figures.points import Rows, intervals
+
     most = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
     parts = {
         "share, %": {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN},

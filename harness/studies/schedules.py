@@ -29,7 +29,6 @@ from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.runs.leading import BALANCED
 from harness.runs.success import Success
 from harness.studies.choices import COSTS, Choices, choices
-from harness.studies.figures.points import Steps, fronts
 from harness.studies.learning import layouts
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import Study, corrected, p_cell, refuse_other
@@ -37,6 +36,9 @@ from harness.studies.sweep import point_of
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+
+    from harness.studies.figures.points import Steps
 
 RESAMPLES = 2000
 SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
@@ -385,10 +387,6 @@ def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], se
     first, data = compared[0], tables(compared)
     words = first.counting.words
     tuned = bool(first.tune)
-    panels = [
-        (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
-        for run in compared for cost in BUDGETS if cost == "messages" or run.energy
-    ]  # fmt: skip
     chosen = (
         f"Both were chosen for the most {words} on tune layouts, within "
         f"{100 * first.budget:.0f} % of the paper's messages there."
@@ -414,7 +412,7 @@ def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], se
             "sources": [run.manifest() for run in runs], "condition": first.point.name,
             "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
         },
-        data["schedules"], {"fronts": fronts(panels, words)},
+        data["schedules"], lambda: {"fronts": _fronts(compared)},
         [caveat for run in runs for caveat in run.caveats],
     )  # fmt: skip
 
@@ -449,10 +447,21 @@ def headline(compared: Compared) -> list[str]:
     return sentences
 
 
-def _steps(run: Compared, cost: str) -> Iterator[Steps]:
-    """Yield the settings that are taken as the budget grows."""
+def _fronts(compared: Sequence[Compared]) -> "Figure":
+    from harness.studies.figures.points import fronts
 
-    def steps(label: str, plays: Sequence[Play], **look: Any) -> Steps:
+    panels = [
+        (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
+        for run in compared for cost in BUDGETS if cost == "messages" or run.energy
+    ]  # fmt: skip
+    return fronts(panels, compared[0].counting.words)
+
+
+def _steps(run: Compared, cost: str) -> "Iterator[Steps]":
+    """Yield the settings that are taken as the budget grows."""
+    from harness.studies.figures.points import Steps
+
+    def steps(label: str, plays: Sequence[Play], **look: Any) -> "Steps":
         success = [100 * play.rate for play in plays]
         return Steps(label, [play.means[cost] for play in plays], success, look)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
+from harness.core import extras
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
@@ -18,11 +18,11 @@ from harness.core.formats import STUDIES
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
-from harness.report.drawing.pictures import FORMATS, save
 from harness.report.library import on_dark_too, picture
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
@@ -41,7 +41,8 @@ class Study:
     data: "Mapping[str, pd.DataFrame]"  # the tables that are written as CSV and JSON Lines, by file name
     manifest: Mapping[str, Any]  # what it was made of
     answer: Any  # what `--json` prints, a data frame or plain values
-    figures: Mapping[str, Figure] = field(default_factory=dict)  # by file name
+    # draws them by file name, where matplotlib is installed
+    figures: "Callable[[], Mapping[str, Figure]]" = dict
     caveats: Sequence[str] = ()  # what a reader must know first
     more: Markup = field(default_factory=Markup)  # what else the page shows, below the tables
 
@@ -73,12 +74,7 @@ def write_study(study: Study, out: Path) -> Path:
     """Write figures, tables, the page, and last the manifest, each file whole; return the page."""
     refuse_taken(out, study.kind)
     out.mkdir(parents=True, exist_ok=True)
-    pictures = {}
-    for stem, figure in study.figures.items():
-        for kind in FORMATS:
-            save(figure, out / f"{stem}.{kind}", kind, dpi=300)
-        width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
-        pictures[stem] = picture(on_dark_too(bytes_of(out / f"{stem}.svg", "picture"))), width_rem
+    pictures = _pictures(study, out) if undrawn(study) is None else {}
     for stem, table in study.data.items():
         write_table(table, out / stem)
     section = Section(
@@ -89,6 +85,30 @@ def write_study(study: Study, out: Path) -> Path:
     manifest = json.dumps({"format": f"swarmdrive-{study.kind}/1", **study.manifest}, allow_nan=False)
     write_whole(out / f"{study.kind}.json", msgspec.json.format(manifest, indent=1) + "\n")
     return out / "index.html"
+
+
+def undrawn(study: Study) -> UserError | None:
+    """Return what keeps the figures of a study from being drawn: a package that is not installed."""
+    if study.figures is dict:
+        return None
+    try:
+        extras.need("drawing figures", "matplotlib")
+    except UserError as error:
+        return error
+    return None
+
+
+def _pictures(study: Study, out: Path) -> dict[str, tuple[str, int]]:
+    """Draw the figures into a folder; return each as an address, with its width in rem."""
+    from harness.report.drawing.pictures import FORMATS, save
+
+    pictures = {}
+    for stem, figure in study.figures().items():
+        for kind in FORMATS:
+            save(figure, out / f"{stem}.{kind}", kind, dpi=300)
+        width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
+        pictures[stem] = picture(on_dark_too(bytes_of(out / f"{stem}.svg", "picture"))), width_rem
+    return pictures
 
 
 def write_table(table: "pd.DataFrame", path: Path) -> None:

@@ -6,8 +6,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from matplotlib.figure import Figure
-
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
@@ -28,15 +26,13 @@ from harness.studies.axes import (
     usual_at,
 )
 from harness.studies.figures.axes import interval_of, lead_in
-from harness.studies.figures.bars import operating_points
-from harness.studies.figures.heat_map import heat_map
-from harness.studies.figures.lines import along
-from harness.studies.play import Source, joined, play
+from harness.studies.play import PanelResult, Source, joined, play
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, percent, refuse_other
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 ESTIMATE = ("mean", "ci_low", "ci_high")
 HEADS = {
@@ -186,7 +182,25 @@ def run_sweep(
         run.settle()
     whole = joined([part for parts in results.values() for part in parts])
     summary = whole.summary
-    lines = [summary[summary.panel == panel] for panel in panels if panel != CORE and CROSS not in panel]
+    shown = tables(summary)
+    return Study(
+        "sweep", f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
+        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
+        [f"{counts(sources, seeds)}. {PAIRED}"], shown,
+        {"conditions": summary, "episodes": whole.episodes},
+        # Anew, since sources state what was left out.
+        {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
+        summary, lambda: _figures(summary, results),
+        [caveat for run in runs for caveat in run.caveats],
+    )  # fmt: skip
+
+
+def _figures(summary: "pd.DataFrame", results: Mapping[str, Sequence[PanelResult]]) -> "dict[str, Figure]":
+    """Draw lines of the axes that are varied alone, bars of the conditions, and maps of crossed axes."""
+    from harness.studies.figures.bars import operating_points
+    from harness.studies.figures.lines import along
+
+    lines = [summary[summary.panel == panel] for panel in results if panel != CORE and CROSS not in panel]
     figures = {"sweep": along(lines)} if lines else {}
     figures |= {
         f"operating-points-{n}": operating_points(part.summary)
@@ -197,21 +211,10 @@ def run_sweep(
         for panel, parts in results.items() if CROSS in panel
         for part in parts for condition in dict.fromkeys(part.summary.condition)
     ]  # fmt: skip
-    figures |= {
+    return figures | {
         "sweep" if n == 0 else f"sweep-{n + 1}": _map(part[part.condition == condition])
         for n, (part, condition) in enumerate(maps)
     }
-    shown = tables(summary)
-    return Study(
-        "sweep", f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
-        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
-        [f"{counts(sources, seeds)}. {PAIRED}"], shown,
-        {"conditions": summary, "episodes": whole.episodes},
-        # Anew, since sources state what was left out.
-        {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
-        summary, figures,
-        [caveat for run in runs for caveat in run.caveats],
-    )  # fmt: skip
 
 
 def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
@@ -224,8 +227,10 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
     return f"{'; '.join(of_sources)} (channel seeds {', '.join(map(str, seeds))})"
 
 
-def _map(part: "pd.DataFrame") -> Figure:
+def _map(part: "pd.DataFrame") -> "Figure":
     """Draw success of crossed axes: the first down, the second across, a panel for each of the others."""
+    from harness.studies.figures.heat_map import heat_map
+
     down, across, *panel_axes = part.variable.iloc[0].split(CROSS)
     rows = part[(part.metric == lead_in(part)) & (part.interval == interval_of(part))]
     groups = rows.groupby(panel_axes, sort=False) if panel_axes else [((), rows)]

@@ -10,7 +10,7 @@ from fractions import Fraction
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,11 +32,13 @@ from harness.report.document import Table, strong
 from harness.runs.metrics import SUCCESS, mean_by_place, over_episodes
 from harness.runs.success import Success
 from harness.studies.axes import AXES, NONE, Setting, usual_at
-from harness.studies.figures.heat_map import heat_map
 from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Cells, Study, corrected, ends, refuse_other
 from harness.studies.sweep import point_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 RESAMPLES = 2000
 Key = tuple[str, str, float]  # rule, attack, share
@@ -315,14 +317,6 @@ def trust_study(bench: Bench) -> Study:
     """Declare the study of a bench: a heat map, tables of rules and of success a share, and of detection."""
     import pandas as pd
 
-    attacks = (PEACE, *bench.attacks)
-    panels = {
-        _title(share): np.array([
-            [100 * bench.success(rule, attack, share * bool(attack)).value for rule in bench.rules]
-            for attack in attacks
-        ])
-        for share in bench.shares
-    }  # fmt: skip
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
     cells = [
         {"rule": c.rule, "attack": c.attack or None, "share": c.share,
@@ -349,8 +343,22 @@ def trust_study(bench: Bench) -> Study:
             "versions": versions(),
         },
         {"run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells},
-        {"heat-map": heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)}, bench.caveats,
+        lambda: {"heat-map": _heat_map(bench)}, bench.caveats,
     )  # fmt: skip
+
+
+def _heat_map(bench: Bench) -> "Figure":
+    """Draw success of each rule under each attack, a panel a share of attackers."""
+    from harness.studies.figures.heat_map import heat_map
+
+    panels = {
+        _title(share): np.array([
+            [100 * bench.success(rule, attack, share * bool(attack)).value for rule in bench.rules]
+            for attack in (PEACE, *bench.attacks)
+        ])
+        for share in bench.shares
+    }  # fmt: skip
+    return heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)
 
 
 def headline(bench: Bench) -> list[str]:

@@ -5,11 +5,10 @@ from dataclasses import asdict
 from difflib import SequenceMatcher
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from markupsafe import Markup, escape
-from matplotlib.figure import Figure
 
 from harness.core.figures import PERCENT, Unit, as_mapping, shown
 from harness.core.files import write_whole
@@ -19,11 +18,13 @@ from harness.report.compare.words import judged
 from harness.report.document import Table
 from harness.report.drawing.colours import ROLES as COLOUR_OF_ROLE
 from harness.report.templating import environment, visible
-from harness.studies.figures.points import Rows, intervals
 from harness.studies.study import Study
 from harness.studies.twins.asking import Questions, lack
 from harness.studies.twins.declared import TWINS, Twin
 from harness.studies.twins.scoring import METRICS, ROLES, Pair, Row, headline
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXAMPLES = 3  # of each row
 DISTANCE = Unit(decimals=2)
@@ -64,12 +65,14 @@ def twins_study(
             "holds that always gives the same answer, and so reads nothing.", terminal=range(7),
         )],
         {}, {**answer, "versions": versions()}, answer, caveats=notes(questions, rows, unanswered),
-        more=_examples(spec.actions, rows), figures={"twins": _figure(rows)},
+        more=_examples(spec.actions, rows), figures=lambda: {"twins": _figure(rows)},
     )  # fmt: skip
 
 
-def _figure(rows: Sequence[Row]) -> Figure:
+def _figure(rows: Sequence[Row]) -> "Figure":
     """Draw how often each twin holds, and how far apart both answers are, by who was asked."""
+    from harness.studies.figures.points import Rows, intervals
+
     names = list(dict.fromkeys(row.twin.name for row in rows))
     by_place = {(row.twin.name, row.role): row for row in rows}
     roles = [role for role in ROLES if any(row.role == role for row in rows)]
