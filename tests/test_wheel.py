@@ -12,6 +12,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+NO_FIGURES = (
+    "harness: drawing figures needs matplotlib, which is not installed; "
+    "run `pip install 'swarmdrive-harness[report]'`"
+)
+FROM_PYTHON = """
+import sys
+import harness
+run, *_ = sys.argv[1:]
+episodes, listed = harness.load(run).episodes.episode, harness.ls()
+print(len(set(episodes)), len(listed), type(harness.compare(run, run)).__name__)
+"""
 pytestmark = pytest.mark.exhaustive
 
 
@@ -65,6 +76,14 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     run = tmp_path / told["run"]
     files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
     assert {p.name for p in run.iterdir()} == {*files, "run.toml", "sources"}
+    assert harness("--help").startswith("Usage: harness [OPTIONS] COMMAND")
+    swept = typed("study", "sweep", str(run), "--over", "loss", "--grid", "0,0.4", "--out", "swept")
+    assert (swept.returncode, swept.stderr.splitlines()[-1]) == (0, NO_FIGURES), swept.stderr
+    assert re.search(r"^0\.4 +\d", swept.stdout, re.MULTILINE)
+    assert (tmp_path / "swept/conditions.csv").read_text().startswith("source,panel,")
+    python = [str(site / "bin/python"), "-c", FROM_PYTHON, str(run)]
+    done = subprocess.run(python, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "2 1 Comparison\n"), done.stderr
     simulated = typed("drive", "--model", "proxy")
     assert (simulated.returncode, simulated.stderr.count("\n")) == (2, 1)
     assert "pip install 'swarmdrive-harness[sim]'" in simulated.stderr
