@@ -185,6 +185,49 @@ def test_a_run_by_url_states_its_card_and_can_be_typed_again(
     assert not any(KEY.encode() in path.read_bytes() for path in files)
 
 
+WEIGHTS = resources.folder("models") / "swarm-tiny/swarm-tiny-f16.gguf"
+CARD = """
+engine = "openai"
+description = "a server's"
+weights = "lab/tiny:q4"
+server.base_url = "http://127.0.0.1:9/v1"
+latency = {source = "paper", basis = "none declared"}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("brought", ["a URL", "a file of weights", "a server"])
+def test_a_run_of_what_the_user_brought_runs_again_as_the_first_line_of_its_file_says(
+    brought: str, small_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    if brought == "a file of weights":
+        pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    Path("models").mkdir()
+    Path("models/mine.toml").write_text(CARD)
+    Path("swarmdrive.toml").touch()
+    what = ["--dataset", small_path, "--limit", "1", "--condition", "single-local", "--seeds", "0:1"]
+    quiet = ("--no-cache", "--quiet")
+    with serving(answer, listing("lab/tiny:q4")) as there:
+        words = {
+            "a URL": ("--model", there.url), "a file of weights": ("--model", str(WEIGHTS)),
+            "a server": ("--model", "mine", "--server", there.url),
+        }[brought]  # fmt: skip
+        code, _, said = harness("eval", *words, *what, *quiet, "--out", "one")
+        assert code == 0, said
+        first = Path("one/run.toml").read_text().partition("\n")[0]
+        asked = len(there.asked)
+        code, _, refused = harness("eval", "one/run.toml", *quiet, "--out", "two")
+        assert (code, refused.count("\n"), len(there.asked)) == (2, 1, asked), "a file alone asks nobody"
+        _, command, _ = first.split("`")
+        assert command.startswith("harness eval run.toml --")
+        assert f"`{command.replace('run.toml', 'one/run.toml')}`" in refused
+        _, *typed = shlex.split(command.replace("run.toml", "one/run.toml"))
+        code, _, said = harness(*typed, *quiet, "--out", "two")
+        assert code == 0, said
+    for name in ("decisions.parquet", "episodes.csv", "summary.csv", "run.toml"):
+        assert Path("two", name).read_bytes() == Path("one", name).read_bytes()
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(any(find_spec(name) is None for name in NEEDED), reason=f"needs {', '.join(NEEDED)}")
 def test_a_real_server_is_known_and_evaluated_by_its_url(

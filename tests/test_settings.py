@@ -106,12 +106,16 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
 
 
 HOSTILE = {
-    'model = "./theirs"': "./theirs is none of your cards, and a file names no other model to open; give "
-    "it by --model",
+    'model = "./theirs"': "./theirs is none of your cards, and a file opens no other model by itself; if "
+    "you want it, type `harness eval stated.toml --model ./theirs`",
+    'model = "http://theirs:1/v1"': "`harness eval stated.toml --model http://theirs:1/v1`",
+    'model = "./a b; rm"\nserver = ["http://theirs:1/v1"]': "`harness eval stated.toml --model './a b; rm' "
+    "--server http://theirs:1/v1`",
     'model = "replay:theirs"': "theirs is no finished run: it has no run.json",
     'model = "theirs/on-the-hub"': "theirs/on-the-hub is none of your cards",
-    '[helpers]\nmodel = "proxy, ./theirs"': "give it by --helper-model",
-    'server = ["http://theirs:1/v1"]': "a file names no server to ask; give --server, or take the line out",
+    '[helpers]\nmodel = "proxy, ./theirs"': "`harness eval stated.toml --helper-model 'proxy, ./theirs'`",
+    'server = ["http://theirs:1/v1"]': "http://theirs:1/v1 is a server, and a file asks none by itself; if "
+    "you want it, type `harness eval stated.toml --server http://theirs:1/v1`",
     "model = 3": "model = 3; allowed: a text",
     'prompd = "v2"': "unknown key in settings stated.toml 'prompd'; did you mean 'prompt'?",
     '[world]\nkind = "frozen"\nlimti = 1': "unknown key in settings stated.toml [world] 'limti'; did you "

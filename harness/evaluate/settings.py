@@ -4,6 +4,7 @@ Each field of `Settings` is an option of `harness eval` or `harness drive`, with
 """
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -444,8 +445,9 @@ def of_words(typed: Sequence[str]) -> Settings:
 
 def text_of(settings: Settings) -> str:
     """Return the text of `run.toml`: every setting that has a value, also where it is the default."""
-    command = COMMANDS[kind_of(settings)]
-    lines = [f"# The settings of a run. `harness {command} {FILE}` runs it again; an option beside it wins."]
+    beside = [word for own in _only_typed(settings).values() for word in own]
+    again = _again(settings, Path(FILE), beside)
+    lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
     tables: dict[str, list[str]] = {"": [], "helpers": [], "world": [f"kind = {_toml(kind_of(settings))}"]}
     for each in options(type(settings.world)):
         if (value := each.of(settings)) not in (None, ()):
@@ -454,6 +456,29 @@ def text_of(settings: Settings) -> str:
     for name, rows in tables.items():
         lines += ([f"\n[{name}]"] if name and rows else []) + rows
     return "\n".join(lines) + "\n"
+
+
+def _again(settings: Settings, file: Path, beside: Sequence[str]) -> str:
+    """Return the command that runs a file of settings, with what is typed beside it."""
+    return printable(shlex.join(["harness", COMMANDS[kind_of(settings)], str(file), *beside]), 2000)
+
+
+def _only_typed(settings: Settings) -> dict[str, list[str]]:
+    """Return what a file names and only a user may, as words by option: models that are no cards, servers.
+
+    A replay reads another run's answers and opens none.
+    """
+    named: dict[str, list[str]] = {}
+    for each in options(type(settings.world)):
+        value = each.of(settings)
+        if each.name in ("model", "helper_model"):
+            models = filter(None, map(str.strip, (value or "").split(",")))
+            allowed = all(model.startswith("replay:") or _is_card(model) for model in models)
+        else:
+            allowed = each.name != "server" or not value
+        if not allowed:
+            named[each.name] = each.words(value)
+    return named
 
 
 def _toml(value: Any) -> str:
@@ -478,15 +503,15 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     settings = changed(_as_driven(convert(toml(file, where), Settings, where), file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
-    for name, models in {"model": settings.model, "helper_model": settings.helpers.model or ""}.items():
-        for model in filter(None, map(str.strip, models.split(","))):
-            if name not in given and not model.startswith("replay:") and not _is_card(model):
-                raise UserError(
-                    f"{where}: {printable(model)} is none of your cards, and a file names no other model to "
-                    f"open; give it by --{name.replace('_', '-')}"
-                )
-    if settings.server and "server" not in given:
-        raise UserError(f"{where}: a file names no server to ask; give --server, or take the line out")
+    own = {name: words for name, words in _only_typed(settings).items() if name not in given}
+    if own:
+        flag, value, *_ = beside = [word for words in own.values() for word in words]
+        what = (
+            f"{printable(value)} is a server, and a file asks none"
+            if flag == "--server"
+            else f"{printable(value)} is none of your cards, and a file opens no other model"
+        )
+        raise UserError(f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`")
     return settings
 
 
