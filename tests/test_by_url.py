@@ -1,6 +1,7 @@
 """A model by its URL: the server is asked what it has and what it is, and is believed no further."""
 
 import json
+import re
 import shlex
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from test_server_identity import SERVERS, answering
 
 from harness.backends import cards
 from harness.backends.openai import http
-from harness.backends.servers import Kind
+from harness.backends.servers import Kind, Server
 from harness.core import resources
 from harness.core.errors import Unanswered, UserError
 
@@ -156,6 +157,42 @@ def test_what_is_no_base_url_is_not_asked_and_not_shown(url: str) -> None:
     with pytest.raises(UserError, match=r"--model: base_url .*; give one such as http") as raised:
         cards.resolve(url)
     assert "hunter22" not in str(raised.value)
+
+
+ADDRESSES = {
+    "127.0.0.1:9101": "http://127.0.0.1:9101/v1",
+    "localhost:8080/v1": "http://localhost:8080/v1",
+    "gpu-1.lab.example:8000/v1/": "http://gpu-1.lab.example:8000/v1",
+    "[::1]:8080": "http://[::1]:8080/v1",
+    "htp://127.0.0.1:9101/v1": "http://127.0.0.1:9101/v1",
+    "https:/127.0.0.1:9101": "https://127.0.0.1:9101/v1",
+    "HTTPS//10.0.0.1:9101": "https://10.0.0.1:9101/v1",
+}
+
+
+@pytest.mark.parametrize(("typed", "meant"), ADDRESSES.items())
+def test_an_address_without_a_scheme_is_told_the_url_that_it_means(typed: str, meant: str) -> None:
+    with pytest.raises(UserError, match=re.escape(f"give {meant}") + "$"):
+        cards.resolve(typed)
+    with pytest.raises(ValueError, match=rf"^base_url .*; give {re.escape(meant)}$"):
+        Server(typed)
+
+
+@pytest.mark.parametrize(
+    "typed", ["me:hunter22@127.0.0.1:80/v1", "127.0.0.1:80/v1?key=hunter22", "127.0.0.1:80/v1#hunter22"]
+)
+def test_an_address_with_a_secret_is_not_shown_with_a_scheme(typed: str) -> None:
+    with pytest.raises(ValueError, match="give one such as http") as raised:
+        Server(typed)
+    assert "hunter22" not in str(raised.value)
+    with pytest.raises(UserError) as refused:
+        cards.resolve(typed)
+    assert "give http://" not in str(refused.value)
+
+
+def test_a_name_that_is_no_address_is_told_the_models(harness: Callable[..., tuple[int, str, str]]) -> None:
+    assert "did you mean 'qwen3-4b'?" in harness("eval", "--model", "qwen3:4b")[2]
+    assert "no hub id; give an existing path" in harness("eval", "--model", "not/there/at:all")[2]
 
 
 @pytest.mark.slow

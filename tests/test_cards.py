@@ -344,7 +344,7 @@ def test_a_served_model_has_a_server_with_defaults_that_are_stated(shelf: Path) 
         (("[server]\nbase_url", "[server]\nurl"), ["[server]", "'url'", "base_url"]),
         (('base_url = "https://models.example/v1"', ""), ["[server]", "base_url", "add it"]),
         (("weights =", "revision ="), ["weights", "openai"]),
-        (("https:", "ftp:"), ["base_url", "http or https", "http://127.0.0.1:8080/v1"]),
+        (("https:", "ftp:"), ["base_url", "http or https", "give http://models.example/v1"]),
         (("https://models.example", "models.example"), ["base_url", "http or https"]),
         (("https://models.example", "https://:8080"), ["base_url", "host"]),
         (("models.example", "models.example:port"), ["base_url", "no URL"]),

@@ -17,6 +17,7 @@ from harness.backends.base import Letters
 from harness.backends.card import Card, Latency, System, Thinking, read_cards
 from harness.backends.gguf import read_facts
 from harness.backends.registry import registration
+from harness.backends.servers import meant
 from harness.backends.vision import Vision, read_vision
 from harness.core import resources
 from harness.core.config import convert
@@ -155,6 +156,10 @@ def _local_card(text: str, engine: str | None) -> Card | None:
         return _gguf_card(text, path, engine)
     if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
         return _new_card(text, "transformers", text, "Hub model without a card")
+    if re.search(r":\d|//", text) and (url := meant(text)):
+        raise UserError(
+            f"model {printable(text)!r} is no path; the URL of a server begins with http://: give {url}"
+        )
     if "/" in text:
         raise UserError(
             f"model {printable(text)!r} is no directory, no .gguf file and no hub id; "

@@ -18,6 +18,13 @@ from harness.core.errors import UserError
 Kind = Literal["generic", "vllm", "llama-server", "ollama", "lm-studio", "llama-cpp-python"]
 KINDS = get_args(Kind)
 MOST_LOGPROBS = 20  # most log-probabilities of one token that OpenAI and vLLM give
+# An address without a scheme or with one misspelt. It has no place for a password, so it may be shown.
+_ADDRESS = re.compile(
+    r"(?P<scheme>[a-z]{3,6}(?::/{1,2}|//))?"
+    r"(?P<host>(?:\[[\da-f:.]+\]|localhost|[\w-]+(?:\.[\w-]+)+|[\w-]+(?=:))(?::\d{2,5})?)"
+    r"(?P<path>/[\w./-]*)?",
+    re.ASCII | re.IGNORECASE,
+)
 _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{0,63}")
 _NAME = Meta(pattern=r"^[a-z][a-z0-9_]{0,63}\Z", description="true, false or another name of the field")
 _Sent = bool | Annotated[str, _NAME]
@@ -97,7 +104,8 @@ class Server:
     def __post_init__(self) -> None:
         # A refused URL is not shown, since it may hold a password.
         if fault := next(filter(None, map(_fault, self.urls)), None if self.urls else "is an empty list"):
-            raise ValueError(f"base_url {fault}; give one such as http://127.0.0.1:8080/v1")
+            mended = next(filter(None, map(meant, self.urls)), "one such as http://127.0.0.1:8080/v1")
+            raise ValueError(f"base_url {fault}; give {mended}")
         if len(set(self.urls)) < len(self.urls):
             raise ValueError("base_url names a server twice; name each once")
         if not _VARIABLE.fullmatch(self.key_env):
@@ -144,6 +152,16 @@ def readable(variable: str) -> bool:
     *words, last = variable.split("_")
     listed = {name.strip() for name in os.environ.get(KEYS, "").split(",")}
     return variable in listed or (last in ("KEY", "TOKEN") and not _OF_MODELS.isdisjoint(words))
+
+
+def meant(address: str) -> str | None:
+    """Return the base URL that an address means which does not begin with http:// or https://, or None."""
+    found = _ADDRESS.fullmatch(address)
+    if found is None or address.startswith(("http://", "https://")):
+        return None
+    scheme = "https" if (found["scheme"] or "").lower().startswith("https") else "http"
+    path = (found["path"] or "").rstrip("/") or "/v1"
+    return f"{scheme}://{found['host']}{path}"
 
 
 def _fault(url: str) -> str | None:
