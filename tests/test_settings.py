@@ -123,6 +123,12 @@ HOSTILE = {
     '[world]\nkind = "closed-loop"': "are of `harness drive`; type that",
     '[world]\nkind = "dream"': "stated.toml",
     "model =": "stated.toml is no TOML",
+    "model = proxy": "stated.toml is no TOML: Invalid value (at line 1, column 9); put a text in quotes",
+    "limit = 2": "settings stated.toml: limit stands in a table; write limit below a line [world] instead",
+    "sample-seed = 2": "sample-seed stands in a table; write sample_seed below a line [world] instead",
+    'helper_model = "proxy"': "helper_model stands in a table; write model below a line [helpers] instead",
+    'condition = "6g"': "condition = '6g'; allowed: a list",
+    "world = 2": "world = 2; allowed: a table",
 }
 
 
@@ -137,6 +143,15 @@ def test_a_file_of_settings_opens_nothing_that_the_user_did_not_name(
     assert (code, out, err.count("\n")) == (2, "", 1), err
     assert said in err
     assert not Path("reports").exists()
+
+
+def test_episodes_of_a_file_are_those_of_its_command(tmp_path: Path) -> None:
+    file = tmp_path / "stated.toml"
+    file.write_text("[world]\nsample = 2\n")
+    assert read(file, FrozenSettings, {}).world == FrozenSettings(sample=2)
+    assert read(file, DriveSettings, {}).world == DriveSettings(sample=2)
+    file.write_text("")
+    assert read(file, DriveSettings, {}) == Settings(world=DriveSettings())
 
 
 def test_what_is_typed_beside_a_file_wins(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ PROMPT = "v3"  # what one's own prompt begins as
 def command(
     folder: Path = typer.Argument(metavar="DIR", help="Folder to make; it may exist if it is empty."),
 ) -> None:
-    """Make a project folder with a prompt and a model card to edit.
+    """Make a project folder with a prompt, a model card and settings to edit.
 
-    Commands that you type in this folder find both by name.
+    Commands that you type in this folder find prompts and cards by name.
     """
     from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory

@@ -80,7 +80,8 @@ def loads(text: str, where: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also raised for too many digits or brackets
-        raise UserError(f"{where} is no TOML: {printable(error)}; fix the file") from None
+        mend = "put a text in quotes" if str(error).startswith("Invalid value") else "fix the file"
+        raise UserError(f"{where} is no TOML: {printable(error)}; {mend}") from None
 
 
 def json_loads(text: str, where: str) -> Any:

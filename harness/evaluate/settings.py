@@ -500,7 +500,8 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, which runs "
             "have since 0.3; for another, type the command in its run.json"
         )
-    settings = changed(_as_driven(convert(toml(file, where), Settings, where), file.parent), given)
+    tables = _placed(toml(file, where), world, where)
+    settings = changed(_as_driven(convert(tables, Settings, where), file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
     own = {name: words for name, words in _only_typed(settings).items() if name not in given}
@@ -513,6 +514,22 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         )
         raise UserError(f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`")
     return settings
+
+
+def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str, Any]:
+    """Return the tables of a file, with the kind of episodes that its command has, if it states none.
+
+    Raises UserError if an option stands outside of its table.
+    """
+    kind = str(world.__struct_config__.tag)
+    for each in options(world):
+        table, *inner = each.path
+        for key in {each.name, each.flag.removeprefix("--")} & tables.keys() if inner else ():
+            raise UserError(
+                f"{where}: {key} stands in a table; write {inner[0]} below a line [{table}] instead"
+            )
+    its = tables.get("world", {})
+    return {**tables, "world": {"kind": kind, **its}} if isinstance(its, dict) else tables
 
 
 def _as_driven(settings: Settings, run: Path) -> Settings:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from harness.backends import cards
 from harness.core import resources
+from harness.evaluate import settings
 from harness.prompts import versions as prompts
 
 Said = tuple[int, str, str]
@@ -29,7 +31,7 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     lines = [line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")]
-    assert len(lines) == 3
+    assert len(lines) == 4
     for line in lines:
         _, program, *args = shlex.split(line)
         if "--episodes" in args:
@@ -83,6 +85,28 @@ def test_a_name_that_ships_is_refused(harness: Harness, project: Path) -> None:
     )
 
 
+@pytest.mark.slow
+def test_its_settings_run_as_they_are(harness: Harness, project: Path) -> None:
+    typed = ("--limit", "1", "--seeds", "0", "--quiet", "--out", "tried")
+    assert harness("eval", "settings.toml", *typed) == (0, "", "")
+    manifest = json.loads((project / "tried/run.json").read_text())
+    assert (manifest["model"]["name"], manifest["prompt"]["version"]) == ("proxy", "mine")
+    assert [condition["name"] for condition in manifest["conditions"]] == ["single-local", "6g"]
+    assert harness("eval", "settings.toml", "--limit", "2", "--dry-run", "--quiet") == (0, "", "")
+
+
+def test_each_line_of_its_settings_can_be_switched_on(project: Path) -> None:
+    file = project / "settings.toml"
+    usual = settings.read(file, settings.FrozenSettings, {})
+    text, switched = re.subn(r"(?m)^# (?=\w+ = )", "", file.read_text())
+    assert switched > 6
+    file.write_text(text)
+    every = settings.read(file, settings.FrozenSettings, {})
+    assert (every.answer, every.tag, every.helpers.model) == ("constrained", ("first",), "swarm-tiny")
+    assert (usual.answer, usual.tag, usual.helpers.model) == ("json", (), None)
+    assert usual.condition == every.condition == ("single-local", "6g")
+
+
 def test_a_prompt_is_released_in_its_project(harness: Harness, project: Path) -> None:
     shipped = (resources.folder("prompts") / "released.toml").read_bytes()
     assert harness("prompt", "release", "mine")[0] == 0
@@ -123,4 +147,6 @@ def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_pa
 
 def test_an_empty_folder_will_do(harness: Harness, tmp_path: Path) -> None:
     assert harness("init", ".")[0] == 0
-    assert {p.name for p in tmp_path.iterdir()} == {"README.md", "models", "prompts", "swarmdrive.toml"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "README.md", "models", "prompts", "settings.toml", "swarmdrive.toml",
+    }  # fmt: skip
