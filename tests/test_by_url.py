@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from misbehaving import Asked, Play, serving
+from misbehaving import Asked, Play, completion, serving
 from served import answer, llama_cpp_server
 from test_server_identity import SERVERS, answering
 
@@ -19,6 +19,9 @@ from harness.backends.openai import http
 from harness.backends.servers import Kind, Server
 from harness.core import resources
 from harness.core.errors import Unanswered, UserError
+from harness.evaluate.asking import WITH_EXAMPLES
+from harness.prompts import versions as prompts
+from harness.world import scenarios
 
 KEY = "sk-of-mine-5ecret"
 OTHERS = {
@@ -263,6 +266,41 @@ def test_a_run_of_what_the_user_brought_runs_again_as_the_first_line_of_its_file
         assert code == 0, said
     for name in ("decisions.parquet", "episodes.csv", "summary.csv", "run.toml"):
         assert Path("two", name).read_bytes() == Path("one", name).read_bytes()
+
+
+def chatting(asked: Asked) -> None:
+    asked.reply(completion("I would rather wait and see."))
+
+
+def wavering(asked: Asked) -> None:
+    (answer if asked.number % 5 == 0 else chatting)(asked)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("play", "prompt", "tries"),
+    [(chatting, "v2", "v10"), (chatting, "v10", "VERSION"), (wavering, "v2", None)],
+)
+def test_a_model_whose_first_answers_cannot_be_read_is_told_at_once_and_goes_on(
+    play: Play, prompt: str, tries: str | None, small_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    what = ["--dataset", small_path, "--condition", "single-local", "--seeds", "0:1", "--prompt", prompt]
+    with serving(play, listing("lab/tiny:q4")) as there:
+        typed = ("--model", there.url, *what, "--no-cache", "--quiet", "--out", "run")
+        code, _, said = harness("eval", *typed)
+    assert (code, Path("run/report.html").is_file()) == (0, True)
+    command = f"harness prompt check {tries} --model '{there.url}#lab/tiny:q4'"
+    assert said == (
+        f"harness: none of the first answers of served:lab/tiny:q4 to prompt {prompt} could be read, and "
+        f"the run goes on; try another: `{command}`; `harness prompt list` shows all\n"
+        if tries else ""
+    )  # fmt: skip
+
+
+def test_the_prompt_that_is_to_be_tried_is_there_for_every_scenario() -> None:
+    prompt = prompts.load(WITH_EXAMPLES)
+    assert prompt.released
+    assert all(prompts.unfit(prompt, scenario) is None for scenario in map(scenarios.get, scenarios.names()))
 
 
 @pytest.mark.slow

@@ -165,3 +165,11 @@ def test_every_text_of_junit_is_xml(text: str) -> None:
     suite = ElementTree.fromstring(junit(text, cases))
     assert suite.attrib["name"] == printable(text)
     assert [case.attrib["name"] for case in suite] == [printable(text)] * 3
+
+
+def test_a_device_or_a_pipe_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    refused = pytest.raises(FileExistsError, match="is no file that can be replaced")
+    with refused, replacing(tmp_path / "pipe"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from run_on_disk import Row, damage, made_up
+from run_on_disk import Row, configure, damage, made_up
 
 from harness.runs.folder import read
 
@@ -72,7 +72,7 @@ IN_TABLES = {
         score("success_rate", "value", 0.987),
         "summary.csv has success_rate 0.987 in 6g (episodes)",
     ),
-    "an end of its interval": (score("success_rate", "ci_low", 0.9), "success_rate, low end, 0.9 in 6g"),
+    "an end of its interval": (score("success_rate", "ci_low", 0.9), "success_rate, low, 0.9 in 6g"),
     "a figure over seeds": (
         score("latency_proxy_ms", "value", 20.0, "seed means"),
         "has latency_proxy_ms 20.0 in 6g (seed means)",
@@ -126,6 +126,80 @@ def reworded(answer: Row) -> None:
     if answer["viewer"] == "v1":
         answer["raw"] = '{"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}'
         answer["intent"] = (1.0, 0.0, 0.0)
+
+
+def older(run: Path) -> None:
+    """State that the figures are by older rules."""
+    stated = json.loads((run / "run.json").read_text())
+    configure(run, versions={**stated["versions"], "figures": "1"})
+    score("success_rate", "ci_low", 0.9)(run)
+
+
+def newer(run: Path) -> None:
+    configure(run, versions={"figures": "99"})
+
+
+def without(metric: str) -> Tamper:
+    """Leave a figure out that speaks against the run."""
+
+    def tamper(run: Path) -> None:
+        lines = (run / "summary.csv").read_text().splitlines(keepends=True)
+        (run / "summary.csv").write_text("".join(line for line in lines if metric not in line))
+
+    return tamper
+
+
+def renamed(run: Path) -> None:
+    """Let an easier radio have the name of another."""
+    stated = json.loads((run / "run.json").read_text())
+    configure(
+        run, conditions=[{**each, "loss": 0.0} if each["profile"] else each for each in stated["conditions"]]
+    )
+
+
+def picked(run: Path) -> None:
+    """State that some layouts were taken in their order."""
+    stated = json.loads((run / "run.json").read_text())["world"]
+    configure(run, world={**stated, "limit": 3, "selection": {}})
+
+
+def called(run: Path) -> None:
+    """Give its dataset a grander name."""
+    world = json.loads((run / "run.json").read_text())["world"]
+    configure(run, world={**world, "name": "hard"})
+
+
+def sooner(run: Path) -> None:
+    """State that a latency is the card's."""
+    stated = json.loads((run / "run.json").read_text())
+    card = {**stated["model"], "latency": {**stated["model"]["latency"], "inference_s": 0.3}}
+    configure(run, model=card)
+
+
+OF_THE_RUN = {
+    "older rules": (older, "success_rate, low, 0.9 in 6g"),
+    "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
+    "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
+    "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
+    "a radio's name": (renamed, "run.json has other settings of v2x than that name says"),
+    "which layouts": (picked, "episodes.csv has other episodes than run.json says that were selected"),
+    "a latency's source": (sooner, "run.json has another latency than its model's card"),
+    "a dataset's name": (
+        called,
+        "run.json has another name of its scenes than the dataset",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changed", OF_THE_RUN)
+def test_what_a_run_states_of_itself_is_held_against_its_dataset_and_its_names(
+    changed: str, run: Path, harness: Harness
+) -> None:
+    tamper, said = OF_THE_RUN[changed]
+    tamper(run)
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert said in " ".join(out.split())
 
 
 def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness) -> None:

@@ -43,8 +43,16 @@ class Unanswered(Unfinished):
 
 def printable(text: object, limit: int = 120) -> str:
     """Make any text safe for one terminal line: escape control characters, and cut at `limit` characters."""
-    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _said(text))
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
+
+
+def _said(thing: object) -> str:
+    """Return the text of a thing, or the name of its type where it has none, as a package's error may."""
+    try:
+        return str(thing)
+    except Exception:
+        return type(thing).__name__
 
 
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
@@ -59,7 +67,7 @@ def sayable(what: str, name: str, repair: str = "rename it") -> str:
 
 def one_line(error: Exception) -> str:
     """Return an error's message on one line, made safe to show."""
-    return printable(" ".join(str(error).split()), 200)
+    return printable(" ".join(_said(error).split()), 200)
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:

@@ -195,6 +195,8 @@ def replacing(path: Path) -> Iterator[Path]:
     sayable("file", path.name, "give another name")
     if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():  # a device or a pipe, whose place the file would take
+        raise FileExistsError(errno.EEXIST, "is no file that can be replaced", str(path))
     # Arrow takes a relative path with a colon, such as `6g:loss=0/x`, for an address.
     part = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
     try:

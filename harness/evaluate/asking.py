@@ -1,6 +1,8 @@
 """Ask the agents: one answer for each viewer at each decision point, kept so that a run can resume."""
 
 import math
+import shlex
+import sys
 from collections.abc import Callable, Collection, Container, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache, partial
@@ -13,7 +15,9 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
+from harness.backends.card import Card
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
@@ -41,6 +45,7 @@ T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
+WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
 EGO = (0,)
 _TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where there is no number
 Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
@@ -118,6 +123,18 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
+@cache  # once: a run has an asker for each of its parts
+def _say_unread(card: Card, prompt: str) -> None:
+    """Say on stderr that none of the first answers could be read, and which prompt to try instead."""
+    other = WITH_EXAMPLES if prompt != WITH_EXAMPLES else "VERSION"
+    command = shlex.join(["harness", "prompt", "check", other, "--model", cards.argument(card)])
+    print(
+        f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could be read, "
+        f"and the run goes on; try another: `{printable(command, 300)}`; `harness prompt list` shows all",
+        file=sys.stderr,
+    )
+
+
 def answer_of(request: Request, completion: Completion) -> Answer:
     """Parse a completion into an answer."""
     raw = completion.text
@@ -186,6 +203,8 @@ class Asker:
         self._given, self.served = frozenset(answers or {}), list[Served]()
         self.answers = {**(self._kept.recall() if self._kept else {}), **(answers or {})}
         self.tally, self._in_a_row = Tally(), 0
+        # How many there are while none could be read; None once one could, or it was said.
+        self._unread: int | None = None if self.answers else 0
 
     def ask(self, asked: Sequence[Request]) -> None:
         """Ask for the missing answers, each once, and keep each chunk as soon as it is answered.
@@ -247,7 +266,19 @@ class Asker:
         self._in_a_row = 0 if answered else self._in_a_row + len(answers)
         if self._in_a_row >= (self._first() if refused_so_far else IN_A_ROW):
             raise Unanswered(str(self.tally))
+        self._look_at(answered)
         self._progress(len(answers))
+
+    def _look_at(self, answered: Sequence[Answer]) -> None:
+        """Say it once if none of the first answers of a language model can be read."""
+        if self._unread is None:
+            return
+        read = any(answer.intent is not None for answer in answered)
+        self._unread = None if read else self._unread + len(answered)
+        ego = self.spec.ego
+        if self._unread is not None and self._unread >= FIRST and ego.can.language_model:
+            _say_unread(ego.card, ego.prompt.version)
+            self._unread = None
 
     def _keep_servers(self, these: Sequence[Served]) -> None:
         if self._kept:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, redirect_stdout
+from copy import deepcopy
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -86,11 +87,12 @@ class _Caller:
 
     def call(self, method: str, arguments: tuple[Any, ...], patience_s: float) -> None:
         """Call a method. Raises what it raises, and TimeoutError if it takes longer than `patience_s`."""
-        done: Future[None] = Future()
+        done, here = Future[None](), os.getcwd()
         self._calls.put((done, method, arguments))
         if not wait([done], min(SAID_S, patience_s)).done and patience_s > SAID_S:
             print(f"harness: waiting for {self._what}, {patience_s:g} s at most", file=sys.stderr)
         if not wait([done], max(patience_s - SAID_S, 0.0)).done:
+            os.chdir(here)  # which it may have left
             raise TimeoutError(f"its {method} takes longer than {patience_s:g} s")
         done.result()
 
@@ -140,7 +142,7 @@ class Followers:
         for name, caller in list(self._callers.items()):
             try:
                 with redirect_stdout(sys.stderr):  # what a command prints may be read by a program
-                    caller.call(method, arguments, patience_s or PATIENCE_S)
+                    caller.call(method, deepcopy(arguments), patience_s or PATIENCE_S)
             except Exception as error:  # a stranger's code
                 who = f"tracker {printable(name)}"
                 shown = one_line(error).removeprefix(f"{who} ") or type(error).__name__

@@ -1,29 +1,38 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from msgspec import to_builtins
+from msgspec.structs import astuple
 
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.backends.replay import Kept
+from harness.coordination.operating_point import named_point
 from harness.core import work
+from harness.core.config import convert
+from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.dataset.load import Dataset
+from harness.dataset.select import Selection
 from harness.evaluate import latency as latencies
+from harness.evaluate.agent import Agent
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import check_prompts, points_of, spec_of
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
-from harness.runs.contradictions import close, contradictions
-from harness.runs.difficulty import REFERENCES
+from harness.runs.contradictions import close, contradictions, current
 from harness.runs.folder import Run, read
-from harness.runs.records import Episode, Latency
+from harness.runs.records import Episode, FrozenScenes, Latency
 
-RULES = ("driver", "proxy")  # engines that are no models
+DRIVER = "driver"
+RULES = (DRIVER, "proxy")  # engines that are no models
 
 
 class Held:
@@ -74,22 +83,56 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
 
     Raises UserError if a prompt, a channel or the like is not here as it was, or an answer is missing.
     """
-    spec = spec_of(run, dataset.of_episodes(run.grid.episodes))
+    world = run.manifest.world
+    assert isinstance(world, FrozenScenes)
+    selection = convert({"limit": world.limit, **world.selection}, Selection, f"{printable(run.path)}: world")
+    source = FrozenSource(selection.of(dataset), selection)
+    if source.dataset.episodes != run.grid.episodes:
+        return ["episodes.csv has other episodes than run.json says that were selected"]
+    spec = replace(spec_of(run, source.dataset), source=source)
     check_prompts(run, spec)
     manifest = run.manifest
     if manifest.device_profile is None:
         times = latencies.as_declared(manifest.latency)
         spec = replace(spec, latency=times)
     spec = replace(
-        spec, points=tuple(points_of(run).values()), ask=manifest.ask,
+        spec, ego=_here(spec.ego), points=tuple(points_of(run).values()), ask=manifest.ask,
         device_profile=manifest.device_profile, device_model=manifest.device_model,
     )  # fmt: skip
     ours, otherwise = computed(run, spec, out, progress)
-    wrong = [*contradictions(run), *_of_episodes(run, ours), *_of_decisions(run, ours)]
-    wrong += _of_layouts(run, dataset)
+    wrong = [
+        *contradictions(run),
+        *_of_manifest(run, ours),
+        *_of_episodes(run, ours),
+        *_of_decisions(run, ours),
+    ]
+    if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
+        wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
     if otherwise:
         wrong.append(f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here")
     return wrong
+
+
+def _here(agent: Agent) -> Agent:
+    """Return an agent with the driver that is here, which says what it may see."""
+    return replace(agent, card=cards.load(agent.card.name)) if agent.card.engine == DRIVER else agent
+
+
+def _of_manifest(stated: Run, ours: Run) -> Iterator[str]:
+    """Yield what run.json says otherwise of the scenes, the conditions, the latency and the model."""
+    world, here = (to_builtins(run.manifest.world) for run in (stated, ours))
+    for name in here.keys() - {"path", "looks"}:
+        if world.get(name) != here[name]:
+            yield f"run.json has another {name} of its scenes than the dataset"
+    for point in points_of(stated).values():
+        with suppress(UserError):  # of a radio that is not here by that name
+            if named_point(point.name) != point:
+                yield f"run.json has other settings of {printable(point.name)} than that name says"
+    model, latency = stated.manifest.model, stated.manifest.latency
+    if latency.source == "card" and model["latency"]["inference_s"] != latency.ego_s:
+        yield "run.json has another latency than its model's card, which it names as the source"
+    if model.get("privileged") != ours.manifest.model.get("privileged"):
+        yield "run.json says of a driver that it sees other than it does"
 
 
 def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
@@ -97,22 +140,8 @@ def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
     for name in Episode.__struct_fields__:
         theirs, here = ([getattr(episode, name) for episode in run.episodes] for run in (stated, ours))
         wrong = sum(not close(a, b) for a, b in zip(theirs, here, strict=True))
-        if wrong and any(value is not None for value in theirs):
+        if wrong and (current(stated) or any(value is not None for value in theirs)):
             yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than its answers make"
-
-
-def _of_layouts(run: Run, dataset: Dataset) -> Iterator[str]:
-    """Yield whether difficulty.csv says otherwise than the trees of its layouts."""
-    if not run.layouts:
-        return
-    trees = dataset.of_episodes(frozenset(layout.episode for layout in run.layouts))
-    success = trees.reference_success()
-    known = np.column_stack([success[name] for name in REFERENCES])
-    here = dict(zip(trees.episodes, known.tolist(), strict=True))
-    stated = {each.episode: (each.local_view, each.cruise, each.uniform) for each in run.layouts}
-    wrong = sum(not all(map(close, stated[number], here[number])) for number in stated)
-    if wrong:
-        yield f"difficulty.csv has {amount(wrong, 'row')} that the trees of the dataset do not have"
 
 
 def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
@@ -125,7 +154,8 @@ def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
         return
     theirs, here = stated.decisions.table, ours.decisions.table
     for name in (name for name in here.column_names if name in theirs.column_names):
-        if theirs[name].equals(here[name]) or theirs[name].null_count == len(theirs):  # an older run's
+        lacks = theirs[name].null_count == len(theirs) and not current(stated)  # an older run
+        if theirs[name].equals(here[name]) or lacks:
             continue
         pairs = zip(theirs[name].to_pylist(), here[name].to_pylist(), strict=True)
         if wrong := sum(not close(a, b) for a, b in pairs):

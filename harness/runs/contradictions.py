@@ -34,8 +34,11 @@ def refuse(run: Run) -> None:
 def contradictions(run: Run) -> Iterator[str]:
     """Yield, in words, what the tables of a run say otherwise than those that they follow from.
 
-    Of a run by rules of another version, means are held against the others, and no intervals.
+    A run by older rules may lack figures, and those of all decisions together are held against nothing.
     """
+    version = run.manifest.versions.get("figures", "1")
+    if not (version.isdecimal() and int(version) <= FIGURES):
+        yield f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
     yield from _of_episodes(run)
     undecided = (answer.scene for answer in run.answers if answer.scene not in run.decisions.scenes)
     if (scene := next(undecided, None)) is not None:
@@ -59,26 +62,32 @@ def _scores(run: Run) -> Iterator[Score]:
             yield pinned.gain(run, score)
 
 
+def current(run: Run) -> bool:
+    """Return whether a run says that its figures are by the rules of this version."""
+    return run.manifest.versions.get("figures", "1") == str(FIGURES)
+
+
 def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
-    """Yield which figures are others than those computed, or are none of them."""
+    """Yield which figures are others than those computed, are none of them, or are not there."""
+    own = {name: metric for name, metric in METRICS.built_in.items() if not metric.pooled or current(run)}
     here = {(score.condition, score.metric, score.interval): score for score in computed}
-    current = run.manifest.versions.get("figures", "1") == str(FIGURES)
-    for score in run.scores:
-        metric, where = printable(score.metric), f"{printable(score.condition)} ({printable(score.interval)})"
-        other = here.get((score.condition, score.metric, score.interval))
-        own = METRICS.built_in.get(score.metric)
-        if own is None or own.superseded:  # of a package, which may not be here, or of an older definition
-            continue
-        if own.pooled and not current:
-            continue
+    stated = {(score.condition, score.metric, score.interval): score for score in run.scores}
+    for key, score in stated.items():
+        condition, metric, interval = map(printable, key)
+        where, other = f"{condition} ({interval})", here.get(key)
+        if score.metric not in own or (other is None and own[score.metric].superseded):
+            continue  # of a package, which may not be here, or of an older definition
         if other is None:
             yield f"summary.csv has {metric} {score.value} in {where}, which its other tables do not have"
             continue
-        for what in ("value", "low", "high") if current else ("value",):
+        for what in ("value", "low", "high", "n", "n_excluded"):
             a, b = getattr(score, what), getattr(other, what)
             if not close(a, b):
-                end = "" if what == "value" else f", {what} end,"
-                yield f"summary.csv has {metric}{end} {a} in {where}, and its other tables make it {b}"
+                of = "" if what == "value" else f", {what},"
+                yield f"summary.csv has {metric}{of} {a} in {where}, and its other tables make it {b}"
+    for key in here if current(run) else ():
+        if key not in stated and key[1] in own:
+            yield f"summary.csv lacks {key[1]} in {printable(key[0])} ({key[2]})"
 
 
 def _of_episodes(run: Run) -> Iterator[str]:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
-from harness.studies import study
+from harness.report.drawing import pictures
 
 Row = dict[str, str]
 Table = list[Row]
@@ -36,7 +36,7 @@ def typed(*arguments: str | Path) -> str:
     command = ["harness", *map(str, arguments)]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as printed:
         patch.setattr(sys, "argv", command)
-        patch.setattr(study, "FORMATS", ("svg",))  # pictures take longer than all else, and none is golden
+        patch.setattr(pictures, "FORMATS", ("svg",))  # pictures take longer than all else, and none is golden
         with pytest.raises(SystemExit) as ended:
             main()
     assert not ended.value.code, f"`{' '.join(command)}` ended with {ended.value.code}"
