@@ -23,6 +23,7 @@ from hypothesis import settings
 from shares import SHARES, share_of
 
 from harness import cli
+from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 
@@ -246,6 +247,13 @@ def two_run(once: Once, two_path: Path) -> Path:
 def proxy_run(once: Once, small: Dataset) -> Path:
     """Folder of a run of the proxy on every episode of `small`."""
     return once("proxy-run", lambda out: run(spec_of(small), out))
+
+
+@pytest.fixture
+def unrebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Build no layouts again, which takes seconds each time; test_tune_is_a_fact.py is about that."""
+    monkeypatch.setattr(rebuilt, "differences", lambda dataset: iter(()))
+    monkeypatch.setattr(rebuilt, "_reported", lambda scenario: iter(()))
 
 
 @pytest.fixture

@@ -23,6 +23,8 @@ from harness.studies.optimize.feedback import of_course, of_decision
 from harness.studies.optimize.search import looks
 from harness.studies.optimize.tuning import TIE, Decision, Played
 
+pytestmark = pytest.mark.usefixtures("unrebuilt")
+
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 REPORT = "occluded-intersection-v2"

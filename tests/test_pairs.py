@@ -20,6 +20,8 @@ from harness.runs.folder import read
 from harness.training.lessons import label
 from harness.training.pairs import pairs, preferences
 
+pytestmark = pytest.mark.usefixtures("unrebuilt")
+
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
 

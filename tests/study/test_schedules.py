@@ -36,6 +36,8 @@ from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.schedules import Candidate, Compared, Play, _area, compare
 from harness.world import scenarios
 
+pytestmark = pytest.mark.usefixtures("unrebuilt")
+
 SEED = 100  # of the first layout of `small`
 SIXG = POINTS["6g"]
 POINTS_PLAYED = (
