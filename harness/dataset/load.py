@@ -272,11 +272,6 @@ def find(name: str) -> Path:
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         sayable("dataset", os.path.basename(name))
         return Path(name)
-    if os.path.isfile(name):
-        raise UserError(
-            f"dataset {printable(name)} is a file; a dataset is a folder that `harness dataset build` makes, "
-            "and files of other programs are not read"
-        )
     names = {manifest.parent.name for manifest in entries("datasets", "*/manifest.json")}
     if name in names:
         return beside("datasets", name)
@@ -284,6 +279,11 @@ def find(name: str) -> Path:
         raise UserError(
             f"dataset {printable(name)} is not in this installation, which has the newest of each family; "
             "clone the repository, which has all"
+        )
+    if os.path.isfile(name):
+        raise UserError(
+            f"dataset {printable(name)} is a file; a dataset is a folder that `harness dataset build` makes, "
+            "and files of other programs are not read"
         )
     raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 
