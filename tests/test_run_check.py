@@ -92,6 +92,16 @@ IN_TABLES = {
 }  # fmt: skip
 
 
+def check_finds(case: tuple[Tamper, str], run: Path, harness: Harness) -> str:
+    """Tamper with a run, and assert that `run check` names it; return what it says."""
+    tamper, said = case
+    tamper(run)
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert said in " ".join(out.split())
+    return said
+
+
 def test_a_run_that_nobody_changed_is_equal(run: Path, harness: Harness) -> None:
     code, out, _ = harness("run", "check", run)
     assert code == 0
@@ -107,11 +117,7 @@ def test_a_run_that_nobody_changed_is_equal(run: Path, harness: Harness) -> None
 def test_tables_that_contradict_each_other_are_named_and_are_neither_shown_nor_compared(
     changed: str, run: Path, proxy_run: Path, harness: Harness
 ) -> None:
-    tamper, said = IN_TABLES[changed]
-    tamper(run)
-    code, out, _ = harness("run", "check", run)
-    assert code == 1
-    assert said in " ".join(out.split())
+    said = check_finds(IN_TABLES[changed], run, harness)
     for typed in (("report", run), ("compare", proxy_run, run), ("compare", run, proxy_run)):
         gate = ("--fail-if", "success_rate < 1") if typed[0] == "compare" else ()
         code, out, error = harness(*typed, *gate)
@@ -184,10 +190,7 @@ OF_THE_RUN = {
     "a radio's name": (renamed, "run.json has other settings of v2x than that name says"),
     "which layouts": (picked, "episodes.csv has other episodes than run.json says that were selected"),
     "a latency's source": (sooner, "run.json has another latency than its model's card"),
-    "a dataset's name": (
-        called,
-        "run.json has another name of its scenes than the dataset",
-    ),
+    "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
 }  # fmt: skip
 
 
@@ -195,11 +198,7 @@ OF_THE_RUN = {
 def test_what_a_run_states_of_itself_is_held_against_its_dataset_and_its_names(
     changed: str, run: Path, harness: Harness
 ) -> None:
-    tamper, said = OF_THE_RUN[changed]
-    tamper(run)
-    code, out, _ = harness("run", "check", run)
-    assert code == 1
-    assert said in " ".join(out.split())
+    check_finds(OF_THE_RUN[changed], run, harness)
 
 
 def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness) -> None:

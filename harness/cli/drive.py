@@ -24,9 +24,7 @@ if TYPE_CHECKING:
 ALL = "all"
 SHARE = "agent_share"
 LATE = Column("late", "late_rate")
-TIME_OUT = Column(
-    "time-out", "time_out_rate"
-)  # instead of it where several decide, since nobody is late there
+TIME_OUT = Column("time-out", "time_out_rate")  # where several decide, since nobody is late there
 COLUMNS = (
     Column("success % [95 % CI]", "success_rate", interval=True),
     Column("crash", "collision_rate"),

@@ -129,8 +129,8 @@ def check(
 ) -> None:
     """Compute runs again from their own answers; compare each number.
 
-    No model is asked, but rules are. A driven run has its tables held against each other alone. Exit code 1
-    means that a number differs.
+    No model is asked; rule-based drivers are. Of a driven run, only whether its tables agree is checked.
+    Exit code 1 means that a number differs.
     """
     lines = [_checked(run, dataset, as_json or quiet) for run in _runs_in(runs)]
     if as_json:
@@ -151,7 +151,7 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
-    """Check a run, say what came of it, and return it."""
+    """Check a run, print the result, and return it."""
     from harness.evaluate.recompute import differences
     from harness.runs.contradictions import contradictions
     from harness.runs.folder import dataset_of, read

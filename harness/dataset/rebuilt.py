@@ -31,8 +31,9 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
     """
     if dataset.trusted:
         return
+    starts = _starts(dataset)
     for other in (*others, *_reported(dataset.scenario.name)):
-        starts, theirs = _starts(dataset), _starts(other)
+        theirs = _starts(other)
         for start in starts.keys() & theirs.keys():
             raise UserError(
                 f"dataset {printable(dataset.path)} has scene {starts[start]}, which is {theirs[start]} of "
@@ -42,23 +43,25 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
         raise UserError(f"dataset {printable(dataset.path)}: {difference}; build it again")
 
 
-def differences(dataset: Dataset, layouts: int = REBUILT) -> Iterator[str]:
-    """Yield which of some layouts, drawn at random, are not those of the seeds that a dataset states.
+def differences(dataset: Dataset) -> Iterator[str]:
+    """Yield which of `REBUILT` layouts, drawn at random, are not those of the seeds that a dataset states.
 
     None where the simulator is not installed.
     """
     if find_spec("highway_env") is None:
         return
+    from importlib.metadata import version
+
     from harness.dataset.freeze import freeze
 
-    numbers = random.SystemRandom().sample(dataset.episodes, min(layouts, len(dataset.episodes)))
+    numbers = random.SystemRandom().sample(dataset.episodes, min(REBUILT, len(dataset.episodes)))
     seeds = {number: dataset.manifest.seed + number for number in numbers}
     for number, frozen in zip(numbers, freeze(dataset.scenario, seeds), strict=True):
         tree = dataset.trees.read(number)
         dataset.scenes([point.scene for level in tree.levels for point in level])  # checks their content
         if _courses(frozen.branchings) != _courses(tree.levels):
             stated = dataset.manifest.versions.get("highway-env", "none")
-            here = _here()
+            here = version("highway-env")
             versions = "" if here == stated else f" by highway-env {here}, of {printable(stated, 20)}"
             yield f"layout {number} is not what layout seed {seeds[number]} gives{versions}"
 
@@ -75,8 +78,8 @@ def _course(edge: Edge) -> tuple[list[str], int | None, str | None]:
 def _reported(scenario: str) -> Iterator[Dataset]:
     """Yield the released datasets of a scenario, all of which are of report seeds."""
     for path in sorted(folder("datasets").glob("*/manifest.json")):
-        manifest, digest = read_manifest(path.parent)
-        if digest in released().values() and manifest.scenario == scenario and manifest.purpose == "report":
+        manifest, sha256 = read_manifest(path.parent)
+        if sha256 in released().values() and manifest.scenario == scenario and manifest.purpose == "report":
             yield load(path.parent)
 
 
@@ -85,9 +88,3 @@ def _starts(dataset: Dataset) -> dict[str, str]:
     forest = dataset.forest
     scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
     return {digest(to_builtins(scene.state.vehicles)): scene.id for scene in scenes}
-
-
-def _here() -> str:
-    from importlib.metadata import version
-
-    return version("highway-env")

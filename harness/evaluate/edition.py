@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from harness.backends import cards
 from harness.backends.card import Card
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable, unknown
@@ -22,6 +21,7 @@ from harness.dataset.select import Selection
 from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.of_run import card_here
 from harness.evaluate.settings import FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
@@ -32,7 +32,7 @@ from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
 from harness.runs.success import Pairs, is_gain, mean_difference
 
-KIND, DRIVER = "editions", "driver"
+KIND = "editions"
 
 Names = Annotated[tuple[str, ...], Meta(min_length=1, description="a list of names, one or more")]
 Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of digests by name")]
@@ -152,9 +152,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         prompt = versions.load(str(m.prompt["version"]))
         if prompt.sha256 != self.prompts[prompt.version]:
             raise self._differs(f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version])
-        card = convert(m.model, Card, f"{printable(run.path)}: its model")
-        if card.engine == DRIVER:  # the one that is here says what it may see
-            card = cards.load(card.name)
+        card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         return Spec(
             Agent(card, prompt, *how), source, resolve.points(self.condition), parse_seeds(self.seeds),

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import msgspec
 
+from harness.backends import cards
 from harness.backends.base import AnswerMode, Letters, Sums
 from harness.backends.card import Card
 from harness.coordination.calibrations import file_of
@@ -15,7 +16,6 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
 from harness.core.formats import SOURCES
-from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
@@ -25,8 +25,10 @@ from harness.radio.profiles import CHANNELS
 from harness.runs.folder import Run
 from harness.runs.sources import PROMPTS, prompt_of
 
+DRIVER = "driver"  # the engine of what has no model and no prompt
 
-def spec_of(run: Run, dataset: Dataset) -> Spec:
+
+def spec_of(run: Run, source: FrozenSource) -> Spec:
     """Return the evaluation of a run's frozen scenes, with all that decides its answers; without conditions.
 
     Raises UserError if a prompt of it is not here.
@@ -34,11 +36,16 @@ def spec_of(run: Run, dataset: Dataset) -> Spec:
     manifest = run.manifest
     ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
     return Spec(
-        ego, FrozenSource(dataset), (), manifest.seeds, tuple(helpers),
+        ego, source, (), manifest.seeds, tuple(helpers),
         batch_size=manifest.batch_size, dtype=manifest.dtype,
         temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
         ties=manifest.ties,
     )  # fmt: skip
+
+
+def card_here(card: Card) -> Card:
+    """Return a card that a run states; of a driver the one that is here, which says what it may see."""
+    return cards.load(card.name) if card.engine == DRIVER else card
 
 
 def points_of(run: Run) -> dict[str, OperatingPoint]:

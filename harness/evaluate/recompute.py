@@ -9,7 +9,6 @@ from typing import Any
 from msgspec import to_builtins
 from msgspec.structs import astuple
 
-from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
@@ -22,16 +21,14 @@ from harness.core.figures import amount
 from harness.dataset.load import Dataset
 from harness.dataset.select import Selection
 from harness.evaluate import latency as latencies
-from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.of_run import check_prompts, points_of, spec_of
+from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
-from harness.runs.contradictions import close, contradictions, current
+from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
-from harness.runs.records import Episode, FrozenScenes, Latency
+from harness.runs.records import FrozenScenes, Latency
 
-DRIVER = "driver"
 RULES = (DRIVER, "proxy")  # engines that are no models
 
 
@@ -89,20 +86,19 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
     source = FrozenSource(selection.of(dataset), selection)
     if source.dataset.episodes != run.grid.episodes:
         return ["episodes.csv has other episodes than run.json says that were selected"]
-    spec = replace(spec_of(run, source.dataset), source=source)
-    check_prompts(run, spec)
-    manifest = run.manifest
-    if manifest.device_profile is None:
-        times = latencies.as_declared(manifest.latency)
-        spec = replace(spec, latency=times)
+    stated, manifest = spec_of(run, source), run.manifest
+    check_prompts(run, stated)
+    profile = manifest.device_profile
+    ego = replace(stated.ego, card=card_here(stated.ego.card))
     spec = replace(
-        spec, ego=_here(spec.ego), points=tuple(points_of(run).values()), ask=manifest.ask,
-        device_profile=manifest.device_profile, device_model=manifest.device_model,
+        stated, ego=ego, points=tuple(points_of(run).values()), ask=manifest.ask,
+        latency=latencies.as_declared(manifest.latency) if profile is None else None,
+        device_profile=profile, device_model=manifest.device_model,
     )  # fmt: skip
     ours, otherwise = computed(run, spec, out, progress)
     wrong = [
         *contradictions(run),
-        *_of_manifest(run, ours),
+        *_of_manifest(run, ours, stated.ego.card),
         *_of_episodes(run, ours),
         *_of_decisions(run, ours),
     ]
@@ -113,13 +109,8 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
     return wrong
 
 
-def _here(agent: Agent) -> Agent:
-    """Return an agent with the driver that is here, which says what it may see."""
-    return replace(agent, card=cards.load(agent.card.name)) if agent.card.engine == DRIVER else agent
-
-
-def _of_manifest(stated: Run, ours: Run) -> Iterator[str]:
-    """Yield what run.json says otherwise of the scenes, the conditions, the latency and the model."""
+def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
+    """Yield what run.json, with this card, says otherwise of scenes, conditions, latency and model."""
     world, here = (to_builtins(run.manifest.world) for run in (stated, ours))
     for name in here.keys() - {"path", "looks"}:
         if world.get(name) != here[name]:
@@ -128,19 +119,17 @@ def _of_manifest(stated: Run, ours: Run) -> Iterator[str]:
         with suppress(UserError):  # of a radio that is not here by that name
             if named_point(point.name) != point:
                 yield f"run.json has other settings of {printable(point.name)} than that name says"
-    model, latency = stated.manifest.model, stated.manifest.latency
-    if latency.source == "card" and model["latency"]["inference_s"] != latency.ego_s:
+    latency = stated.manifest.latency
+    if latency.source == "card" and card.latency.inference_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
-    if model.get("privileged") != ours.manifest.model.get("privileged"):
+    if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
         yield "run.json says of a driver that it sees other than it does"
 
 
 def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
     """Yield which columns of episodes.csv differ; a column that an older run lacks does not."""
-    for name in Episode.__struct_fields__:
-        theirs, here = ([getattr(episode, name) for episode in run.episodes] for run in (stated, ours))
-        wrong = sum(not close(a, b) for a, b in zip(theirs, here, strict=True))
-        if wrong and (current(stated) or any(value is not None for value in theirs)):
+    for name, wrong in differing(stated.episodes, ours.episodes):
+        if current(stated) or any(getattr(episode, name) is not None for episode in stated.episodes):
             yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than its answers make"
 
 

@@ -125,9 +125,7 @@ def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
     Numbers are compared as they are written, to the last digit; but not a column of episodes that the stated
     run, which may be older, lacks.
     """
-    theirs, ours = (
-        {(s.condition, s.metric, s.interval): s for s in edition.figures(run)} for run in (stated, computed)
-    )
+    theirs, ours = ({score.key: score for score in edition.figures(run)} for run in (stated, computed))
     for key in {**theirs, **ours}:
         if theirs.get(key) != ours.get(key):
             yield " ".join(key)

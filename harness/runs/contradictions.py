@@ -12,7 +12,7 @@ from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run
 from harness.runs.metrics import BASELINE, GAINS, METRICS
-from harness.runs.records import Episode, Score
+from harness.runs.records import Answer, Episode, Score
 from harness.runs.success import any_time_scores
 from harness.runs.summary import Figures, counted
 
@@ -40,16 +40,16 @@ def contradictions(run: Run) -> Iterator[str]:
     if not (version.isdecimal() and int(version) <= FIGURES):
         yield f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
     yield from _of_episodes(run)
-    undecided = (answer.scene for answer in run.answers if answer.scene not in run.decisions.scenes)
+    answers, reached = list(run.answers), run.decisions.scenes
+    undecided = (answer.scene for answer in answers if answer.scene not in reached)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
-    yield from _of_scores(run, _scores(run))
+    decided = [answer for answer in answers if answer.scene in reached]
+    yield from _of_scores(run, _scores(run, decided))
 
 
-def _scores(run: Run) -> Iterator[Score]:
-    """Yield the figures that follow from a run's decisions, episodes, answers and layouts."""
-    reached = run.decisions.scenes
-    answers = [answer for answer in run.answers if answer.scene in reached]
+def _scores(run: Run, answers: Sequence[Answer]) -> Iterator[Score]:
+    """Yield the figures that follow from a run's decisions, episodes, layouts and these answers of it."""
     with np.errstate(all="ignore"):  # a file can state any number
         yield from Figures.of(run.world, run.grid, run.decisions, run.episodes, answers).scores()
     if run.manifest.world.looks:
@@ -70,8 +70,8 @@ def current(run: Run) -> bool:
 def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     """Yield which figures are others than those computed, are none of them, or are not there."""
     own = {name: metric for name, metric in METRICS.built_in.items() if not metric.pooled or current(run)}
-    here = {(score.condition, score.metric, score.interval): score for score in computed}
-    stated = {(score.condition, score.metric, score.interval): score for score in run.scores}
+    here = {score.key: score for score in computed}
+    stated = {score.key: score for score in run.scores}
     for key, score in stated.items():
         condition, metric, interval = map(printable, key)
         where, other = f"{condition} ({interval})", here.get(key)
@@ -93,14 +93,20 @@ def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
 def _of_episodes(run: Run) -> Iterator[str]:
     """Yield which columns of episodes.csv say otherwise than decisions.parquet."""
     computed = counted(run.grid, run.decisions, run.episodes)
-    for name in Episode.__struct_fields__:
-        pairs = zip(run.episodes, computed, strict=True)
-        wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
-        if wrong:
-            yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than decisions.parquet"
+    for name, wrong in differing(run.episodes, computed):
+        yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than decisions.parquet"
     wrong = sum(a.success != b for a, b in zip(run.episodes, _ends(run), strict=True) if b is not None)
     if wrong:
         yield f"episodes.csv has another success in {amount(wrong, 'row')} than the last decision leaves"
+
+
+def differing(stated: Sequence[Episode], computed: Sequence[Episode]) -> Iterator[tuple[str, int]]:
+    """Yield the columns in which the rows of two tables of the same episodes differ, and in how many."""
+    for name in Episode.__struct_fields__:
+        pairs = zip(stated, computed, strict=True)
+        wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
+        if wrong:
+            yield name, wrong
 
 
 def _ends(run: Run) -> Sequence[bool | None]:

@@ -211,7 +211,7 @@ class Run:
 
     def _scores(self, file: Path) -> tuple[Score, ...]:
         scores = _records(file, Score)
-        if len({(s.condition, s.metric, s.interval) for s in scores}) < len(scores):
+        if len({score.key for score in scores}) < len(scores):
             raise ValueError("a figure is there twice")
         return scores
 

@@ -331,6 +331,11 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
         return cls(condition, metric, value, low, high, e.n, e.n_excluded, interval)
 
     @property
+    def key(self) -> tuple[str, str, str]:
+        """What a summary has it by: condition, metric and kind of interval."""
+        return self.condition, self.metric, self.interval
+
+    @property
     def estimate(self) -> Estimate:
         value, low, high = (float("nan") if x is None else x for x in (self.value, self.low, self.high))
         return Estimate(value, low, high, self.n, self.n_excluded)

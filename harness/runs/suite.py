@@ -79,11 +79,10 @@ class SuiteRun:
 
     def _means(self) -> Iterator[Score]:
         first, *rest = self.runs.values()
-        others_by_key = [{(s.condition, s.metric, s.interval): s for s in run.scores} for run in rest]
+        others_by_key = [{s.key: s for s in run.scores} for run in rest]
         for s in first.scores:
-            key = s.condition, s.metric, s.interval
-            if s.interval != "seed means" and all(key in scores for scores in others_by_key):
-                of_families = [s, *(scores[key] for scores in others_by_key)]
+            if s.interval != "seed means" and all(s.key in scores for scores in others_by_key):
+                of_families = [s, *(scores[s.key] for scores in others_by_key)]
                 yield self._gain(s) if is_gain(s, self.conditions) else mean(of_families)
 
     @cached_property

@@ -30,7 +30,7 @@ from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import device
 from harness.evaluate.asking import EGO, Asker, wanted_in
-from harness.evaluate.frozen_world import FrozenWorld
+from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.of_run import check_prompts, points_of, spec_of
 from harness.evaluate.spec import Spec
@@ -108,7 +108,7 @@ class ReplayedRun:
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         times = PAPER if latency == "paper" else manifest.latency
         self._asker = Asker(
-            spec_of(self.run, self.dataset), self._open, times, folder / MORE, answers,
+            spec_of(self.run, FrozenSource(self.dataset)), self._open, times, folder / MORE, answers,
             self._count_answered, self._set_left,
         )  # fmt: skip
 
