@@ -383,5 +383,7 @@ def test_a_letter_is_worth_its_action(make: Make) -> None:
     call = {"role": "assistant", "content": None, "tool_calls": [{"name": "brake"}]}
     without_text: list[Any] = [[call], [], [{"role": "assistant"}], [{"content": 3}], None]
     assert env.advantage([], without_text, **columns([row] * 5)) == [-1] * 5
+    of_others = [[call, {"role": role, "content": "B"}] for role in ("tool", "user")]
+    assert env.advantage([], of_others, **columns([row] * 2)) == [-1, -1]
     in_parts = [{"content": [{"type": "text", "text": said[1][:9]}, {"type": "text", "text": said[1][9:]}]}]
     assert env.advantage([], [in_parts], **columns([row])) == [0]

@@ -170,10 +170,14 @@ def _rewards(
 
 
 def _text(completion: Any) -> str:
-    """Return the text of a completion, or of a chat's last message; empty if it has none."""
+    """Return the text of a completion, or of a chat's last message; empty if it has none.
+
+    What a tool or a user said last is not the model's.
+    """
     if isinstance(completion, Sequence) and not isinstance(completion, str):
         last = completion[-1] if completion else {}
-        completion = last.get("content") if isinstance(last, Mapping) else None
+        by_model = isinstance(last, Mapping) and last.get("role", "assistant") == "assistant"
+        completion = last.get("content") if by_model else None
     if isinstance(completion, list):  # a message in parts
         parts = (part.get("text") for part in completion if isinstance(part, Mapping))
         completion = "".join(part for part in parts if isinstance(part, str))
