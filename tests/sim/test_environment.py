@@ -15,8 +15,9 @@ import pytest
 from evaluating import scenes_of
 from highway_env.envs import HighwayEnv, MergeEnv
 from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.controller import ControlledVehicle
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from highway_env.vehicle.objects import Obstacle
 from my_roads import Breakdown
 
 from harness.core.errors import UserError
@@ -80,10 +81,35 @@ class Ghost(Vehicle):
 
 
 class Haunted(Breakdown):
+    """Ghosts: two where the ego is, a vehicle and an object ahead that are passed through."""
+
     def _reset(self):
         super()._reset()
         for _ in range(2):
             self.road.vehicles.append(Ghost(self.road, self.vehicle.position, 0, 14))
+        thin = Vehicle(self.road, self.vehicle.position + np.array([8.0, 0.0]), 0, 14)
+        mirage = Obstacle(self.road, self.vehicle.position + np.array([12.0, 0.0]))
+        thin.solid = mirage.collidable = False
+        self.road.vehicles.append(thin)
+        self.road.objects.append(mirage)
+
+
+class Fading(Breakdown):
+    """Each second the first of the other vehicles turns into a ghost."""
+
+    def step(self, action):
+        result = super().step(action)
+        next(v for v in self.road.vehicles[1:] if v.collidable).collidable = False
+        return result
+
+
+class Vanishing(Breakdown):
+    """Its ego is taken off the road after a second."""
+
+    def step(self, action):
+        result = super().step(action)
+        self.road.vehicles = self.road.vehicles[1:]
+        return result
 
 
 class OwnVehicle(ControlledVehicle):
@@ -109,20 +135,71 @@ class PlainEgo(OwnEgo):
     ego_class = Vehicle
 
 
-for kind in (Without, Roadless, Crashed, Haunted, OwnEgo, IdmEgo, PlainEgo):
+class Speedless(MDPVehicle):
+    def __init__(self, *where, **how):
+        super().__init__(*where, **how)
+        self.target_speeds = None
+
+
+class SpeedlessEgo(OwnEgo):
+    ego_class = Speedless
+
+
+class Through(MDPVehicle):
+    def __init__(self, *where, **how):
+        super().__init__(*where, **how)
+        self.collidable = False
+
+
+class GhostEgo(OwnEgo):
+    ego_class = Through
+
+
+class AbsentEgo(Breakdown):
+    """The ego is not among the road's vehicles."""
+
+    def _reset(self):
+        super()._reset()
+        self.road.vehicles.remove(self.vehicle)
+
+
+EGOS = {
+    OwnEgo: "is a OwnVehicle, which has no target_speeds, speed_index; make it of self.action_type",
+    IdmEgo: "is a IDMVehicle, which has no target_speeds, speed_index; make it of self.action_type",
+    PlainEgo: "is a Vehicle, which has no target_speeds, target_speed, speed_index, route; make it of",
+    SpeedlessEgo: "is a Speedless, which has target_speeds None, no speeds; make it of self.action_type",
+    GhostEgo: "is a Through, which hits nothing; leave it collidable and solid",
+    AbsentEgo: "is not on the road; append self.vehicle to self.road.vehicles",
+}
+for kind in (Without, Roadless, Crashed, Haunted, Fading, Vanishing, *EGOS):
     gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
 
 
-@pytest.mark.parametrize("kind", [OwnEgo, IdmEgo, PlainEgo])
-def test_an_ego_of_another_class_is_named(kind):
-    with pytest.raises(UserError, match=r"its ego is a \w+, which has no target_speeds; make it of self"):
+@pytest.mark.parametrize(("kind", "said"), EGOS.items())
+def test_an_ego_that_meta_actions_do_not_drive_is_named(kind, said):
+    with pytest.raises(UserError) as error:
         scenarios.get(f"env:{kind.__name__.lower()}-v0:decisions=2")
+    assert f"its ego {said}" in str(error.value)
+
+
+def test_an_ego_that_leaves_the_road_is_named():
+    with pytest.raises(UserError, match=r"its ego leaves the road in seed 0; keep it in self\.road"):
+        examine(scenarios.get("env:vanishing-v0"), 0)
+
+
+def test_who_turns_into_a_ghost_has_gone():
+    world = EnvironmentWorld.begun(scenarios.get("env:fading-v0:decisions=2"), 0)
+    seen = []
+    for _ in range(3):
+        seen.append(len(world.state().vehicles))
+        world.advance(world.frame + world.period)
+    assert seen == [5, 4, 3]
 
 
 def test_what_collides_with_nothing_hides_nothing_and_helps_nobody(tmp_path):
     own, haunted = (scenarios.get(f"{name}:decisions=1,helpers=2") for name in (OWN, "env:haunted-v0"))
     seen = [World.start(each, 0).state() for each in (own, haunted)]
-    assert seen[1].vehicles == seen[0].vehicles
+    assert (seen[1].vehicles, seen[1].buildings) == (seen[0].vehicles, seen[0].buildings)
     graphs = [scene_graph(each, state, "v1") for each, state in zip((own, haunted), seen, strict=True)]
     assert graphs[0].sectors == graphs[1].sectors
 

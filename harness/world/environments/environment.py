@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.strangers import strangers
@@ -20,6 +22,7 @@ from harness.world.road import Lane
 PREFIX, CHANGES = "env:", ":config="
 IMPORTS = "SWARMDRIVE_IMPORTS"  # environment variable: modules, with commas, that names may have imported
 OWN_PACKAGE = "highway_env"
+OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")  # what the ego of meta-actions has
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
@@ -108,7 +111,36 @@ def reset(name: str, seed: int) -> Any:
     except Exception as error:
         raise UserError(f"{shown(name)} cannot be reset: {raised(error)}; mind its config") from None
     meta_actions(name, env)
+    _only_drivable(name, env)
     return env
+
+
+def _only_drivable(name: str, env: Any) -> None:
+    """Raise UserError unless the ego is on the road, meta-actions drive it, and it can be hit."""
+    ego, its = env.vehicle, f"{shown(name)}: its ego"
+    if not any(v is ego for v in env.road.vehicles):
+        raise UserError(f"{its} is not on the road; append self.vehicle to self.road.vehicles")
+    its, made = (
+        f"{its} is a {printable(type(ego).__name__)}, which",
+        "make it of self.action_type.vehicle_class",
+    )
+    if missing := [attribute for attribute in OF_EGO if not hasattr(ego, attribute)]:
+        raise UserError(f"{its} has no {', '.join(missing)}; {made}")
+    try:
+        speeds_mps = [float(speed) for speed in ego.target_speeds]
+    except (TypeError, ValueError):
+        speeds_mps = []
+    if not (speeds_mps and np.isfinite(speeds_mps).all()):
+        raise UserError(
+            f"{its} has target_speeds {printable(repr(ego.target_speeds), 40)}, no speeds; {made}"
+        )
+    if not hittable(ego):
+        raise UserError(f"{its} hits nothing; leave it collidable and solid")
+
+
+def hittable(thing: Any) -> bool:
+    """Return whether others can run into a vehicle or an object of highway-env: not into a ghost."""
+    return bool(thing.collidable and thing.solid)
 
 
 def _create(name: str) -> Any:

@@ -74,11 +74,6 @@ def place(name: str) -> Place:
     """Return the properties that are the same for every seed, from seed 0."""
     env = reset(name, 0)
     ego, network = env.vehicle, env.road.network
-    if not hasattr(ego, "target_speeds"):
-        raise UserError(
-            f"{environment.shown(name)}: its ego is a {type(ego).__name__}, which has no target_speeds; make "
-            "it of self.action_type.vehicle_class"
-        )
     available = environment.meta_actions(name, env).actions.values()
     p, lane = _parameters(name, env, len(available)), lane_of(ego)
     goal = partial(_goal_m, first_target_mps(ego))

@@ -16,7 +16,15 @@ import numpy as np
 from harness.core.errors import UserError
 from harness.world import beacons
 from harness.world.conflict_measures import observe
-from harness.world.environments.environment import Constants, lane_of, meta_actions, numbered, reset, shown
+from harness.world.environments.environment import (
+    Constants,
+    hittable,
+    lane_of,
+    meta_actions,
+    numbered,
+    reset,
+    shown,
+)
 from harness.world.environments.place import Parameters, ends_of, first_target_mps, place
 from harness.world.gaps import least_gaps_m
 from harness.world.parameters import DIALS
@@ -164,16 +172,19 @@ class EnvironmentWorld(World):
             self.journey.passed(speeds_mps, gap_m, conflicts, hz)
 
     def _recast(self) -> None:
-        """Remove vehicles that have left, and add new ones."""
-        present, places = (
-            {id(v) for v in _solid(self.road)},
-            {id(v): n for n, v in enumerate(self.everybody)},
-        )
+        """Remove vehicles that have left, and add new ones. Raises UserError if the ego has left."""
+        solid = _solid(self.road)
+        present, places = {id(v) for v in solid}, {id(v): n for n, v in enumerate(self.everybody)}
+        if id(self.everybody[0]) not in present:
+            raise UserError(
+                f"{shown(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep it in "
+                "self.road.vehicles, collidable and solid"
+            )
         self.everybody = [v for v in self.everybody if id(v) in present]
         known = {id(v) for v in self.everybody}
         for v in self.everybody:
             self._place(v)
-        for v in _solid(self.road):
+        for v in solid:
             if id(v) not in known:
                 self._enter(v, "other")
         now = [places.get(id(v), -1) for v in self.everybody]
@@ -239,12 +250,12 @@ def _kind(v: Any) -> Kind:
 
 def _solid(road: Any) -> list[Any]:
     """Return the vehicles that can be hit: one that collides with nothing hides nothing, and helps nobody."""
-    return [v for v in road.vehicles if v.collidable]
+    return list(filter(hittable, road.vehicles))
 
 
 def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
     """Return the solid objects nearest to the ego as buildings, by their axis-parallel bounding boxes."""
-    solid = sorted((thing for thing in env.road.objects if thing.solid), key=partial(_apart_m, env.vehicle))
+    solid = sorted(filter(hittable, env.road.objects), key=partial(_apart_m, env.vehicle))
     boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
     return tuple(
         Building(f"b{n}", *box.min(axis=0).round(3).tolist(), *box.max(axis=0).round(3).tolist())
