@@ -2,6 +2,8 @@
 
 import json
 import os
+import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -167,6 +169,41 @@ def test_a_hook_that_hangs_is_left_behind(
     assert said.splitlines().count(line) == 1
     assert hangs.told[-1][0] == "answered"
     assert good.told[-1][0] == "end"
+
+
+AWAY = """
+import atexit, socket, sys, time
+from harness.core import process
+from harness.evaluate import hooks
+
+port = int(sys.argv.pop())
+
+class Away:
+    def begin(self, folder, settings):
+        atexit.register(time.sleep, 60)
+        with socket.create_connection(("127.0.0.1", port)) as server:
+            server.recv(1)
+
+hooks.PATIENCE_S, process.GIVEN_UP_S = 0.4, 0.1
+hooks.chosen = lambda names: {"away": Away()}
+
+from harness import cli
+process.run(cli.main)
+"""
+
+
+def test_the_process_does_not_wait_again_for_a_server_that_did_not_answer(
+    two_path: Path, tmp_path: Path
+) -> None:
+    """A package's own handler at the end of the process waits for it as well."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        typed = [*map(str, typed_eval(two_path, "--quiet", "--json")), str(silent.getsockname()[1])]
+        ended = subprocess.run(
+            [sys.executable, "-c", AWAY, *typed], cwd=tmp_path, capture_output=True, text=True, timeout=45,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, check=False,
+        )  # fmt: skip
+    assert (ended.returncode, json.loads(ended.stdout)["run"]) == (0, "run")
+    assert "tracker away: its begin takes longer than 0.4 s; the run goes on without it" in ended.stderr
 
 
 def test_a_hook_that_takes_long_is_waited_for_aloud(

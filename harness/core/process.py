@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 
 STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
 LEAVE_S = 120.0  # in which the process is gone once its work is done; a tracker may still send things
+GIVEN_UP_S = 2.0  # the same where something hangs that was waited for already
 AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is raised again
 LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
 # Texts of the errors, other than MemoryError, of a process whose memory ran out.
@@ -69,6 +70,12 @@ def run(program: Callable[[], object]) -> None:
     finally:
         stops.let_go()
         _leave(sys.exception())
+
+
+def give_up() -> None:
+    """Note that something hangs: what its package registered with `atexit` may wait for the same server."""
+    global LEAVE_S
+    LEAVE_S = min(LEAVE_S, GIVEN_UP_S)
 
 
 def _leave(error: BaseException | None) -> None:

@@ -15,7 +15,7 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from harness.core import extras
+from harness.core import extras, process
 from harness.core.errors import one_line, printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.strangers import strangers
@@ -93,6 +93,7 @@ class _Caller:
             print(f"harness: waiting for {self._what}, {patience_s:g} s at most", file=sys.stderr)
         if not wait([done], max(patience_s - SAID_S, 0.0)).done:
             os.chdir(here)  # which it may have left
+            process.give_up()
             raise TimeoutError(f"its {method} takes longer than {patience_s:g} s")
         done.result()
 
