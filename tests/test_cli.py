@@ -117,6 +117,8 @@ def one_line(said: Said) -> str:
         (["model", "check"], "Missing argument 'name'"),
         (["dataset", "check", __file__], "is a file; a dataset is a folder that `harness dataset"),
         (["eval", "--dataset", __file__], "is a file; a dataset is a folder that `harness dataset"),
+        (["report", __file__], "is a file; a run is a folder, made by `harness eval`"),
+        (["run", "check", __file__], "is a file; a run is a folder, made by `harness eval`"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_that_says_what_is_allowed(

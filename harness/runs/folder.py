@@ -275,6 +275,8 @@ def read(path: Path) -> Run:
             if (path / SUITE).is_file()
             else f"{printable(path)} is no finished run, since its model could not be asked: {reason}"
             if (reason := work.unanswered(path))
+            else f"{printable(path)} is a file; a run is a folder, made by `harness eval` or `harness drive`"
+            if path.is_file()
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
         )
