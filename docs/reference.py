@@ -12,7 +12,7 @@ from typer import Context
 from typer.main import get_command
 
 from harness.cli import app
-from harness.cli.commands import PANELS
+from harness.cli.commands import panels
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "commands.md"
@@ -113,7 +113,7 @@ def shared_section(common: dict[str, tuple[str, set[str]]]) -> str:
 def overview(found: list[tuple[str, Any]]) -> str:
     """Every command with the first sentence of its purpose, in the groups of `--help`."""
     lines = ["| command | what it does |", "|---|---|"]
-    for panel, names in PANELS.items():
+    for panel, names in panels().items():
         lines.append(f"| **{panel}** | |")
         for path, command in found:
             if path.split()[1] in names:

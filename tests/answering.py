@@ -12,8 +12,8 @@ from harness.backends.base import Backend
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.core import web
-from harness.serving.app import Service
-from harness.serving.model import ServedModel, served
+from harness.extensions.decide.app import Service
+from harness.extensions.decide.model import ServedModel, served
 
 
 @contextmanager

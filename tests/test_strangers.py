@@ -20,7 +20,7 @@ from harness.core import parallel
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.strangers import strangers
-from harness.serving.desk import Desk
+from harness.extensions.decide.desk import Desk
 
 ROOT = Path(__file__).parents[1]
 Typed = Callable[..., tuple[int, str, str]]

@@ -1,7 +1,14 @@
-"""State every command: what is typed for it, the function behind it, and how it was typed before."""
+"""State every command of the core: what is typed, the function behind it, and how it was typed before.
 
-# The function behind each command, as `module:function` of this package. A module alone stands for its
-# function `command`.
+Extensions add to each of these tables.
+"""
+
+from collections.abc import Mapping
+
+from harness.core.extensions import extensions, joined
+
+# The function behind each command, as `module:function` of this package, or of another whose dotted name is
+# given. A module alone stands for its function `command`.
 COMMANDS = {
     "init": "init",
     "eval": "eval",
@@ -10,7 +17,6 @@ COMMANDS = {
     "plan": "plan",
     "report": "report",
     "view": "view",
-    "serve": "serve",
     "benchmark run": "benchmark:run",
     "benchmark pack": "benchmark:pack",
     "benchmark verify": "benchmark:verify",
@@ -85,7 +91,7 @@ GROUPS = {
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report", "view"),
-    "More": ("plan", "serve", "benchmark", "study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("plan", "benchmark", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.
@@ -116,3 +122,27 @@ OLD = {
 
 # Short for a command of a group, for good and without a note.
 SHORT = {"doctor": "model doctor"}
+
+
+def commands() -> Mapping[str, str]:
+    """Return every command, with those of extensions."""
+    return joined(COMMANDS, "commands")
+
+
+def groups() -> Mapping[str, str]:
+    """Return the help of every group."""
+    return joined(GROUPS, "groups")
+
+
+def spellings() -> Mapping[str, str]:
+    """Return every old spelling, and what replaces it."""
+    return joined(OLD, "spellings")
+
+
+def panels() -> Mapping[str, tuple[str, ...]]:
+    """Return the panels of the first screen, each with its words."""
+    words = {panel: list(names) for panel, names in PANELS.items()}
+    for extension in extensions().values():
+        for word, panel in extension.panels.items():
+            words.setdefault(panel, []).append(word)
+    return {panel: tuple(dict.fromkeys(names)) for panel, names in words.items()}

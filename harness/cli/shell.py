@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +11,8 @@ from typer import Context, Typer, echo
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
+from harness.cli.commands import COMMANDS, GROUPS, OLD, SHORT, commands, groups, panels, spellings
+from harness.core.extensions import owner
 from harness.core.strangers import ended, ends_the_program
 
 UNREAD = object()
@@ -24,32 +24,46 @@ class Stopped(Exception):
 
 
 class Branch(Mapping[str, Any]):
-    """The commands and groups below a path, by name; each is loaded when it is looked up."""
+    """The commands and groups below a path, by name; each is loaded when it is looked up.
+
+    Extensions are looked for only where the core has no such name, or all are listed.
+    """
 
     def __init__(self, path: str) -> None:
-        depth = len(path.split())
-        paths = [words for words in map(str.split, COMMANDS) if words[:depth] == path.split()]
-        self.paths = {words[depth]: " ".join(words[: depth + 1]) for words in paths}
+        self.path = path
+        self.core = _below(path, COMMANDS)
         self.loaded: dict[str, Any] = {}
 
     def __getitem__(self, name: str) -> Any:
-        path = self.paths[name]
         if name not in self.loaded:
-            self.loaded[name] = Group(path, name=name) if path in GROUPS else _command(name, COMMANDS[path])
+            path = self.core[name] if name in self.core else _below(self.path, commands())[name]
+            self.loaded[name] = (
+                Group(path, name=name)
+                if path in GROUPS or path in groups()
+                else _command(name, COMMANDS.get(path) or commands()[path])
+            )
             hasten(self.loaded[name])
         return self.loaded[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.paths)
+        return iter(_below(self.path, commands()))
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(_below(self.path, commands()))
+
+
+def _below(path: str, table: Mapping[str, str]) -> dict[str, str]:
+    """Return the names that may follow a path in a table of commands, each with what is typed up to it."""
+    depth = len(path.split())
+    paths = [words for words in map(str.split, table) if words[:depth] == path.split()]
+    return {words[depth]: " ".join(words[: depth + 1]) for words in paths}
 
 
 def _command(name: str, place: str) -> Any:
     module, _, function = place.partition(":")
+    whole = module if "." in module else f"harness.cli.{module}"
     app = Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name, cls=Command)(getattr(import_module(f"harness.cli.{module}"), function or "command"))
+    app.command(name, cls=Command)(getattr(import_module(whole), function or "command"))
     return get_command(app)
 
 
@@ -75,7 +89,7 @@ class Group(TyperGroup):
     def __init__(self, path: str = "", **attributes: Any) -> None:
         below: Any = Branch(path)
         attributes |= {"commands": below, "no_args_is_help": True, "rich_markup_mode": None}
-        super().__init__(**{"help": GROUPS.get(path), **attributes})
+        super().__init__(**{"help": GROUPS.get(path) or (groups().get(path) if path else None), **attributes})
         self.path = path
 
     def invoke(self, ctx: Any) -> Any:
@@ -99,7 +113,15 @@ class Group(TyperGroup):
             )
         args = new.split() + args[len(old.split()) :]
         if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            last = {**OLD, **{words.split()[-1]: words for words in (*COMMANDS, *OLD.values())}}
+            from difflib import get_close_matches
+
+            typed = f"{self.path} {args[0]}".strip()
+            if extension := owner(typed):
+                ctx.fail(f"`harness {typed}` is part of the extension {extension}, which is not installed")
+            last = {
+                **spellings(),
+                **{words.split()[-1]: words for words in (*commands(), *spellings().values())},
+            }
             near = get_close_matches(args[0], [*self.commands, *last])
             meant = dict.fromkeys(
                 f"{self.path} {name}".strip() if name in self.commands else last[name] for name in near
@@ -113,7 +135,7 @@ class Group(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each panel's commands, each with the first sentence of its help."""
         width = max(map(len, self.commands))
-        for panel, names in {"Commands": tuple(self.commands)}.items() if self.path else PANELS.items():
+        for panel, names in {"Commands": tuple(self.commands)}.items() if self.path else panels().items():
             with formatter.section(panel):
                 formatter.write_dl(
                     [
@@ -128,10 +150,17 @@ class Group(TyperGroup):
 
 def respelt(args: list[str]) -> tuple[str, str]:
     """Return the old or short spelling with which arguments begin, and what it stands for; empty if none."""
-    spellings = {**OLD, **SHORT}
     for n in (2, 1):
-        if (typed := " ".join(args[:n])) in spellings:
-            return typed, spellings[typed]
+        typed = " ".join(args[:n])
+        if typed in OLD or typed in SHORT:
+            return typed, {**OLD, **SHORT}[typed]
+    if args[0] in COMMANDS or (
+        args[0] in GROUPS and " ".join(args[:2]) in _below(args[0], COMMANDS).values()
+    ):
+        return "", ""  # of the core: nobody looks for extensions
+    for n in (2, 1):
+        if (typed := " ".join(args[:n])) in spellings():
+            return typed, spellings()[typed]
     return "", ""
 
 

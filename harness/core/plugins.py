@@ -24,7 +24,21 @@ def entries(group: str) -> Mapping[str, Any]:
 def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
     from importlib.metadata import entry_points  # imported here because it is slow
 
-    return {entry.name: entry for entry in sorted(entry_points(group=group))}
+    by_name: dict[str, Any] = {}
+    for entry in sorted(entry_points(group=group), key=lambda entry: (not is_ours(entry), entry)):
+        first = by_name.setdefault(entry.name, entry)
+        if first.value != entry.value:
+            name, *places = map(printable, (entry.name, first.value, entry.value))
+            print(
+                f"harness: {name!r} ({group}) is in two packages, {' and '.join(places)}; the first is taken",
+                file=sys.stderr,
+            )
+    return by_name
+
+
+def is_ours(entry: Any) -> bool:
+    """Return whether an entry point is of this distribution, whose names nobody else's replace."""
+    return str(entry.value).startswith("harness.")
 
 
 class Plugins(Mapping[str, T], Generic[T]):
@@ -55,7 +69,9 @@ class Plugins(Mapping[str, T], Generic[T]):
         return len(list(iter(self)))
 
     def _entries(self) -> Mapping[str, Any]:
-        return entries(self.group)
+        from harness.core.extensions import added
+
+        return {**added(self.group), **entries(self.group)}
 
     def _load(self, name: str) -> T:
         entry = self._entries()[name]

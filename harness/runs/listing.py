@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.core.errors import UserError, printable
+from harness.core.extensions import studies
 from harness.core.files import BROKEN, opened, text_of
-from harness.core.formats import CONFIG, SOURCES, STUDIES, SUITE, WORK
+from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
 from harness.runs.doubts import OFF_LAG, doubted
 from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, leading
 
 DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
-MARKS = {**{f"{kind}.json": word for kind, word in STUDIES.items()}, "fidelity.csv": "study"}  # by file
 FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
 Rows = Sequence[dict[str, str]]  # of a summary
@@ -85,6 +85,11 @@ def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
                 yield from _entries(subfolder, root, depth + 1)
 
 
+def _marks() -> dict[str, str]:
+    """Return what lists call a study, by the file that marks its folder."""
+    return {**{f"{kind}.json": word for kind, word in studies().items()}, "fidelity.csv": "study"}
+
+
 def _within(path: str, root: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(root)
 
@@ -109,7 +114,7 @@ def _entry(path: str, root: str) -> Listed | None:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
     if has(SUITE):
         return _suite_entry(path, root, has("summary.csv"), written)
-    for name, kind in MARKS.items():
+    for name, kind in _marks().items():
         if has(name):
             written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
             try:

@@ -12,9 +12,9 @@ from markupsafe import Markup
 
 from harness.core import extras
 from harness.core.errors import UserError, printable
+from harness.core.extensions import studies
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
-from harness.core.formats import STUDIES
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
@@ -127,7 +127,7 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
 
 def refuse_taken(out: Path, kind: str) -> None:
     """Raise UserError if a folder has a finished run, or a finished study of another kind."""
-    for name in ("run", "suite", *STUDIES):
+    for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
                 f"--out {printable(out)} holds something else, as its {name}.json says; name another folder"

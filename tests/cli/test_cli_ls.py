@@ -13,10 +13,10 @@ from types import ModuleType
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness import cli, studies
+from harness import cli, extensions, studies
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
-from harness.core.formats import STUDIES
+from harness.core.extensions import studies as kinds_of_study
 from harness.dataset.load import Dataset
 from harness.report.words import compared
 from harness.runs import listing
@@ -239,9 +239,10 @@ def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., S
 
 def kinds_of_studies() -> set[str]:
     """The kinds that the program makes, by its text: `Study("trust", …)`."""
-    room = Path(studies.__file__).parent
+    rooms = (Path(studies.__file__).parent, Path(extensions.__file__).parent)
     calls = [
         node
+        for room in rooms
         for file in room.rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Study"
@@ -252,14 +253,15 @@ def kinds_of_studies() -> set[str]:
 def test_every_study_that_is_made_is_listed_and_refuses_the_folder_of_another(tmp_path: Path) -> None:
     kinds = kinds_of_studies()
     assert len(kinds) > 8
-    assert kinds - {"attribution"} == set(STUDIES), "which lies in its run's folder"
-    for kind in STUDIES:
+    known = dict(kinds_of_study())
+    assert kinds - {"attribution"} == set(known), "which lies in its run's folder"
+    for kind in known:
         (tmp_path / kind).mkdir()
         (tmp_path / kind / f"{kind}.json").write_text('{"sources": [{"name": "proxy"}]}')
-        other = next(name for name in STUDIES if name != kind)
+        other = next(name for name in known if name != kind)
         with pytest.raises(UserError, match=rf"holds something else, as its {kind}\.json says"):
             refuse_taken(tmp_path / kind, other)
     listed = {one.name: one for one in runs(tmp_path)}
-    assert listed.keys() == STUDIES.keys()
+    assert listed.keys() == known.keys()
     assert {one.state for one in listed.values()} == {"finished"}
-    assert {name: one.kind for name, one in listed.items()} == STUDIES
+    assert {name: one.kind for name, one in listed.items()} == known

@@ -13,7 +13,7 @@ import typer
 from typer.main import get_command
 
 from harness.cli import app
-from harness.cli.commands import COMMANDS, GROUPS, OLD, PANELS, SHORT
+from harness.cli.commands import SHORT, commands, groups, panels, spellings
 from harness.cli.shell import UNREAD, plain
 from harness.coordination.attacks import ATTACKS
 from harness.coordination.rules import RULES, reads_plans
@@ -69,7 +69,7 @@ def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: 
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
-@pytest.mark.parametrize("group", ["", *GROUPS])
+@pytest.mark.parametrize("group", ["", *groups()])
 def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., Said], group: str) -> None:
     code, out, err = harness(*group.split(), "--help")
     assert (code, err) == (0, "")
@@ -80,13 +80,13 @@ def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., S
 def test_the_map_has_every_command_under_its_panel(harness: Callable[..., Said]) -> None:
     blocks = [block.splitlines() for block in harness("--help")[1].split("\n\n")]
     shown = {head: {line.split()[0] for line in lines} for head, *lines in blocks if lines}
-    for panel, commands in PANELS.items():
-        assert shown[f"{panel}:"] == set(commands)
-    assert {name for names in PANELS.values() for name in names} == {path.split()[0] for path in COMMANDS}
-    assert sum(map(len, PANELS.values())) <= 15
+    for panel, words in panels().items():
+        assert shown[f"{panel}:"] == set(words)
+    assert {name for names in panels().values() for name in names} == {path.split()[0] for path in commands()}
+    assert sum(map(len, panels().values())) <= 15
 
 
-@pytest.mark.parametrize(("old", "new"), OLD.items())
+@pytest.mark.parametrize(("old", "new"), spellings().items())
 def test_an_old_spelling_works_and_says_the_new_one(harness: Callable[..., Said], old: str, new: str) -> None:
     code, out, err = harness(*old.split(), "--help")
     assert (code, out) == (0, harness(*new.split(), "--help")[1])

@@ -37,8 +37,8 @@ def command(
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
     from harness.core import web
-    from harness.serving.app import CONNECTIONS, Service
-    from harness.serving.model import ServedModel, served
+    from harness.extensions.decide.app import CONNECTIONS, Service
+    from harness.extensions.decide.model import ServedModel, served
 
     in_range("--port", port, 0, 65535)
     local, token = web.is_loopback(host), token or os.environ.get(TOKEN) or None

@@ -10,7 +10,7 @@ import numpy as np
 from harness.core import extras
 from harness.core.errors import UserError, one_line
 from harness.core.image import Image
-from harness.serving.asked import Refusal
+from harness.extensions.decide.asked import Refusal
 
 MOST_PX = 2**20  # of a picture: 3 MB each that waits
 _URL = re.compile(r"data:image/(png|jpeg);base64,", re.IGNORECASE)

@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
+from harness.extensions.decide.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, asked, text_of
 from harness.prompts.decision import Question
-from harness.serving.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, asked, text_of
 
 Content = str | dict[str, Any] | list[Any]
 

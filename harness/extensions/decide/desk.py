@@ -9,7 +9,7 @@ from threading import Thread
 from harness.backends.base import Backend, Completion, Request
 from harness.core.errors import UserError
 from harness.core.strangers import strangers
-from harness.serving.asked import Refusal
+from harness.extensions.decide.asked import Refusal
 
 PLACES = 64  # questions that may wait
 AGAIN_S = 1  # after which a client that found no place may ask again

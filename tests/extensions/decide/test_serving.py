@@ -38,12 +38,12 @@ from harness.core import web
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
+from harness.extensions.decide.app import CONNECTIONS, Service
+from harness.extensions.decide.asked import Refusal
+from harness.extensions.decide.desk import Desk
+from harness.extensions.decide.model import ServedModel, served
 from harness.prompts.decision import Question
 from harness.runs import folder
-from harness.serving.app import CONNECTIONS, Service
-from harness.serving.asked import Refusal
-from harness.serving.desk import Desk
-from harness.serving.model import ServedModel, served
 
 Said = tuple[int, str, str]
 WIRES = ("systemone", "decisions")

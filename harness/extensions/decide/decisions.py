@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
+from harness.extensions.decide.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, Refusal, asked, text_of
 from harness.prompts.decision import Question
-from harness.serving.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, Refusal, asked, text_of
 
 
 class Text(Struct, tag_field="type", tag="input_text"):

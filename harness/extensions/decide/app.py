@@ -24,10 +24,10 @@ from starlette.routing import Route
 from harness.backends import base
 from harness.core import web
 from harness.core.errors import Unanswered, UserError, one_line, printable
-from harness.serving import decisions, systemone
-from harness.serving.asked import Answered, Enquiry, Refusal, answered
-from harness.serving.desk import AGAIN_S, PLACES, Desk
-from harness.serving.model import ServedModel
+from harness.extensions.decide import decisions, systemone
+from harness.extensions.decide.asked import Answered, Enquiry, Refusal, answered
+from harness.extensions.decide.desk import AGAIN_S, PLACES, Desk
+from harness.extensions.decide.model import ServedModel
 
 MOST_BYTES = 2**20  # of a request
 MOST_SEEN_BYTES = 5 * 2**20  # of one with a picture

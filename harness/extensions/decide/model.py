@@ -11,10 +11,10 @@ from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.image import Image
 from harness.evaluate.agent import Agent
+from harness.extensions.decide.asked import Asked, Enquiry, Refusal
+from harness.extensions.decide.picture import picture
 from harness.prompts import decision, versions
 from harness.prompts.readout import LETTERS
-from harness.serving.asked import Asked, Enquiry, Refusal
-from harness.serving.picture import picture
 
 ANY = "default"  # the name that asks for whatever there is
 MOST_CHARACTERS = 2**18  # of a state and its question: each order of the letters is split into tokens

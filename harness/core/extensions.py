@@ -1,0 +1,141 @@
+"""Hold what extensions add: one object for those of this distribution and for everybody's packages.
+
+An extension is an entry point of the group `swarmdrive.extensions`; docs/extend.md shows a whole one. Those
+that ship are folders of `harness/extensions/`. The distribution's metadata name them and their commands:
+without the folder all else works, and says what a command was part of.
+"""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Any
+
+from harness.core import formats
+from harness.core.errors import UserError, printable
+from harness.core.plugins import Plugins, entries, is_ours
+
+GROUP = "swarmdrive.extensions"
+COMMANDS = "swarmdrive.commands"  # in the metadata: by command, the extension that has it
+INTERFACE = 1
+Texts = Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extension:
+    """What a package adds. A place is `module:name`, imported when it is first used."""
+
+    name: str  # the same as that of its entry point
+    interface: int = INTERFACE  # the version of this class that it was written for
+    commands: Texts = field(default_factory=dict)  # what is typed after `harness`, and the function's place
+    groups: Texts = field(default_factory=dict)  # the groups of commands that it opens, and their help
+    panels: Texts = field(default_factory=dict)  # its words of the first screen, and the panel of each
+    spellings: Texts = field(default_factory=dict)  # older spellings of its commands, and what replaces them
+    # kinds of study that it writes, and what lists call them; `<kind>.json` marks such a folder
+    studies: Texts = field(default_factory=dict)
+    # plug-ins by kind, such as `rules` or `metrics`, and by name; the value is a place
+    adds: Mapping[str, Texts] = field(default_factory=dict)
+
+
+def extensions() -> Mapping[str, Extension]:
+    """Return the extensions that are installed and work, those that ship first.
+
+    Of each other one a line on stderr says, once, what is wrong with it.
+    """
+    return _extensions(tuple(sys.path))
+
+
+def owner(command: str) -> str | None:
+    """Return the extension that has a command or group, by the metadata of what is installed; else None."""
+    for name, entry in entries(COMMANDS).items():
+        if f"{name} ".startswith(f"{command} "):
+            return str(entry.value).rpartition(".")[2]
+    return None
+
+
+def joined(core: Texts, kind: str) -> Texts:
+    """Return a table of the core, such as its commands, with what extensions add to it.
+
+    What is there already is not replaced; a line on stderr says so, once.
+    """
+    return _joined(tuple(core.items()), kind, tuple(sys.path))
+
+
+def studies() -> Texts:
+    """Return every kind of study, and what lists call it."""
+    return joined(formats.STUDIES, "studies")
+
+
+def added(group: str) -> Mapping[str, Any]:
+    """Return the entry points of the plug-ins of a group, such as `swarmdrive.rules`, that extensions add."""
+    from importlib.metadata import EntryPoint
+
+    if group == GROUP:
+        return {}
+    kind = group.rpartition(".")[2]
+    return {
+        name: EntryPoint(name, place, group)
+        for each in extensions().values()
+        for name, place in each.adds.get(kind, {}).items()
+    }
+
+
+@cache
+def _extensions(path: tuple[str, ...]) -> Mapping[str, Extension]:
+    declared = entries(GROUP)
+    loaded = Plugins[Extension](GROUP, Extension, {})
+    working: dict[str, Extension] = {}
+    for name in sorted(declared, key=lambda name: (not is_ours(declared[name]), name)):
+        if is_ours(declared[name]) and not _is_here(declared[name]):
+            continue
+        try:
+            working[name] = _checked(name, loaded[name])
+        except UserError as error:
+            print(f"harness: {error}; all else works", file=sys.stderr)
+    return working
+
+
+def _is_here(entry: Any) -> bool:
+    from importlib.util import find_spec
+
+    try:
+        return find_spec(entry.module) is not None
+    except ModuleNotFoundError:  # the folder of all of them is gone
+        return False
+
+
+def _checked(name: str, extension: Extension) -> Extension:
+    """Return an extension. Raises UserError if it is of another interface, or no such record."""
+    what = f"extension {printable(name)}"
+    if extension.interface != INTERFACE:
+        raise UserError(
+            f"{what} is for version {printable(extension.interface)} of `Extension`, and this is version "
+            f"{INTERFACE}; install a version of its package for this harness"
+        )
+    if extension.name != name:
+        raise UserError(f"{what} calls itself {printable(extension.name)}; give both the same name")
+    for kind in fields(Extension):
+        value = getattr(extension, kind.name)
+        tables = [*value.values()] if kind.name == "adds" and isinstance(value, Mapping) else [value]
+        if kind.name not in ("name", "interface") and not all(map(_is_texts, tables)):
+            raise UserError(f"{what}: its {kind.name} are no table of texts; repair its package")
+    return extension
+
+
+def _is_texts(table: Any) -> bool:
+    return isinstance(table, Mapping) and all(isinstance(text, str) for text in (*table, *table.values()))
+
+
+@cache
+def _joined(core: tuple[tuple[str, str], ...], kind: str, path: tuple[str, ...]) -> Texts:
+    table = dict(core)
+    for extension in extensions().values():
+        for name, value in getattr(extension, kind).items():
+            if name in table:
+                print(
+                    f"harness: extension {printable(extension.name)}: {printable(name)} of its {kind} is "
+                    "taken; it is left out, and all else works",
+                    file=sys.stderr,
+                )
+            table.setdefault(name, value)
+    return table
