@@ -1,8 +1,9 @@
-"""Re-export what plug-ins build on. A name that goes warns for a release first: CONTRIBUTING.md."""
+"""Re-export what extensions build on. A name that goes warns for a release first: docs/extend.md."""
 
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
+from harness.cli.show import finish as finish_study
 from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
 from harness.coordination.intents import Intents
@@ -13,7 +14,11 @@ from harness.core.figures import PERCENT, Unit
 from harness.evaluate.hooks import Hook
 from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical
 from harness.radio.constant import link_up
+from harness.report.document import Section, Table
+from harness.runs.folder import Run
+from harness.runs.folder import read as read_run
 from harness.runs.metrics import Metric
+from harness.studies.study import Study
 from harness.world.parameters import Parameters
 from harness.world.road import Ground, Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
 from harness.world.scenario import Draws as LayoutDraws
@@ -55,15 +60,21 @@ __all__ = [
     "Request",
     "Road",
     "Rule",
+    "Run",
     "Scenario",
     "ScheduleInputs",
+    "Section",
     "Spawn",
+    "Study",
+    "Table",
     "Turn",
     "Unit", "UserError",
     "crossings",
+    "finish_study",
     "ground",
     "linear_pool",
     "link_up",
+    "read_run",
     "straights",
     "to_the_left",
 ]  # fmt: skip

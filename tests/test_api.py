@@ -29,6 +29,7 @@ def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
     assert dir(harness) == [
+        "Extension",
         "UserError",
         "__version__",
         "compare",
@@ -40,7 +41,9 @@ def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
     ]
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-    with pytest.raises(AttributeError, match="no attribute 'evaluation'; it has UserError, compare"):
+    with pytest.raises(
+        AttributeError, match="no attribute 'evaluation'; it has Extension, UserError, compare"
+    ):
         _ = harness.evaluation
 
 
@@ -110,11 +113,11 @@ def test_what_plug_ins_build_on_is_pinned() -> None:
     names = """
     Attack Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
     Formula Fused Ground Hook Intents Ints Lane Layout LayoutDraws Links Messages Metric PERCENT
-    Parameters Path PathKey Physical Pool Registration Request Road Rule Scenario ScheduleInputs Spawn Turn
-    Unit UserError
-    crossings ground linear_pool link_up straights to_the_left
+    Parameters Path PathKey Physical Pool Registration Request Road Rule Run Scenario ScheduleInputs Section
+    Spawn Study Table Turn Unit UserError
+    crossings finish_study ground linear_pool link_up read_run straights to_the_left
     """
-    # A name that goes stays here for a release, with a warning: CONTRIBUTING.md.
+    # A name that goes stays here for a release, with a warning: docs/extend.md.
     assert sorted(extend.__all__, key=str.lower) == sorted(names.split(), key=str.lower)
     assert all(getattr(extend, name) for name in extend.__all__)
 

@@ -16,7 +16,9 @@ from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins, entries, is_ours
 
 GROUP = "swarmdrive.extensions"
-COMMANDS = "swarmdrive.commands"  # in the metadata: by command, the extension that has it
+# In the metadata: by command, and by kind of study, the package of the extension that has it.
+COMMANDS, STUDIES = "swarmdrive.commands", "swarmdrive.studies"
+OURS = "harness.extensions."
 INTERFACE = 1
 Texts = Mapping[str, str]
 
@@ -62,8 +64,9 @@ def joined(core: Texts, kind: str) -> Texts:
 
 
 def studies() -> Texts:
-    """Return every kind of study, and what lists call it."""
-    return joined(formats.STUDIES, "studies")
+    """Return every kind of study, those of extensions that are gone included, and what lists call it."""
+    gone = {kind: kind for kind in entries(STUDIES)}
+    return {**gone, **joined(formats.STUDIES, "studies")}
 
 
 def added(group: str) -> Mapping[str, Any]:

@@ -26,6 +26,7 @@ from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
 from harness.report.runs import Runs
+from harness.report.sections import sections
 from harness.report.templating import environment
 from harness.runs.leading import IN_WORDS
 from harness.runs.reliability import LEAST
@@ -157,6 +158,7 @@ def _pieces(
         examples=contents.examples(runs),
         attributions=contents.attributions(runs),
         notes=contents.notes(runs),
+        sections=sections(runs),
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),
         vega=library.packed(library.vega()),

@@ -1,0 +1,43 @@
+"""The sections that extensions add to a run's page.
+
+An extension adds one by `adds={"sections": {"name": "module:function"}}`. The function takes a finished run
+and returns a `Section`, or None where it has nothing to say of that run.
+"""
+
+from collections.abc import Callable
+
+from markupsafe import Markup
+
+from harness.core.errors import UserError, one_line, printable
+from harness.core.plugins import Plugins
+from harness.core.strangers import strangers
+from harness.report.document import Section
+from harness.report.runs import Runs
+from harness.report.templating import environment
+from harness.runs.folder import Run
+
+SECTIONS: Plugins[Callable[[Run], Section | None]] = Plugins("swarmdrive.sections", Callable, {})
+
+
+def sections(runs: Runs) -> list[tuple[str, Markup]]:
+    """Return what extensions say of the runs: the title and the content of each section.
+
+    One that fails says so in its place: the rest of the page does not depend on it.
+    """
+    written = [_written(name, run) for name in SECTIONS for run in runs.runs]
+    return [section for section in written if section is not None]
+
+
+def _written(name: str, run: Run) -> tuple[str, Markup] | None:
+    try:
+        with strangers(f"section {printable(name)}"):
+            section = SECTIONS[name](run)
+            return None if section is None else (section.title, _content(section))
+    except Exception as error:  # a package's code
+        reason = str(error) if isinstance(error, UserError) else f"its package failed: {one_line(error)}"
+        return printable(name), _content(Section(name, warnings=[reason]))
+
+
+def _content(section: Section) -> Markup:
+    macros = environment().get_template("macros.html.j2").module
+    return Markup(macros.outcome(section, "h3"))  # type: ignore[attr-defined]

@@ -1,0 +1,219 @@
+"""Extensions: the one that docs/extend.md shows, and those that do not work; and the core without any."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from packaged import register
+from reference import DOCS, blocks
+
+from harness.cli.commands import COMMANDS
+from harness.core import extensions as known
+from harness.core.extensions import Extension
+from harness.runs.metrics import METRICS, entry
+
+ROOT = Path(__file__).parents[1]
+OURS = ROOT / "harness" / "extensions"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+ENTRIES = PROJECT["entry-points"]
+Said = tuple[int, str, str]
+Typed = Callable[..., Said]
+Installed = Callable[..., None]
+
+
+def of_the_page(folder: Path) -> Path:
+    """Write the package that docs/extend.md shows, in the order in which it shows its files."""
+    page = (DOCS / "extend.md").read_text()
+    [project] = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    extension, study = [block for language, block in blocks(DOCS / "extend.md") if language == "python"][:2]
+    for name, text in {
+        "pyproject.toml": project,
+        "doubt/__init__.py": extension,
+        "doubt/study.py": study,
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def in_process(site: Path, folder: Path, *typed: str) -> Said:
+    """Type a command in a process of its own that has a folder of packages."""
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", *typed], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(site)])}, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.slow
+def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: Path) -> None:
+    site = tmp_path / "site"
+    options = ["--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation"]
+    pip = [sys.executable, "-m", "pip", "install", *options, "--target", str(site)]
+    subprocess.run([*pip, str(of_the_page(tmp_path / "package"))], check=True)
+    asked = ("--model", "proxy", "--condition", "6g", "--seeds", "0:2", "--dataset", str(two_path))
+    assert in_process(site, tmp_path, "eval", *asked, "--quiet", "--out", "reports/run") == (0, "", "")
+    page = (tmp_path / "reports" / "run" / "report.html").read_text()
+    assert "<h2>Doubt</h2>" in page
+    assert page.count("Decisions in doubt") == 2  # its head, and the name of its region
+    assert "doubt_rate" in (tmp_path / "reports" / "run" / "summary.csv").read_text()
+    code, out, err = in_process(site, tmp_path, "study", "doubt", "reports/run", "--out", "reports/doubt")
+    assert (code, err) == (0, "")
+    assert out.startswith("Doubt of run\n1 of 1 conditions have the metric.\n")
+    listed = json.loads(in_process(site, tmp_path, "run", "ls", "--json")[1])
+    assert {one["name"]: one["kind"] for one in listed} == {"run": "eval", "doubt": "doubt"}
+    assert "\n  doubt " in in_process(site, tmp_path, "study", "--help")[1]
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Installed:
+    """Have a package register extensions, each with the text that makes it."""
+
+    def put(**extensions: str) -> None:
+        entries = "".join(f"{name} = of_others:{name.upper()}\n" for name in extensions)
+        made = "".join(f"{name.upper()} = {text}\n" for name, text in extensions.items())
+        source = f"from harness import Extension\n{made}"
+        register(tmp_path / "site", f"[{known.GROUP}]\n{entries}", of_others=source)
+        monkeypatch.syspath_prepend(tmp_path / "site")
+        monkeypatch.delitem(sys.modules, "of_others", raising=False)
+
+    return put
+
+
+ODD = {
+    'Extension(name="odd", interface=9)': "extension odd is for version 9 of `Extension`, and this is "
+    "version 1; install a version of its package for this harness",
+    'Extension(name="other")': "extension odd calls itself other; give both the same name",
+    'Extension(name="odd", commands=["study x"])': "extension odd: its commands are no table of texts",
+    'Extension(name="odd", adds={"rules": 3})': "extension odd: its adds are no table of texts",
+    "1 / 0": "plug-in 'odd' (swarmdrive.extensions): of_others:ODD does not load (division by zero)",
+    "Extension": "is of type type and no Extension",
+    "exit()": "ends the program (SystemExit",
+    "__import__('absent_package')": "does not load (No module named 'absent_package')",
+}
+
+
+@pytest.mark.parametrize(("text", "said"), ODD.items())
+def test_an_extension_that_does_not_work_is_one_line_and_all_else_works(
+    installed: Installed, harness: Typed, text: str, said: str
+) -> None:
+    installed(odd=text)
+    code, out, err = harness("study", "--help")
+    assert (code, err.count("\n")) == (0, 1), err
+    assert said in err
+    assert err.endswith("; all else works\n")
+    assert "sweep" in out
+
+
+def test_a_name_that_is_taken_is_left_out_with_a_line(installed: Installed, harness: Typed) -> None:
+    installed(
+        odd='Extension(name="odd", commands={"eval": "x:y", "odd": "x:y"}, studies={"sweep": "mine"})',
+        other='Extension(name="other", commands={"odd": "x:z"})',
+    )
+    assert harness("eval", "--help")[0] == 0
+    assert known.studies()["sweep"] == "sweep"
+    code, _, err = harness("nothing")
+    assert code == 2
+    assert "extension odd: eval of its commands is taken; it is left out" in err
+    assert "extension other: odd of its commands is taken" in err
+
+
+def test_another_package_takes_no_name_of_what_ships(installed: Installed, harness: Typed) -> None:
+    name = next(iter(ENTRIES[known.GROUP]))
+    installed(**{name: f'Extension(name="{name}")'})
+    _, _, err = harness("study", "--help")
+    assert known.extensions()[name].commands
+    assert f"'{name}' (swarmdrive.extensions) is in two packages" in err
+
+
+def test_what_extensions_add_is_found_like_what_the_core_has(
+    installed: Installed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(METRICS, "_loaded", dict(METRICS.built_in))
+    installed(odd='Extension(name="odd", adds={"metrics": {"success_again": "of_others:AGAIN"}})')
+    source = Path(sys.path[0]) / "of_others.py"
+    metric = 'replace(METRICS["success_rate"], name="success_again", primary=False)'
+    imports = "from dataclasses import replace\nfrom harness.runs.metrics import METRICS\n"
+    source.write_text(f"{source.read_text()}\n{imports}AGAIN = {metric}\n")
+    entry.cache_clear()
+    assert METRICS["success_again"].name == "success_again"
+    assert "success_again" in METRICS
+
+
+@pytest.mark.parametrize("name", ENTRIES[known.GROUP])
+def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
+    """They say what a command or study was part of where its folder is gone."""
+    extension = known.extensions()[name]
+    assert ENTRIES[known.GROUP][name] == f"{known.OURS}{name}:EXTENSION"
+    for group, names in ((known.COMMANDS, extension.commands), (known.STUDIES, extension.studies)):
+        named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{known.OURS}{name}"}
+        assert named == set(names)
+
+
+def test_every_folder_of_an_extension_is_registered() -> None:
+    folders = {path.parent.name for path in OURS.glob("*/__init__.py")}
+    assert folders == set(ENTRIES[known.GROUP])
+
+
+def test_registering_loads_nothing_but_the_record() -> None:
+    """Every command reads these modules."""
+    code = (
+        "import sys\nfrom harness.core.extensions import extensions\nassert extensions()\n"
+        "print([name for name in ('numpy', 'msgspec', 'typer', 'jinja2') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the checkout in which the folder of extensions is deleted."""
+    copy = tmp_path_factory.mktemp("core") / "checkout"
+    left_out = shutil.ignore_patterns("__pycache__", "extensions")
+    shutil.copytree(ROOT / "harness", copy / "harness", ignore=left_out)
+    for name in ("prompts", "models", "channels", "devices", "networks", "schedules", "pyproject.toml"):
+        (copy / name).symlink_to(ROOT / name)
+    return copy
+
+
+def without_extensions(core: Path, folder: Path, *typed: str) -> Said:
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", *typed], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(core)}, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.slow
+def test_the_core_writes_the_same_run_without_extensions(
+    core: Path, two_path: Path, harness: Typed, tmp_path: Path
+) -> None:
+    asked = ("eval", "--model", "proxy", "--dataset", str(two_path), "--seeds", "0:2", "--quiet")
+    assert without_extensions(core, tmp_path, *asked, "--out", "without") == (0, "", "")
+    assert harness(*asked, "--out", "with") == (0, "", "")
+    for file in ("answers.jsonl", "episodes.csv", "summary.csv", "decisions.parquet"):
+        one, other = ((tmp_path / run / file).read_bytes() for run in ("without", "with"))
+        assert one == other, file
+    assert without_extensions(core, tmp_path, "--help")[0] == 0
+
+
+@pytest.mark.parametrize("command", ["serve"])
+def test_a_command_that_is_gone_says_what_it_was_part_of(core: Path, tmp_path: Path, command: str) -> None:
+    code, out, err = without_extensions(core, tmp_path, *command.split())
+    assert (code, out) == (2, "")
+    extension = ENTRIES[known.COMMANDS][command].rpartition(".")[2]
+    assert err.startswith(
+        f"harness: `harness {command}` is part of the extension {extension}, which is not installed in "
+    )
+
+
+def test_the_core_names_no_command_of_an_extension() -> None:
+    assert not set(COMMANDS) & set(ENTRIES[known.COMMANDS])
+    assert isinstance(Extension(name="x"), Extension)
