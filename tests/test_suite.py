@@ -323,3 +323,60 @@ def test_view_opens_a_suite_with_links_to_its_runs_and_none_whose_files_lead_out
     summary.rename("outside.csv")
     summary.symlink_to(Path("outside.csv").absolute())
     assert browser.get("/run", params={"path": DONE.name}).status_code == 400
+
+
+def edited(file: Path, before: str, after: str) -> None:
+    text = file.read_text()
+    assert before in text
+    file.write_text(text.replace(before, after, 1))
+
+
+def flattered(row: str) -> str:
+    """Return a row of a summary with a success of 98.7 %."""
+    cells = row.split(",")
+    cells[6] = "0.987"
+    return ",".join(cells)
+
+
+@pytest.mark.parametrize(
+    "change", ["a mean", "a mean that is left out", "one that is none", "a family twice"]
+)
+def test_a_suites_own_table_is_held_against_its_runs(change: str, evaluated: Harness) -> None:
+    best = next(one for one in runs(Path("reports")) if one.kind == "suite")
+    table = DONE / "summary.csv"
+    [row] = [
+        line for line in table.read_text().splitlines() if ",6g,success_rate," in line and "episodes" in line
+    ]
+    if change == "a mean":
+        edited(table, row, flattered(row))
+        said = "summary.csv has success_rate 0.987 in 6g (episodes), and its runs make it "
+    elif change == "a mean that is left out":
+        edited(table, row + "\n", "")
+        said = "summary.csv lacks success_rate in 6g (episodes)"
+    elif change == "one that is none":
+        edited(table, row, row + "\n" + flattered(row).replace("success_rate", "safe_rate"))
+        said = "summary.csv has safe_rate 0.987 in 6g (episodes), which is no mean over its runs"
+    else:
+        edited(DONE / "suite.json", '"exits"', '"small"')
+        said = "suite.json has two families of the same scenes"
+    code, out, _ = evaluated("run", "check", DONE)
+    assert code == 1
+    assert said in " ".join(out.split())
+    code, out, error = evaluated("report", DONE)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert f"{DONE} contradicts itself: " in error
+    if change != "a family twice":
+        assert best == next(one for one in runs(Path("reports")) if one.kind == "suite"), "ls reads its runs"
+
+
+def test_a_run_counts_for_the_family_whose_scenes_it_has(evaluated: Harness) -> None:
+    edited(DONE / "suite.json", '"parking-exit"', '"roundabout"')
+    code, out, error = evaluated("report", DONE)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "has a run of parking-exit as that of roundabout" in error
+
+
+def test_a_suite_that_nobody_changed_is_equal(evaluated: Harness) -> None:
+    code, out, _ = evaluated("run", "check", DONE)
+    assert (code, "not equal" in out) == (0, False)
+    assert re.search(rf"{DONE}: equal: \d+ means, computed again from its\s+runs", out)

@@ -132,7 +132,9 @@ def check(
     No model is asked; rule-based drivers are. Of a driven run, only whether its tables agree is checked.
     Exit code 1 means that a number differs.
     """
-    lines = [_checked(run, dataset, as_json or quiet) for run in _runs_in(runs)]
+    silent = as_json or quiet
+    lines = [_checked(run, dataset, silent) for run in _runs_in(runs)]
+    lines += [_checked_means(run, silent) for run in runs if (run / SUITE).is_file()]
     if as_json:
         echo_json(lines)
     if not all(line["equal"] for line in lines):
@@ -174,6 +176,21 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
         "run": str(path), "world": run.world, "equal": not wrong, "figures": len(run.scores),
         "decisions": len(run.decisions), "differences": wrong,
     }  # fmt: skip
+
+
+def _checked_means(path: Path, silent: bool) -> dict[str, object]:
+    """Check the means of a suite over its runs, print the result, and return it."""
+    from harness.runs.contradictions import of_suite
+    from harness.runs.suite import read
+
+    suite = read(path)
+    wrong = list(of_suite(suite))
+    if not silent:
+        means = amount(len(suite.stated), "mean")
+        typer.echo(f"{printable(path)}: {'not ' * bool(wrong)}equal: {means}, computed again from its runs")
+        for difference in wrong:
+            echo_text(f"  {difference}")
+    return {"suite": str(path), "equal": not wrong, "figures": len(suite.stated), "differences": wrong}
 
 
 def merge(

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from harness.core.errors import UserError, printable
 from harness.core.figures import amount
+from harness.core.formats import SUITE
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seeds import purposes
 from harness.dataset.load import Dataset
@@ -52,14 +54,22 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
 
     Args:
         suite: what was run.
-        datasets: by family, those that were read already; others are read.
+        datasets: by family, of a suite that was just made; of others they are read.
+
+    Raises UserError if a suite, or a run of it, contradicts itself.
     """
     if datasets is None:  # else they were just made
-        for run in suite.runs.values():
-            refuse(run)
-    datasets, gains, lead = datasets or {}, BASELINE in suite.conditions, lead_of(suite)
+        refuse(suite)
+        datasets = {family: dataset_of(run) for family, run in suite.runs.items()}
+        for family, dataset in datasets.items():
+            if dataset.scenario.name != family:
+                raise UserError(
+                    f"{printable(suite.path)} contradicts itself: {SUITE} has a run of "
+                    f"{printable(dataset.scenario.name)} as that of {printable(family)}; make the suite again"
+                )
+    gains, lead = BASELINE in suite.conditions, lead_of(suite)
     of_trees = {
-        family: in_trees((datasets.get(family) or dataset_of(run)).of_episodes(run.grid.episodes))
+        family: in_trees(datasets[family].of_episodes(run.grid.episodes))
         for family, run in suite.runs.items()
     }
     drivers = {family: {name: scores[lead] for name, scores in of.items()} for family, of in of_trees.items()}

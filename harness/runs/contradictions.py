@@ -4,24 +4,32 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from msgspec import structs
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
+from harness.core.formats import SUITE
 from harness.core.versions import FIGURES
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run
+from harness.runs.leading import PAIRED
 from harness.runs.metrics import BASELINE, GAINS, METRICS
 from harness.runs.records import Answer, Episode, Score
 from harness.runs.success import any_time_scores
+from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
 
+_COLUMNS = ("value", "low", "high", "n", "n_excluded")  # the numbers of a figure
 CLOSE = 1e-6  # how near numbers stay that were only written and read again
 
 
-def refuse(run: Run) -> None:
-    """Raise UserError if a table of a run contradicts those that it follows from."""
-    found = list(contradictions(run))
+def refuse(run: Run | SuiteRun) -> None:
+    """Raise UserError if a table of a run or suite contradicts those that it follows from."""
+    if isinstance(run, SuiteRun):
+        for member in run.runs.values():
+            refuse(member)
+    found = list(of_suite(run) if isinstance(run, SuiteRun) else contradictions(run))
     if found:
         more = f", and {len(found) - 1} more" if len(found) > 1 else ""
         shown = printable(run.path)
@@ -46,6 +54,27 @@ def contradictions(run: Run) -> Iterator[str]:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
     decided = [answer for answer in answers if answer.scene in reached]
     yield from _of_scores(run, _scores(run, decided))
+
+
+def of_suite(suite: SuiteRun) -> Iterator[str]:
+    """Yield, in words, which means of a suite's own table are others than its runs' figures make.
+
+    Intervals are held only where all runs are by the rules of this version.
+    """
+    scenes = [run.manifest.world.pinned for run in suite.runs.values()]
+    if any(scenes.count(each) > 1 for each in scenes):
+        yield f"{SUITE} has two families of the same scenes"
+    ours = all(map(current, suite.runs.values()))
+    columns = _COLUMNS if ours else ("value",)
+    stated = {(score if ours else _now(score)).key: score for score in suite.stated}
+    computed = {score.key: score for score in suite.scores}
+    for key in dict.fromkeys((*stated, *computed)):
+        if key not in computed:
+            yield f"{SUMMARY} has {_figure(stated[key])}, which is no mean over its runs"
+        elif key not in stated:
+            yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
+        else:
+            yield from _otherwise(stated[key], computed[key], columns, "its runs make")
 
 
 def _scores(run: Run, answers: Sequence[Answer]) -> Iterator[Score]:
@@ -73,21 +102,36 @@ def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     here = {score.key: score for score in computed}
     stated = {score.key: score for score in run.scores}
     for key, score in stated.items():
-        condition, metric, interval = map(printable, key)
-        where, other = f"{condition} ({interval})", here.get(key)
+        other = here.get(key)
         if score.metric not in own or (other is None and own[score.metric].superseded):
             continue  # of a package, which may not be here, or of an older definition
         if other is None:
-            yield f"summary.csv has {metric} {score.value} in {where}, which its other tables do not have"
-            continue
-        for what in ("value", "low", "high", "n", "n_excluded"):
-            a, b = getattr(score, what), getattr(other, what)
-            if not close(a, b):
-                of = "" if what == "value" else f", {what},"
-                yield f"summary.csv has {metric}{of} {a} in {where}, and its other tables make it {b}"
+            yield f"{SUMMARY} has {_figure(score)}, which its other tables do not have"
+        else:
+            yield from _otherwise(score, other, _COLUMNS, "its other tables make")
     for key in here if current(run) else ():
         if key not in stated and key[1] in own:
-            yield f"summary.csv lacks {key[1]} in {printable(key[0])} ({key[2]})"
+            yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
+
+
+def _now(score: Score) -> Score:
+    """Return a figure with the kind of interval that it has today: a gain's had another name."""
+    gain = score.metric in GAINS.values() and score.interval == pinned.KIND
+    return structs.replace(score, interval=PAIRED) if gain else score
+
+
+def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:
+    """Yield which numbers of a figure are others than those computed; `whose` these are, in words."""
+    for what in columns:
+        a, b = getattr(stated, what), getattr(other, what)
+        if not close(a, b):
+            yield f"{SUMMARY} has {_figure(stated, what)}, and {whose} it {b}"
+
+
+def _figure(score: Score, what: str = "value") -> str:
+    condition, metric, interval = map(printable, score.key)
+    of = "" if what == "value" else f", {what},"
+    return f"{metric}{of} {getattr(score, what)} in {condition} ({interval})"
 
 
 def _of_episodes(run: Run) -> Iterator[str]:

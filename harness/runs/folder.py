@@ -91,7 +91,7 @@ class Run:
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        return self._read("summary.csv", self._scores)
+        return self._read("summary.csv", scores_of)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -208,12 +208,6 @@ class Run:
         ]
         order = {ANY_TIME: 0, PAIRED: 1, "episodes": 2}
         return min(candidates, key=lambda s: order.get(s.interval, 3), default=None)
-
-    def _scores(self, file: Path) -> tuple[Score, ...]:
-        scores = _records(file, Score)
-        if len({score.key for score in scores}) < len(scores):
-            raise ValueError("a figure is there twice")
-        return scores
 
     def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
         episodes = _records(file, Episode)
@@ -515,6 +509,14 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         columns[field] = values
     rows = zip(*columns.values(), strict=True)
     return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
+
+
+def scores_of(file: Path) -> tuple[Score, ...]:
+    """Return the figures of a `summary.csv`. Raises ValueError if one is there twice."""
+    scores = _records(file, Score)
+    if len({score.key for score in scores}) < len(scores):
+        raise ValueError("a figure is there twice")
+    return scores
 
 
 def whole(file: Path, reader: Callable[[Path], T]) -> T:

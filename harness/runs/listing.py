@@ -144,7 +144,7 @@ def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
 
 
 def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> Listed:
-    """Return the entry of a suite's folder: settings from its runs, means from its summary."""
+    """Return the entry of a suite's folder: settings and figures from its runs."""
     listed = Listed("", "suite", "broken", written, SUITE)
     try:
         names = _json(path, SUITE)["families"].values()
@@ -161,7 +161,7 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
             return listed
         folders = [os.path.join(path, name) for name in names]
         runs = [(_json(folder, "run.json"), _rows(folder)) for folder in folders]
-        return _with_success(listed, _rows(path), runs)
+        return _with_success(listed, _means([rows for _, rows in runs]), runs)
     except _BROKEN:
         return listed
 
@@ -179,6 +179,22 @@ def _rows(path: str) -> Rows:
             line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
         ]
     return list(csv.DictReader([head, *lines]))
+
+
+def _means(summaries: Sequence[Rows]) -> Rows:
+    """Return the means over families of the rows that each summary has."""
+    from harness.core.statistics import Estimate, mean_of  # imported here because it is slow
+
+    keys, ends = ("condition", "metric", "interval"), ("value", "ci_low", "ci_high")
+    by_key = [{tuple(row[key] for key in keys): row for row in rows} for rows in summaries]
+    shared = [key for key in by_key[0] if all(key in rows for rows in by_key)]
+    means = list[dict[str, str]]()
+    for key in shared:
+        of_families = [[float(rows[key][end] or "nan") for end in ends] for rows in by_key]
+        mean = mean_of([Estimate(*numbers, 0, 0) for numbers in of_families])
+        numbers = map(repr, (mean.value, mean.low, mean.high))
+        means.append(dict(zip((*keys, *ends), (*key, *numbers), strict=True)))
+    return means
 
 
 def _with_success(listed: Listed, rows: Rows, runs: Sequence[tuple[dict[str, Any], Rows]]) -> Listed:

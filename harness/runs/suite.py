@@ -77,6 +77,11 @@ class SuiteRun:
         """The mean over families of each score with an interval over episodes or answers."""
         return tuple(self._means())
 
+    @cached_property
+    def stated(self) -> tuple[Score, ...]:
+        """The same as the folder's own table says. Raises UserError if it is missing or broken."""
+        return folder.whole(self.path / SUMMARY, folder.scores_of)
+
     def _means(self) -> Iterator[Score]:
         first, *rest = self.runs.values()
         others_by_key = [{s.key: s for s in run.scores} for run in rest]

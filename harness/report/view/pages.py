@@ -19,12 +19,12 @@ from harness.report.compare.pair import pair
 from harness.report.page import render, with_decision
 from harness.report.runs import gather
 from harness.report.templating import environment, visible
-from harness.report.view.folder import whole
+from harness.report.view.folder import own_file, whole
 from harness.runs import notes as run_notes
 from harness.runs.folder import Run
 from harness.runs.folder import read as read_run
 from harness.runs.listing import UNREAD, Listed, runs
-from harness.runs.suite import SuiteRun, contents_of, read
+from harness.runs.suite import SUMMARY, SuiteRun, contents_of, read
 from harness.runs.unfinished import Extent, extent
 
 RUNS = ("eval", "drive")
@@ -75,6 +75,8 @@ def suite_of(folder: Path, name: str) -> SuiteRun:
     """Read a listed suite, every file of which may be read. Raises UserError if one may not."""
     for family in contents_of(folder / name).families.values():
         whole(folder, f"{name}/{family}")
+    if own_file(folder, name, SUMMARY) is None:
+        raise UserError(f"{printable(name)} has no {SUMMARY} of its own; make the suite again")
     return read(folder / name)
 
 
