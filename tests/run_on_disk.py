@@ -9,6 +9,7 @@ import msgspec
 import pyarrow as pa
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.core.versions import FIGURES
 from harness.runs import folder, formats
 from harness.runs.decisions import Decisions, schema
 from harness.runs.metrics import Grid, World
@@ -86,7 +87,7 @@ def made_up(
         "conditions": [point.record() for point in points], "seeds": seeds, "thinking": False,
         "answer": "json", "batch_size": 8, "dtype": None, "latency_source": None,
         "latency": Latency("card", "made up", 0.145, 0.145, 0.145), "identity": {"engine": "proxy"},
-        "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0"},
+        "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0", "figures": str(FIGURES)},
     }  # fmt: skip
     whole = formats.upgraded(msgspec.to_builtins({**manifest, **stated}))
     return _write(out, msgspec.convert(whole, Manifest), rows, ends, said)

@@ -31,8 +31,9 @@ from harness.report.compare.pair import pair
 from harness.report.view.folder import whole
 from harness.report.words import adjusted_lines, as_good_as, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
-from harness.runs.folder import read
+from harness.runs.folder import csv_text, read
 from harness.runs.metrics import ADJUSTED, BALANCED, GAIN, SUCCESS, Grid
+from harness.runs.records import Score
 from harness.runs.success import Success
 
 Typed = Callable[..., tuple[int, str, str]]
@@ -239,8 +240,17 @@ def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> Non
 def uncorrected(run: Path) -> None:
     """Take the figures that are corrected for difficulty out of a run's summary, as an older one has none."""
     configure(run, versions={})
+    (run / FILE).unlink(missing_ok=True)
     lines = (run / "summary.csv").read_text().splitlines(keepends=True)
     (run / "summary.csv").write_text("".join(line for line in lines if ",adjusted_" not in line))
+
+
+def corrected_anew(run: Path) -> None:
+    """Compute the corrected figures of a run again, whose layouts are said to be of another difficulty."""
+    stated = read(run)
+    scores = [score for score in stated.scores if "adjusted_" not in score.metric]
+    scores += adjusted_scores(stated.grid, stated.episodes, stated.layouts)
+    (run / "summary.csv").write_text(csv_text(Score, scores, stated.manifest.variant))
 
 
 @pytest.mark.slow
@@ -263,8 +273,7 @@ def test_a_strangers_difficulty_is_one_line(
     code, out, error = harness("compare", copy, runs["faulty"])
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert says in error
-    (copy / FILE).unlink()  # as in a run of an earlier version
-    uncorrected(copy)
+    uncorrected(copy)  # as in a run of an earlier version
     assert read(copy).layouts == ()
     assert harness("compare", copy, copy)[0] == 0
 
@@ -279,7 +288,7 @@ def test_runs_that_differ_in_how_hard_a_layout_is_are_compared_as_they_are(
     (copy / FILE).write_text(text.replace("0.0,0.0,0.09", "1.0,0.0,0.09", 1))
     with pytest.raises(UserError, match=r"contradicts itself: summary.csv has adjusted_"):
         pair(copy, runs["faulty"])
-    uncorrected(copy)
+    corrected_anew(copy)
     assert pair(copy, runs["faulty"]).pool is None
     assert pair(runs["faulty"], copy).pool is None
 

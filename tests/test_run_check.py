@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from html import unescape
 from pathlib import Path
 
 import pyarrow as pa
@@ -184,6 +185,16 @@ def sooner(run: Path) -> None:
 
 OF_THE_RUN = {
     "older rules": (older, "success_rate, low, 0.9 in 6g"),
+    "older rules, without a row": (
+        lambda run: (older(run), without("off_lag_rate")(run)), "summary.csv lacks off_lag_rate in 6g",
+    ),
+    "older rules, without a row of several": (
+        lambda run: (older(run), without("6g,optimal_brier,")(run)), "summary.csv lacks optimal_brier in 6g",
+    ),
+    "older rules, with another figure of all decisions": (
+        lambda run: (older(run), score("decisions_one_optimal", "value", 5000)(run)),
+        "summary.csv has decisions_one_optimal 5000.0 in 6g",
+    ),
     "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
     "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
@@ -240,3 +251,26 @@ def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(
     code, out, _ = harness("run", "check", run)
     assert code in (1, 2)
     assert "Traceback" not in out
+
+
+def test_what_nobody_can_check_is_named_and_not_called_equal(
+    run: Path, proxy_run: Path, harness: Harness
+) -> None:
+    """A figure of a package, and younger figures that a run by older rules does not have."""
+    stated = json.loads((run / "run.json").read_text())
+    configure(run, versions={**stated["versions"], "figures": "1"})
+    without("optimal_")(run)
+    added("comfort", "episodes")(run)
+    said = (
+        "comfort: as summary.csv states, and not checked, since",
+        "Its figures are made by the rules of version 1, as run.json states. It lacks optimal_action_rate, "
+        "optimal_brier and optimal_nll_nats, and whether they were left out cannot be checked.",
+    )
+    code, out, _ = harness("run", "check", run)
+    page = harness("report", run)[0], (run / "report.html").read_text()
+    compared = harness("compare", proxy_run, run)[1]
+    assert (code, page[0]) == (0, 0)
+    assert f"{run}: equal where it can be checked: " in out
+    for text in (out, page[1], compared):
+        words = " ".join(unescape(text).split())
+        assert all(sentence in words for sentence in said)

@@ -155,7 +155,7 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
     from harness.evaluate.recompute import differences
-    from harness.runs.contradictions import contradictions
+    from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import dataset_of, read
 
     run = read(path)
@@ -167,14 +167,16 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
     else:
         wrong = list(contradictions(run))
         how = "whose tables were held against each other, since it was driven"
+    open_points = list(unchecked(run))
     if not silent:
         rows = f"{amount(len(run.scores), 'figure')} and {amount(len(run.decisions), 'decision')}"
-        typer.echo(f"{printable(path)}: {'not ' * bool(wrong)}equal: {rows}, {how}")
-        for difference in wrong:
-            echo_text(f"  {difference}")
+        equal = "equal where it can be checked" if open_points else "equal"
+        typer.echo(f"{printable(path)}: {'not equal' if wrong else equal}: {rows}, {how}")
+        for line in (*wrong, *open_points):
+            echo_text(f"  {line}")
     return {
         "run": str(path), "world": run.world, "equal": not wrong, "figures": len(run.scores),
-        "decisions": len(run.decisions), "differences": wrong,
+        "decisions": len(run.decisions), "differences": wrong, "unchecked": open_points,
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from harness.core.errors import printable
 from harness.core.figures import PERCENT, amount
 from harness.evaluate.examine import MOST_SHARE, recall_findings
 from harness.parsing.status import Status
-from harness.runs import doubts, pinned
+from harness.runs import contradictions, doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL, BALANCED, GAINS, entry
@@ -133,6 +133,7 @@ def of_run(run: Run) -> Iterator[str]:
     yield from _saturated(run)
     if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
+    yield from contradictions.unchecked(run)
     if run.manifest.temperature:
         yield (
             f"Answers were sampled at temperature {run.manifest.temperature:g} with sampling seed "

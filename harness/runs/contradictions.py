@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from msgspec import structs
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
@@ -14,13 +13,21 @@ from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run
 from harness.runs.leading import PAIRED
-from harness.runs.metrics import BASELINE, GAINS, METRICS
-from harness.runs.records import Answer, Episode, Score
+from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
+from harness.runs.records import Episode, Score
 from harness.runs.success import any_time_scores
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
 
 _COLUMNS = ("value", "low", "high", "n", "n_excluded")  # the numbers of a figure
+# What runs by rules of version 1 may lack, though it follows from what they have
+LATER = {
+    BALANCED, *METRICS.built_in[BALANCED].halves, GAINS[BALANCED],
+    "optimal_action_rate", "optimal_brier", "optimal_nll_nats",
+    *(name for name, metric in METRICS.built_in.items() if metric.pooled),
+    *(name for name in METRICS.built_in if name.startswith("success_dangerous_rate_")),
+}  # fmt: skip
+Key = tuple[str, str, str]
 CLOSE = 1e-6  # how near numbers stay that were only written and read again
 
 
@@ -42,7 +49,7 @@ def refuse(run: Run | SuiteRun) -> None:
 def contradictions(run: Run) -> Iterator[str]:
     """Yield, in words, what the tables of a run say otherwise than those that they follow from.
 
-    A run by older rules may lack figures, and those of all decisions together are held against nothing.
+    A run by older rules is held against these, and may lack figures that are younger.
     """
     version = run.manifest.versions.get("figures", "1")
     if not (version.isdecimal() and int(version) <= FIGURES):
@@ -52,8 +59,7 @@ def contradictions(run: Run) -> Iterator[str]:
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
-    decided = [answer for answer in answers if answer.scene in reached]
-    yield from _of_scores(run, _scores(run, decided))
+    yield from _of_scores(run, _scores(run))
 
 
 def of_suite(suite: SuiteRun) -> Iterator[str]:
@@ -64,9 +70,9 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
     scenes = [run.manifest.world.pinned for run in suite.runs.values()]
     if any(scenes.count(each) > 1 for each in scenes):
         yield f"{SUITE} has two families of the same scenes"
-    ours = all(map(current, suite.runs.values()))
-    columns = _COLUMNS if ours else ("value",)
-    stated = {(score if ours else _now(score)).key: score for score in suite.stated}
+    older = next((run for run in suite.runs.values() if not current(run)), None)
+    columns = ("value",) if older else _COLUMNS
+    stated = {_key(older, score) if older else score.key: score for score in suite.stated}
     computed = {score.key: score for score in suite.scores}
     for key in dict.fromkeys((*stated, *computed)):
         if key not in computed:
@@ -77,10 +83,12 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
             yield from _otherwise(stated[key], computed[key], columns, "its runs make")
 
 
-def _scores(run: Run, answers: Sequence[Answer]) -> Iterator[Score]:
-    """Yield the figures that follow from a run's decisions, episodes, layouts and these answers of it."""
+def _scores(run: Run) -> Iterator[Score]:
+    """Yield the figures that follow from a run's decisions, episodes, layouts and answers, by its rules."""
+    answers = [answer for answer in run.answers if answer.scene in run.decisions.scenes]
     with np.errstate(all="ignore"):  # a file can state any number
-        yield from Figures.of(run.world, run.grid, run.decisions, run.episodes, answers).scores()
+        figures = Figures.of(run.world, run.grid, run.decisions, run.episodes, answers)
+        yield from figures.scores(older=not current(run))
     if run.manifest.world.looks:
         yield from any_time_scores(run.grid, run.episodes)
     if run.layouts:
@@ -98,26 +106,55 @@ def current(run: Run) -> bool:
 
 def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     """Yield which figures are others than those computed, are none of them, or are not there."""
-    own = {name: metric for name, metric in METRICS.built_in.items() if not metric.pooled or current(run)}
-    here = {score.key: score for score in computed}
+    own, here = METRICS.built_in, {score.key: score for score in computed}
     stated = {score.key: score for score in run.scores}
     for key, score in stated.items():
         other = here.get(key)
         if score.metric not in own or (other is None and own[score.metric].superseded):
-            continue  # of a package, which may not be here, or of an older definition
+            continue  # `unchecked` says so
         if other is None:
             yield f"{SUMMARY} has {_figure(score)}, which its other tables do not have"
         else:
             yield from _otherwise(score, other, _COLUMNS, "its other tables make")
-    for key in here if current(run) else ():
-        if key not in stated and key[1] in own:
+    may_lack = set() if current(run) else LATER - {key[1] for key in stated}
+    for key in _lacking(run, here.values()):
+        if key[1] not in may_lack:
             yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
 
 
-def _now(score: Score) -> Score:
-    """Return a figure with the kind of interval that it has today: a gain's had another name."""
+def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
+    """Yield which figures of the harness a run lacks, under their earlier kind of interval as well."""
+    stated = {_key(run, score) for score in run.scores}
+    for score in computed:
+        if score.metric in METRICS.built_in and _key(run, score) not in stated:
+            yield score.key
+
+
+def unchecked(run: Run) -> Iterator[str]:
+    """Yield, in sentences, which figures of a run are held against nothing, and which it may lack."""
+    figures = {score.key: score for score in run.scores}
+    here = {} if current(run) else {score.key: score for score in _scores(run)}
+    held = {key for key in figures if key[1] in METRICS.built_in and (current(run) or key in here)}
+    if names := dict.fromkeys(key[1] for key in figures if key not in held):
+        what = "a package's metrics, or an earlier harness's"
+        yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
+    if names := dict.fromkeys(key[1] for key in _lacking(run, here.values())):
+        version = printable(run.manifest.versions.get("figures", "1"))
+        yield (
+            f"Its figures are made by the rules of version {version}, as run.json states. It lacks "
+            f"{_listed(names)}, and whether they were left out cannot be checked."
+        )
+
+
+def _listed(names: Iterable[str]) -> str:
+    first, *rest = map(printable, names)
+    return " and ".join(filter(None, (", ".join((first, *rest[:-1])), *rest[-1:])))
+
+
+def _key(run: Run, score: Score) -> Key:
+    """Return what a figure is known by; of a gain in a run by older rules, whichever interval it has."""
     gain = score.metric in GAINS.values() and score.interval == pinned.KIND
-    return structs.replace(score, interval=PAIRED) if gain else score
+    return (score.condition, score.metric, PAIRED) if gain and not current(run) else score.key
 
 
 def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:

@@ -135,11 +135,17 @@ def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     return estimates(judged, [figure], episodes)[0]
 
 
-def estimates(judged: Judged, figures: Sequence[Figure], episodes: int) -> list[Estimate]:
-    """Return some figures of the same decisions, as `estimate` does each; they share the resamples."""
-    known = [figure for figure in figures if _known(figure, judged)]
+def estimates(
+    judged: Judged, figures: Sequence[Figure], episodes: int, older: bool = False
+) -> list[Estimate]:
+    """Return some figures of the same decisions, as `estimate` does each; they share the resamples.
+
+    By the `older` rules, version 1 of the figures, any number of episodes is enough, and a figure whose
+    resamples are all alike has no interval.
+    """
+    known = [figure for figure in figures if _known(figure, judged, older)]
     values = [[figure(*sums) for figure in known] for sums in _sums(judged, episodes)] if known else []
-    found = iter(_estimate(parts, judged, episodes) for parts in zip(*values, strict=True))
+    found = iter(_estimate(parts, judged, episodes, older) for parts in zip(*values, strict=True))
     return [next(found) if figure in known else _unknown(episodes) for figure in figures]
 
 
@@ -165,13 +171,14 @@ def _unknown(episodes: int) -> Estimate:
     return Estimate(math.nan, math.nan, math.nan, 0, episodes)
 
 
-def _known(figure: Figure, judged: Judged) -> bool:
+def _known(figure: Figure, judged: Judged, older: bool = False) -> bool:
     if figure is decisions:
         return len(judged.sure) > 0
-    return len(judged.sure) >= LEAST and len(np.unique(judged.episode)) >= LEAST_EPISODES
+    least_episodes = 1 if older else LEAST_EPISODES
+    return len(judged.sure) >= LEAST and len(np.unique(judged.episode)) >= least_episodes
 
 
-def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estimate:
+def _estimate(values: Sequence[Floats], judged: Judged, episodes: int, older: bool = False) -> Estimate:
     """Return a figure, the first of its values, with the interval of the others, its resamples.
 
     Where all are alike, what is not seen in n episodes is in at most 3 / n of others (95 %: Hanley and
@@ -180,7 +187,9 @@ def _estimate(values: Sequence[Floats], judged: Judged, episodes: int) -> Estima
     n = len(np.unique(judged.episode))
     value, *others = np.concatenate(values).tolist()
     low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
-    if high - low < SAME:
+    if older and not low < high:
+        low, high = math.nan, math.nan
+    elif high - low < SAME and not older:
         low, high = value - 3 / n, value + 3 / n
     return Estimate(value, float(low), float(high), n, episodes - n)
 

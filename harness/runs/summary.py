@@ -93,12 +93,13 @@ class Figures:
             list(chain.from_iterable(part.answers for part in parts)),
         )
 
-    def scores(self) -> list[Score]:
+    def scores(self, older: bool = False) -> list[Score]:
+        """Return the scores, those of judged decisions by the `older` rules of `reliability.estimates`."""
         names = known_in(self.values)
         return [
             *of_conditions(self.grid.conditions, self.values, names),
             *of_latencies(self.grid, self.latency_ms),
-            *_of_judged(self.grid, self.judged),
+            *_of_judged(self.grid, self.judged, older),
             *_gains(self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}),
             *_of_answers(self.answers),
         ]
@@ -142,12 +143,12 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     return [Judged.of(fused[here], optimal[here], episode[here]) for here in rows]
 
 
-def _of_judged(grid: Grid, judged: Sequence[Judged]) -> Iterator[Score]:
+def _of_judged(grid: Grid, judged: Sequence[Judged], older: bool) -> Iterator[Score]:
     """Yield each condition's figures of all its judged decisions, where there are any."""
     pooled = {metric.name: metric.pooled for metric in METRICS.values() if metric.pooled}
     for condition, decisions in zip(grid.conditions, judged, strict=True):
         if len(decisions.sure):
-            figures = estimates(decisions, list(pooled.values()), len(grid.episodes))
+            figures = estimates(decisions, list(pooled.values()), len(grid.episodes), older)
             for name, figure in zip(pooled, figures, strict=True):
                 yield Score.of(condition, name, in_range(name, figure), "episodes")
 

@@ -23,6 +23,7 @@ from harness.report.compare.difference import (
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.words import SHOWN_FROM, as_good_as, p_value, pace
+from harness.runs.contradictions import unchecked
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
@@ -158,6 +159,7 @@ def caveats(pair: Pair) -> list[str]:
         *(f"{name}: {text}" for name, run in sides for text in void(run)),
         *no_prompt(run.manifest for _, run in sides),
         *(f"{name}: {text}" for name, run in sides for text in looked_at(run.manifest)),
+        *(f"{name}: {text}" for name, run in sides for text in unchecked(run)),
         *_any_time(pair),
     ]
 
