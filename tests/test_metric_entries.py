@@ -5,18 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluating import spec_of
 from packaged import register
 from run_on_disk import Row, made_up
 
 from harness.core.errors import UserError
 from harness.core.figures import Unit
+from harness.dataset.load import load
+from harness.evaluate.run import evaluate
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.compare.text import terminal
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BUILT_IN, METRICS, Metric, entry, metrics_of
+from harness.runs.metrics import BUILT_IN, METRICS, Metric, _tell, entry, metrics_of
 from harness.runs.records import Score
 
 GOLDEN = Path(__file__).parent / "golden_runs" / "data"
@@ -29,6 +32,23 @@ SURE = Metric("sure_rate", "share of decisions that are sure", Unit("%", 1, 100.
 OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"])
 FIRST = Metric("first", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], primary=True)
 NOTHING = Metric("nothing", "", Unit(), "lower")
+
+
+def bad(name, values):
+    return Metric(name, "", Unit(), "lower", decisions=values)
+
+
+def writes(d):
+    d["latency_ms"][:] = 0.0
+    return d["latency_ms"]
+
+
+RAISES = bad("raises", lambda d: d["no such column"])
+EXITS = bad("exits", lambda d: exit(0))
+SHORT = bad("short", lambda d: d["entropy_nats"][1:])
+BELOW = bad("below", lambda d: d["entropy_nats"] - 1.0)
+WRITES = bad("writes", writes)
+WORDS = Metric("words", "", Unit(), "lower", episodes=lambda episode: "many")
 """
 
 
@@ -144,6 +164,47 @@ def test_a_metric_that_does_not_work_is_one_line(
     with pytest.raises(UserError, match=says) as error:
         metrics_of("frozen")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("raises", "no such column"),
+        ("exits", "ends the program (SystemExit: 0 at "),
+        ("short", "it has values of shape (31,), not (32,)"),
+        ("below", "it has values beyond 0 to inf"),
+        ("writes", "read-only"),
+        ("words", "could not convert string to float: 'many'"),
+    ],
+)
+def test_a_metric_that_fails_costs_its_own_figure(
+    name: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    _tell.cache_clear()
+    before = run_of(tmp_path / "before")
+    plugged_in(tmp_path, monkeypatch, f"{name} = by_hand:{name.upper()}\n")
+    after = run_of(tmp_path / "after")
+    out, error = capfd.readouterr()
+    assert (out, error.count("\n")) == ("", 1)
+    assert f"harness: metric {name} of a package: " in error
+    assert says in error
+    assert error.endswith("; its figure is unknown\n")
+    own = [score for score in after.scores if score.metric == name]
+    assert own
+    assert {score.value for score in own} == {None}
+    assert [score for score in after.scores if score.metric != name] == list(before.scores)
+
+
+@pytest.mark.slow
+def test_a_metric_that_does_not_load_is_known_before_the_first_question(
+    small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged_in(tmp_path, monkeypatch, "gone = by_hand:GONE\n")
+    asked = list[object]()
+    spec = spec_of(load(small_path), seeds=(0,))
+    with pytest.raises(UserError, match=r"'gone' .* does not load"):
+        evaluate(spec, tmp_path / "run", asked.append, opens=lambda *card, **options: asked.append(card))
+    assert (asked, (tmp_path / "run").exists()) == ([], False)
 
 
 def test_a_metric_that_nobody_knows_is_written_plainly() -> None:

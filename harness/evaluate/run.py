@@ -55,7 +55,7 @@ from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT
-from harness.runs.metrics import Grid
+from harness.runs.metrics import Grid, metrics_of
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Looks, Manifest
 from harness.runs.success import any_time_scores
 from harness.runs.summary import Figures, counted
@@ -106,6 +106,7 @@ def evaluate(
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
+    metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     begun = unfinished(spec, out)
     if not begun and spec.latency == latencies.MEASURED:
@@ -127,6 +128,7 @@ def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, work
     `progress` counts episodes, those that a stopped shard kept included. Returns how many the shard has.
     Raises UserError as `evaluate`, or if the latency is to be measured.
     """
+    metrics_of(spec.source.kind)
     refuse_finished(out)
     if spec.source.until:
         raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")

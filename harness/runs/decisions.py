@@ -120,7 +120,7 @@ class Decisions:
     def __getitem__(self, name: str) -> Floats:
         """Return a column of numbers or flags (n,) as floats; NaN where unknown."""
         if name not in self._arrays:
-            self._arrays[name] = _values(self.table[name].cast(NUMBER), np.nan, np.float64)
+            self._arrays[name] = _kept(_values(self.table[name].cast(NUMBER), np.nan, np.float64))
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
@@ -135,7 +135,8 @@ class Decisions:
         """Return the columns of a distribution, or of the outcome of each action, (n, A)."""
         key = f"{name} of actions"
         if key not in self._arrays:
-            self._arrays[key] = np.stack([self[f"{name}_{action}"] for action in self.actions], axis=-1)
+            columns = [self[f"{name}_{action}"] for action in self.actions]
+            self._arrays[key] = _kept(np.stack(columns, axis=-1))
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
@@ -369,6 +370,12 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
 def _of_buffer(values: Any, valid: Any, kind: pa.DataType) -> pa.Array:
     mask = None if valid is None else pa.py_buffer(np.packbits(valid, bitorder="little"))
     return pa.Array.from_buffers(kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))])
+
+
+def _kept(values: Floats) -> Floats:
+    """Return values that nobody can change: a package's metric is given the same as all others."""
+    values.setflags(write=False)
+    return values
 
 
 def _values(column: Any, unknown: float | int, kind: type) -> Any:

@@ -4,6 +4,7 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 """
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,7 +15,7 @@ from msgspec import UNSET
 
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 from harness.core.figures import PERCENT, POINTS, Unit, shown
 from harness.core.plugins import Plugins
 from harness.core.statistics import (
@@ -31,6 +32,7 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
+from harness.core.strangers import strangers
 from harness.parsing.status import Repair
 from harness.runs import leading, reliability
 from harness.runs.decisions import Decisions
@@ -485,19 +487,50 @@ def by_episode(
 
 def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
     """Return a metric of how episodes ended, (C, S, E); the episodes are in the order of the grid."""
-    assert metric.episodes
-    numbers = [metric.episodes(episode) for episode in episodes]
-    return np.array([np.nan if v is None else float(v) for v in numbers]).reshape(grid.shape)
+    function = metric.episodes
+    assert function
+
+    def values() -> Floats:
+        numbers = [function(episode) for episode in episodes]
+        return np.array([np.nan if v is None else float(v) for v in numbers])
+
+    return _values(metric, values, len(episodes)).reshape(grid.shape)
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
     """Return a metric of n episodes, (n,), from decisions; `places` has the episode's index of each."""
-    assert metric.decisions
-    values = np.asarray(metric.decisions(decisions), dtype=float)
+    function = metric.decisions
+    assert function
+    values = _values(metric, lambda: np.asarray(function(decisions), dtype=float), len(places))
     if not metric.total:
         return mean_by_place(values, places, n)
     unknown = sum_by_place(np.isnan(values), places, n)
     return np.where(unknown > 0, np.nan, sum_by_place(values, places, n))
+
+
+def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
+    """Return a metric's values, (n,). Those of a package that fails are unknown, and a line says so."""
+    if metric is METRICS.built_in.get(metric.name):
+        return values()
+    what = f"metric {printable(metric.name)} of a package"
+    try:
+        with strangers(what):
+            found = values()
+        if found.shape != (n,):
+            raise ValueError(f"it has values of shape {found.shape}, not ({n},)")
+        if not ((found >= 0) & (found <= metric.most) | np.isnan(found)).all():
+            raise ValueError(f"it has values beyond 0 to {metric.most:g}")
+    except Exception as error:  # a stranger's code
+        shown = one_line(error).removeprefix(f"{what} ") or type(error).__name__
+        _tell(f"{what}: {shown}; its figure is unknown")
+        return np.full(n, np.nan)
+    return found
+
+
+@lru_cache(64)
+def _tell(line: str) -> None:
+    """Print a line once: figures are computed part by part."""
+    print(f"harness: {line}", file=sys.stderr)
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
