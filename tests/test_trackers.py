@@ -1,7 +1,9 @@
 """Hooks that are told of a run, and the trackers that are made of them, each with its own package offline."""
 
+import _thread
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -154,6 +156,27 @@ def test_a_hook_that_ends_the_program_costs_a_run_one_line(
     assert line.startswith("harness: tracker bad: ")
     assert line.endswith("; the run goes on without it")
     assert read(Path("run")).scores
+
+
+@pytest.mark.parametrize(
+    "sends",
+    [
+        _thread.interrupt_main,
+        partial(signal.raise_signal, signal.SIGINT),
+        lambda: os.kill(os.getpid(), signal.SIGINT),
+    ],
+    ids=["interrupt_main", "raise_signal", "kill"],
+)
+def test_an_interrupt_that_a_hook_sends_is_said_to_have_come_during_it(
+    sends: Callable[[], object], two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    """Nothing tells it from Ctrl-C; the same command goes on."""
+    install(bad=Bad("begin", sends))
+    code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet"))
+    assert code == 130
+    [line] = [line for line in said.splitlines() if line.startswith("harness: interrupted")]
+    assert "; it came during begin of tracker bad; " in line
+    assert harness(*typed_eval(two_path, "--quiet"))[0] == 0
 
 
 def test_a_hook_that_hangs_is_left_behind(

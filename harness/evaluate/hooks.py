@@ -86,7 +86,18 @@ class _Caller:
         Thread(target=self._work, daemon=True).start()
 
     def call(self, method: str, arguments: tuple[Any, ...], patience_s: float) -> None:
-        """Call a method. Raises what it raises, and TimeoutError if it takes longer than `patience_s`."""
+        """Call a method.
+
+        Raises what it raises, and TimeoutError if it takes longer than `patience_s`. An interrupt that comes
+        meanwhile gets a note: a hook can send it as well as Ctrl-C, and nothing tells them apart.
+        """
+        try:
+            self._call(method, arguments, patience_s)
+        except KeyboardInterrupt as stop:
+            stop.add_note(f"it came during {method} of {self._what}")
+            raise
+
+    def _call(self, method: str, arguments: tuple[Any, ...], patience_s: float) -> None:
         done, here = Future[None](), os.getcwd()
         self._calls.put((done, method, arguments))
         if not wait([done], min(SAID_S, patience_s)).done and patience_s > SAID_S:
