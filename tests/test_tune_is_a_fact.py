@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import msgspec
@@ -63,6 +64,26 @@ def relabel(dataset: Path, seeds: dict[int, int]) -> None:
             file.writestr(name, data)
 
 
+def splice(source: Path, dataset: Path, number: int) -> None:
+    """Put a layout of one dataset into another of the same seeds, every digest in order."""
+    folder = f"{number:05d}/"
+    layouts, manifests = list[dict[str, bytes]](), list[dict[str, Any]]()
+    for each in (source, dataset):
+        with ZipFile(each / "layouts.zip") as file:
+            layouts.append({name: file.read(name) for name in file.namelist()})
+        manifests.append(json.loads((each / "manifest.json").read_text()))
+    ours, theirs = layouts[1], {name: data for name, data in layouts[0].items() if name.startswith(folder)}
+    points = [json.loads(of[f"{folder}tree.json"])["levels"] for of in (theirs, ours)]
+    more, fewer = (sum(map(len, levels)) for levels in points)
+    manifests[1]["trees_sha256"][number] = manifests[0]["trees_sha256"][number]
+    manifests[1]["nodes"] += more - fewer
+    (dataset / "manifest.json").write_text(json.dumps(manifests[1]))
+    rest = {name: data for name, data in ours.items() if not name.startswith(folder)}
+    with ZipFile(dataset / "layouts.zip", "w") as file:
+        for name, data in {**rest, **theirs}.items():
+            file.writestr(name, data)
+
+
 @pytest.fixture(scope="session")
 def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
     """What the proxy answers there, helpers included."""
@@ -78,6 +99,31 @@ def test_a_check_rebuilds_a_few(relabelled: Path, small_path: Path, harness: Har
     assert code == 1
     assert "is not what layout seed" in out
     assert harness("dataset", "check", small_path)[0] == 0
+
+
+@pytest.mark.slow
+def test_one_layout_under_another_seed_is_found_whichever_are_built_whole(
+    relabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its first scene tells; a tree that begins as it should is found where it is drawn."""
+    monkeypatch.setattr(rebuilt, "REBUILT", 0)
+    build(scenarios.get(NAME), tmp_path / "tune", 3, 0, 1, lambda done: None)
+    assert list(rebuilt.differences(load(tmp_path / "tune"))) == []
+    splice(relabelled, tmp_path / "tune", 1)
+    [found] = rebuilt.differences(load(tmp_path / "tune"))
+    assert found == "layout 1 is not what layout seed 1 gives"
+
+
+@pytest.mark.slow
+def test_typing_a_command_again_draws_no_other_layouts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = load(find("occluded-intersection-v3"))
+    draws = {tuple(rebuilt.drawn(dataset, 3)) for _ in range(9)}
+    assert len(draws) == 1
+    monkeypatch.setattr(rebuilt.platform, "node", lambda: "another")
+    assert tuple(rebuilt.drawn(dataset, 3)) not in draws
+    assert tuple(rebuilt.drawn(load(find("occluded-intersection-v2")), 3)) not in draws
 
 
 @pytest.mark.slow

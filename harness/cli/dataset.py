@@ -80,7 +80,7 @@ def build(
 def check(dataset: Dataset, as_json: options.Json = False) -> None:
     """Check every file and every decision point of a dataset. Exit code 1 if something is wrong.
 
-    Three layouts, drawn at random, are built again from their seeds, where highway-env is installed.
+    Where highway-env is installed, first scenes and three whole layouts are built again from their seeds.
     """
     from harness.dataset import load, rebuilt, verify
 
