@@ -10,6 +10,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
+from harness.radio.reception import curves_of
 from harness.radio.trace import Trace, from_profile, read
 from harness.radio.wrapped import heard_s
 
@@ -96,7 +97,7 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
         ("distance_m,reception,loss\n1,1,0\n", "'loss'; known: distance_m, latency_ms, latency_p50_ms"),
         ("distance_m,reception\n", "has no rows; give reception at one distance at least"),
         ("distance_m,reception\n1,1\n2,1.2\n", "line 3: reception is '1.2'; it must be a share from 0 to 1"),
-        ("distance_m,reception\nfar,1\n", "line 2: distance_m is 'far'; it must be metres, 0 or more"),
+        ("distance_m,reception\nfar,1\n", "line 2: distance_m is 'far'; it must be metres, 0 to 1000000"),
         ("distance_m,reception\n1,nan\n", "line 2: reception is 'nan'"),
         ("distance_m,reception\n1\n", "line 2: has other columns than the first line"),
         ("distance_m,reception\n1,1,1\n", "line 2: has other columns than the first line"),
@@ -111,7 +112,7 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
         ),
         (
             "distance_m,reception,latency_ms\n1,1,\n",
-            "line 2: latency_ms is ''; it must be milliseconds, 0 or",
+            "line 2: latency_ms is ''; it must be milliseconds, 0 to",
         ),
         ("distance_m,reception,latency_ms\n1,0.1,nan\n", "it may be blank where reception is 0"),
         ("distance_m,reception,latency_ms\n1,0,soon\n", "line 2: latency_ms is 'soon'"),
@@ -164,3 +165,29 @@ def test_a_profile_names_no_file_that_lies_elsewhere(file: str, tmp_path: Path) 
     (tmp_path / "channels/link.csv").symlink_to(tmp_path / "secret.csv")
     with pytest.raises(UserError, match="lies elsewhere; put it beside the profile"):
         from_profile({"file": file, "latency_s": 0.01}, tmp_path / "channels", "profile")
+
+
+@pytest.mark.parametrize("distance_m", ["inf", "nan", "-5", "far", "", "1e300"])
+def test_a_bad_cell_of_somebody_elses_curve_is_named(tmp_path: Path, distance_m: str) -> None:
+    path = table(tmp_path, f"distance_m,reception\n10,.9\n{distance_m},0.5\n")
+    with pytest.raises(UserError) as refused:
+        curves_of(path)
+    assert str(refused.value) == (
+        f"{path}, line 3: distance_m is {distance_m!r}; it must be metres, 0 to 1000000"
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("10,1.2", "line 2: reception is '1.2'; it must be a share from 0 to 1"),
+        ("10", "line 2: has other columns than the first line"),
+        ("10,0.9,7", "line 2: has other columns than the first line"),
+    ],
+)
+def test_a_bad_row_of_somebody_elses_curve_is_named(tmp_path: Path, row: str, says: str) -> None:
+    with pytest.raises(UserError) as refused:
+        curves_of(table(tmp_path, f"distance_m,reception\n{row}\n"))
+    assert says in str(refused.value)
+    [curve] = curves_of(table(tmp_path, "distance_m,reception,configuration\n10,.9,rate_hz=10\n"))
+    assert (curve.configuration, curve.source, curve.reception.tolist()) == ("rate_hz=10", "run.csv", [0.9])

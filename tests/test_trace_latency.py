@@ -200,12 +200,15 @@ def test_percentiles_are_blank_only_together_and_then_those_before(tmp_path):
             "has both latency_ms and latency_p50_ms; give latency_ms, or latency_p50_ms and latency_p95_ms",
         ),
         (SPREAD + "1,1,9,8\n", "latency_p95_ms is 8; it must be latency_p50_ms of its row, 9, or more"),
-        (SPREAD + "1,1,-9,8\n", "latency_p50_ms is '-9'; it must be milliseconds, 0.001 or more; both may"),
-        (SPREAD + "1,1,0,8\n", "latency_p50_ms is '0'; it must be milliseconds, 0.001 or more"),
+        (
+            SPREAD + "1,1,-9,8\n",
+            "latency_p50_ms is '-9'; it must be milliseconds, 0.001 to 1000000; both may",
+        ),
+        (SPREAD + "1,1,0,8\n", "latency_p50_ms is '0'; it must be milliseconds, 0.001 to 1000000"),
         (SPREAD + "1,1,2,inf\n", "latency_p95_ms is 'inf'; it must be milliseconds"),
         (SPREAD + "1,1,nan,8\n", "latency_p50_ms is 'nan'; it must be milliseconds"),
-        (SPREAD + "1,0,,8\n", "latency_p50_ms is ''; it must be milliseconds, 0.001 or more; both may be"),
-        (MEAN + "1,1,inf\n", "latency_ms is 'inf'; it must be milliseconds, 0 or more"),
+        (SPREAD + "1,0,,8\n", "latency_p50_ms is ''; it must be milliseconds, 0.001 to 1000000; both may be"),
+        (MEAN + "1,1,inf\n", "latency_ms is 'inf'; it must be milliseconds, 0 to 1000000"),
     ],
 )
 def test_a_table_with_bad_latencies_is_refused_in_one_line(tmp_path, text, says):

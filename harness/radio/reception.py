@@ -4,11 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
@@ -20,7 +17,7 @@ from harness.core.statistics import Estimate, episode_interval, rate_interval, r
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
-from harness.radio.tables import rows_of
+from harness.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
 from harness.radio.trace import SIGHTS, Trace
 from harness.radio.transceiver import Transceiver
 from harness.radio.wrapped import heard_s
@@ -30,6 +27,7 @@ VEHICLES = (2, 4, 8, 16, 32, 64, 128)
 PAYLOAD_BITS = 800.0
 PACKETS, MPS = 200, 14.0  # of a trip, and its speed
 RESAMPLES = 200
+COLUMNS = ("distance_m", "reception", "configuration", "source")  # of somebody else's curves
 
 
 @dataclass(frozen=True)
@@ -144,39 +142,26 @@ class Curve:
     reception: Floats  # `(n,)` shares
 
 
-class _Row(msgspec.Struct, forbid_unknown_fields=True):
-    distance_m: Annotated[float, Meta(ge=0, description="metres, 0 or more")]
-    reception: Annotated[float, Meta(ge=0, le=1, description="a share from 0 to 1")]
-    configuration: str = ""
-    source: str = ""
-
-
 def curves_of(path: Path) -> list[Curve]:
     """Read curves from a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
 
     Raises UserError, with file, line and value, if it is none or a value is not allowed.
     """
     shown = printable(path)
-    _, rows = rows_of(path, ("distance_m", "reception"), _Row.__struct_fields__)
+    _, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for line, row in rows:
-        try:
-            point = msgspec.convert({k: _plain(v) for k, v in row.items()}, _Row, strict=False, str_keys=True)
-        except msgspec.ValidationError as error:
-            raise UserError(f"{shown}, line {line}: {printable(error)}") from None
-        key = point.configuration, point.source or path.name
-        curves.setdefault(key, []).append((point.distance_m, point.reception))
+        where = f"{shown}, line {line}"
+        refuse_ragged(where, row)
+        point = (
+            number_of(where, row, "distance_m", *DISTANCE_M),
+            number_of(where, row, "reception", *RECEPTION),
+        )
+        key = row.get("configuration", ""), row.get("source") or path.name
+        curves.setdefault(key, []).append(point)
     if not curves:
         raise UserError(f"{shown} has no rows; give distance_m and reception at one distance at least")
     return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
-
-
-def _plain(cell: Any) -> Any:
-    """Return a number as JSON writes it: `.9` is none there."""
-    try:
-        return repr(float(cell))
-    except (TypeError, ValueError):
-        return cell
 
 
 @dataclass(frozen=True)

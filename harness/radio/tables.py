@@ -1,12 +1,15 @@
 """Read tables that users bring, such as curves of another simulator."""
 
 import csv
+import math
 from collections.abc import Collection
 from io import StringIO
 from pathlib import Path
 
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
+
+DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 1")  # the most, and in words
 
 
 def rows_of(
@@ -31,3 +34,22 @@ def rows_of(
         return columns, [(table.line_num, row) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
+
+
+def number_of(
+    where: str, row: dict[str, str], column: str, most: float, allowed: str, least: float = 0.0
+) -> float:
+    """Return the number in a column of a row. Raises UserError, with what is `allowed`, for any other."""
+    try:
+        value = float(row[column])
+    except (TypeError, ValueError):
+        value = math.nan
+    if not least <= value <= most:
+        raise UserError(f"{where}: {column} is {printable(row[column])!r}; it must be {allowed}")
+    return value
+
+
+def refuse_ragged(where: str, row: dict[str, str]) -> None:
+    """Raise UserError for a row that has more or fewer cells than there are columns."""
+    if None in row or None in row.values():
+        raise UserError(f"{where}: has other columns than the first line")

@@ -33,7 +33,7 @@ from harness.radio.channel import (
     Way,
 )
 from harness.radio.constant import link_up
-from harness.radio.tables import rows_of
+from harness.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
 
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
 MEAN, SPREAD = "latency_ms", ("latency_p50_ms", "latency_p95_ms")
@@ -225,31 +225,22 @@ def _beside(point: Point, known: Iterable[Point]) -> float | Spread | None:
 
 
 def _point(where: str, row: dict[str, str]) -> Point:
-    def number(column: str, most: float, allowed: str, least: float = 0.0) -> float:
-        try:
-            value = float(row[column])
-        except (TypeError, ValueError):
-            value = math.nan
-        if not least <= value <= most:
-            raise UserError(f"{where}: {column} is {printable(row[column])!r}; it must be {allowed}")
-        return value
-
-    if None in row or None in row.values():
-        raise UserError(f"{where}: has other columns than the first line")
+    refuse_ragged(where, row)
     sight = row.get("sight")
     if sight is not None and sight not in SIGHTS:
         raise UserError(f"{where}: sight is {printable(sight)!r}; it must be {', '.join(SIGHTS)}")
-    distance_m = number("distance_m", 1e6, "metres, 0 or more")
-    reception = number("reception", 1.0, "a share from 0 to 1")
+    distance_m = number_of(where, row, "distance_m", *DISTANCE_M)
+    reception = number_of(where, row, "reception", *RECEPTION)
     latency_s: float | Spread | None = None
     given = [name for name in (MEAN, *SPREAD) if name in row]
     if given and reception == 0 and all(row[name].strip().lower() in ("", "nan") for name in given):
         latency_s = math.nan
     elif given == [MEAN]:
-        latency_s = number(MEAN, 1e6, "milliseconds, 0 or more; it may be blank where reception is 0") / 1000
+        allowed = "milliseconds, 0 to 1000000; it may be blank where reception is 0"
+        latency_s = number_of(where, row, MEAN, 1e6, allowed) / 1000
     elif given:
-        allowed = "milliseconds, 0.001 or more; both may be blank where reception is 0"
-        p50_ms, p95_ms = (number(name, 1e6, allowed, 1e-3) for name in SPREAD)
+        allowed = "milliseconds, 0.001 to 1000000; both may be blank where reception is 0"
+        p50_ms, p95_ms = (number_of(where, row, name, 1e6, allowed, 1e-3) for name in SPREAD)
         if p95_ms < p50_ms:
             least = f"{SPREAD[0]} of its row, {p50_ms:g}, or more"
             raise UserError(f"{where}: {SPREAD[1]} is {p95_ms:g}; it must be {least}")
