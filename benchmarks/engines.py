@@ -23,8 +23,8 @@ from harness.backends.engine import common_length
 from harness.backends.llama_cpp.engine import open_here
 from harness.backends.registry import open_backend
 from harness.backends.weights import find_gguf
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
+from harness.extensions.checkups import questions
 from harness.prompts import versions
 
 SMALLEST = "--model swarm-tiny --questions 1 --answers readout"

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from pages import harness, options, write_tables
 
 from harness.core.figures import shown
-from harness.evaluate.trial import ROLES, Answers, described
+from harness.extensions.checkups.prompt import ROLES, Answers, described
 from harness.prompts import versions as prompts
 from harness.report.drawing.colours import CONDITIONS, GREY
 from harness.report.drawing.pictures import save, styled

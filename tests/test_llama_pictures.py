@@ -36,8 +36,8 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.core.image import Image
+from harness.extensions.checkups.parity import compare
 from harness.training.gguf_export import export, projector_of
-from harness.training.parity import compare
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

@@ -14,8 +14,8 @@ from harness.backends.base import Completion, Request
 from harness.backends.orders import average_orders
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
+from harness.extensions.checkups import questions
 from harness.prompts import readout, versions
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")

@@ -19,7 +19,6 @@ import tiny_qwen3
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.backends import checkup
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card, Latency
 from harness.backends.cards import load, resolve
@@ -28,6 +27,7 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError
+from harness.extensions.checkups import answers as checkup
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

@@ -121,7 +121,7 @@ def test_typing_a_command_again_draws_no_other_layouts(
     dataset = load(find("occluded-intersection-v3"))
     draws = {tuple(rebuilt.drawn(dataset, 3)) for _ in range(9)}
     assert len(draws) == 1
-    monkeypatch.setattr(rebuilt.platform, "node", lambda: "another")
+    monkeypatch.setattr("platform.node", lambda: "another")
     assert tuple(rebuilt.drawn(dataset, 3)) not in draws
     assert tuple(rebuilt.drawn(load(find("occluded-intersection-v2")), 3)) not in draws
 

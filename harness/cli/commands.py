@@ -41,18 +41,14 @@ COMMANDS = {
     "run video": "runs:video",
     "model list": "model:list_models",
     "model pull": "model:pull",
-    "model check": "model:check",
-    "model parity": "model:parity",
     "model calibrate": "calibrate",
     "model distill": "distill",
-    "model doctor": "doctor",
     "model device list": "device:list_devices",
     "model device show": "device:show",
     "model device check": "device:check",
     "model device measure": "device:measure",
     "prompt list": "prompt:list_prompts",
     "prompt show": "prompt:show",
-    "prompt check": "prompt:check",
     "prompt compare": "prompt:compare",
     "prompt examples": "prompt:examples",
     "prompt optimize": "optimize",
@@ -109,7 +105,6 @@ OLD = {
     "merge": "run merge",
     "export": "run export",
     "video": "run video",
-    "parity": "model parity",
     "distill": "model distill",
     "device": "model device",
     "parse": "prompt parse",
@@ -119,9 +114,6 @@ OLD = {
     "scenario": "dataset scenario",
     "channel": "radio",
 }
-
-# Short for a command of a group, for good and without a note.
-SHORT = {"doctor": "model doctor"}
 
 
 def commands() -> Mapping[str, str]:
@@ -137,6 +129,11 @@ def groups() -> Mapping[str, str]:
 def spellings() -> Mapping[str, str]:
     """Return every old spelling, and what replaces it."""
     return joined(OLD, "spellings")
+
+
+def short() -> Mapping[str, str]:
+    """Return what is short for a command of a group, for good and without a note."""
+    return joined({}, "short")
 
 
 def panels() -> Mapping[str, tuple[str, ...]]:

@@ -11,7 +11,7 @@ from typer import Context, Typer, echo
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from harness.cli.commands import COMMANDS, GROUPS, OLD, SHORT, commands, groups, panels, spellings
+from harness.cli.commands import COMMANDS, GROUPS, OLD, commands, groups, panels, short, spellings
 from harness.core.extensions import owner
 from harness.core.strangers import ended, ends_the_program
 
@@ -106,7 +106,7 @@ class Group(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command that is typed. Of an old spelling, a line on stderr says the new one."""
         old, new = ("", "") if self.path else respelt(args)
-        if new and old not in SHORT and not ctx.resilient_parsing:
+        if new and old not in short() and not ctx.resilient_parsing:
             echo(
                 f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0",
                 err=True,
@@ -150,18 +150,14 @@ class Group(TyperGroup):
 
 def respelt(args: list[str]) -> tuple[str, str]:
     """Return the old or short spelling with which arguments begin, and what it stands for; empty if none."""
-    for n in (2, 1):
-        typed = " ".join(args[:n])
-        if typed in OLD or typed in SHORT:
-            return typed, {**OLD, **SHORT}[typed]
-    if args[0] in COMMANDS or (
-        args[0] in GROUPS and " ".join(args[:2]) in _below(args[0], COMMANDS).values()
-    ):
+    spelt = [" ".join(args[:n]) for n in (2, 1)]
+    for typed in spelt:
+        if typed in OLD:
+            return typed, OLD[typed]
+    if args[0] in COMMANDS or spelt[0] in _below(args[0], COMMANDS).values():
         return "", ""  # of the core: nobody looks for extensions
-    for n in (2, 1):
-        if (typed := " ".join(args[:n])) in spellings():
-            return typed, spellings()[typed]
-    return "", ""
+    others = {**spellings(), **short()}
+    return next(((typed, others[typed]) for typed in spelt if typed in others), ("", ""))
 
 
 def keep_encoding() -> None:

@@ -33,6 +33,7 @@ class Extension:
     groups: Texts = field(default_factory=dict)  # the groups of commands that it opens, and their help
     panels: Texts = field(default_factory=dict)  # its words of the first screen, and the panel of each
     spellings: Texts = field(default_factory=dict)  # older spellings of its commands, and what replaces them
+    short: Texts = field(default_factory=dict)  # what is short for one of its commands, for good
     # kinds of study that it writes, and what lists call them; `<kind>.json` marks such a folder
     studies: Texts = field(default_factory=dict)
     # plug-ins by kind, such as `rules` or `metrics`, and by name; the value is a place

@@ -12,6 +12,7 @@ from harness.core.files import canonical_json
 from harness.core.rounding import rounded
 
 LETTERS = "ABCDEFGHIJ"
+MOST_SHARE = 0.5  # letter share from which the letter explains more of a read-out than all else
 # What stands for a blank or a line break in a token: itself, or SentencePiece's and byte-level BPE's signs.
 _BLANKS = " \t\r\n\u2581\u0120\u010a"
 

@@ -5,10 +5,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import reads_prompts
-from harness.core.errors import printable
+from harness.core.errors import one_line, printable
 from harness.core.figures import PERCENT, amount
-from harness.evaluate.examine import MOST_SHARE, recall_findings
+from harness.core.plugins import Plugins
+from harness.core.strangers import strangers
 from harness.parsing.status import Status
+from harness.prompts.readout import MOST_SHARE
 from harness.runs import contradictions, doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
@@ -18,6 +20,8 @@ from harness.runs.unanswered import tally
 from harness.world.drivers import BLIND
 from harness.world.parameters import Parameters
 
+# What extensions say of a run: sentences for people.
+CAVEATS: Plugins[Callable[[Manifest], Iterable[str]]] = Plugins("swarmdrive.caveats", Callable, {})
 FEW = 100  # episodes; with fewer a page warns of wide intervals
 # By role: whose answers, and what takes their place.
 _FAILED = {
@@ -33,7 +37,7 @@ _CONTROLS = {
 
 def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
     """Return sentences for a run's headline; none for a language model whose answers could be read."""
-    first = [*unread(scores), *no_prompt([manifest]), *findings_of(manifest), *moved_system(manifest)]
+    first = [*unread(scores), *no_prompt([manifest]), *of_extensions(manifest), *moved_system(manifest)]
     first += by_letter(scores)
     return [*first, *beyond_sources(manifest), *on_device(manifest), *looked_at(manifest)]
 
@@ -160,7 +164,7 @@ def of_run(run: Run) -> Iterator[str]:
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
     yield from unheard(run)
     yield from lost_at_once(run)
-    yield from findings_of(run.manifest)
+    yield from of_extensions(run.manifest)
     yield from by_letter(run.scores)
     yield from moved_system(run.manifest)
     yield from beyond_sources(run.manifest)
@@ -196,17 +200,14 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
     return {name: (record.parameters, record.limits) for name, record in manifest.channels.items()}
 
 
-def findings_of(manifest: Manifest) -> Iterator[str]:
-    """Yield what `harness model check` found here of a run's models, if they were asked as in the run."""
-    helpers = manifest.identity.get("helpers")
-    identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
-    agents = [manifest.agent(0), *manifest.helpers]
-    for agent, identity in zip(agents, identities, strict=False):
-        if not isinstance(identity, Mapping):
-            continue
-        if findings := recall_findings(identity, agent["prompt"]["sha256"], agent["answer"]):
-            for sentence in findings.sentences():
-                yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"
+def of_extensions(manifest: Manifest) -> Iterator[str]:
+    """Yield what extensions say of a run; one that fails says so itself."""
+    for name, of in CAVEATS.usable().items():
+        try:
+            with strangers(f"caveat {printable(name)}"):
+                yield from map(str, of(manifest))
+        except Exception as error:  # a package's code
+            yield f"The caveat {printable(name)} of a package failed: {one_line(error)}."
 
 
 def by_letter(scores: Sequence[Score]) -> Iterator[str]:

@@ -190,8 +190,11 @@ def _means(summaries: Sequence[Rows]) -> Rows:
     shared = [key for key in by_key[0] if all(key in rows for rows in by_key)]
     means = list[dict[str, str]]()
     for key in shared:
-        of_families = [[float(rows[key][end] or "nan") for end in ends] for rows in by_key]
-        mean = mean_of([Estimate(*numbers, 0, 0) for numbers in of_families])
+        of_families = list[Estimate]()
+        for rows in by_key:
+            value, low, high = (float(rows[key][end] or "nan") for end in ends)
+            of_families.append(Estimate(value, low, high, 0, 0))
+        mean = mean_of(of_families)
         numbers = map(repr, (mean.value, mean.low, mean.high))
         means.append(dict(zip((*keys, *ends), (*key, *numbers), strict=True)))
     return means

@@ -13,7 +13,7 @@ import typer
 from typer.main import get_command
 
 from harness.cli import app
-from harness.cli.commands import SHORT, commands, groups, panels, spellings
+from harness.cli.commands import commands, groups, panels, short, spellings
 from harness.cli.shell import UNREAD, plain
 from harness.coordination.attacks import ATTACKS
 from harness.coordination.rules import RULES, reads_plans
@@ -94,8 +94,8 @@ def test_an_old_spelling_works_and_says_the_new_one(harness: Callable[..., Said]
 
 
 def test_a_short_spelling_is_for_good(harness: Callable[..., Said]) -> None:
-    for short, path in SHORT.items():
-        assert harness(short, "--help") == harness(*path.split(), "--help")
+    for typed, path in short().items():
+        assert harness(typed, "--help") == harness(*path.split(), "--help")
 
 
 def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[..., Said]) -> None:

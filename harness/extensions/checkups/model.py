@@ -5,17 +5,17 @@ from typing import cast
 
 from harness.backends.base import Completion, Rendering, Request
 from harness.backends.card import Card
-from harness.backends.checkup import Checkup
-from harness.backends.checkup import check as ask
 from harness.backends.registry import capabilities, open_backend
 from harness.core.progress import Progress
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of, requests
-from harness.evaluate.examine import COUNT, Findings, examine, keep_findings
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
+from harness.extensions.checkups.answers import Checkup
+from harness.extensions.checkups.answers import check as ask
+from harness.extensions.checkups.read_outs import COUNT, Findings, examine, keep_findings
 from harness.prompts import versions
 
 PROMPT, IMAGE_PROMPT = "v2", "v7"

@@ -14,7 +14,14 @@ from harness.backends.base import Completion, Request
 from harness.core import kept
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
-from harness.evaluate.examine import COUNT, Findings, Moved, examine, keep_findings, recall_findings
+from harness.extensions.checkups.read_outs import (
+    COUNT,
+    Findings,
+    Moved,
+    examine,
+    keep_findings,
+    recall_findings,
+)
 from harness.prompts import versions
 from harness.report.caveats import by_letter, caveats
 from harness.runs.records import Manifest, Score

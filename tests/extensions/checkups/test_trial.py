@@ -13,7 +13,7 @@ from harness.backends.base import Completion, Request
 from harness.cli import app
 from harness.core.errors import Unanswered
 from harness.evaluate.agent import Agent
-from harness.evaluate.trial import COUNT, Trial, try_out
+from harness.extensions.checkups.prompt import COUNT, Trial, try_out
 from harness.prompts import versions
 
 Finish = Literal["stop", "length"]

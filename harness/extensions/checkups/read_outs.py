@@ -16,16 +16,17 @@ from msgspec.structs import replace as replace_struct
 
 from harness.backends.base import BARE, AnswerMode, Backend, Completion, Letters, Request
 from harness.core import kept
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.files import digest
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
-from harness.evaluate.questions import Fact, Pair
+from harness.extensions.checkups import questions
+from harness.extensions.checkups.questions import Fact, Pair
+from harness.prompts.readout import MOST_SHARE
+from harness.runs.records import Manifest
 
 LEAST_MOVED = 0.05  # by how much the expected action becomes likelier where a fact counts
 COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scenes that moved nothing
-MOST_SHARE = 0.5  # letter share from which the letter explains more than all else
 
 
 class Moved(Struct, frozen=True):
@@ -195,3 +196,16 @@ def recall_findings(identity: Mapping[str, Any], prompt_sha256: str, answer: str
 def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
     alone = {key: value for key, value in identity.items() if key != "helpers"}
     return f"findings/{digest([alone, prompt_sha256, answer])}.json"
+
+
+def caveats(manifest: Manifest) -> Iterator[str]:
+    """Yield what `harness model check` found here of a run's models, if they were asked as in the run."""
+    helpers = manifest.identity.get("helpers")
+    identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
+    agents = [manifest.agent(0), *manifest.helpers]
+    for agent, identity in zip(agents, identities, strict=False):
+        if not isinstance(identity, Mapping):
+            continue
+        if findings := recall_findings(identity, agent["prompt"]["sha256"], agent["answer"]):
+            for sentence in findings.sentences():
+                yield f"{printable(str(agent['model']['name']), 30)}: {sentence}"

@@ -13,11 +13,11 @@ from harness.backends.cards import resolve
 from harness.backends.registry import capabilities, open_backend
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.progress import Progress
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
-from harness.evaluate.examine import COUNT as READ_OUTS
-from harness.evaluate.examine import Findings, Moved, examine, moved
+from harness.extensions.checkups import questions
+from harness.extensions.checkups.read_outs import COUNT as READ_OUTS
+from harness.extensions.checkups.read_outs import Findings, Moved, examine, moved
 from harness.parsing.status import Repair, Status
 from harness.prompts.versions import Prompt, unfit
 from harness.runs.records import Answer

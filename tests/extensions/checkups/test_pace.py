@@ -2,8 +2,8 @@
 
 import pytest
 
-from harness.evaluate import pace
-from harness.evaluate.pace import Pace, advice, paces
+from harness.extensions.checkups import pace
+from harness.extensions.checkups.pace import Pace, advice, paces
 
 
 def of(*seconds: tuple[float, float]) -> list[Pace]:

@@ -8,8 +8,8 @@ from harness.backends.card import Card
 from harness.backends.cards import each_engine, names
 from harness.backends.registry import locate, missing, open_backend
 from harness.core.errors import Unanswered, UserError
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
+from harness.extensions.checkups import questions
 from harness.prompts import versions
 
 PROMPT = "v2"

@@ -10,8 +10,8 @@ from harness.backends import cards
 from harness.cli import app
 from harness.core.seeds import purposes
 from harness.dataset import load
-from harness.evaluate import questions
 from harness.evaluate.agent import Agent
+from harness.extensions.checkups import questions
 from harness.prompts import versions
 
 AGENT = Agent(cards.resolve("swarm-tiny", None), versions.load("v4"), "readout")

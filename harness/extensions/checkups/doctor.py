@@ -39,7 +39,7 @@ def command(
     facts = look(gpu) | {"paces": {}}
     if engines:
         from harness.backends import cards
-        from harness.evaluate.pace import advice, by_card
+        from harness.extensions.checkups.pace import advice, by_card
 
         stems = cards.names()
         with bar("timing engines", len(stems), as_json) as progress:

@@ -22,8 +22,8 @@ from harness.backends import cards
 from harness.cli import app
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
+from harness.extensions.checkups.parity import PASSES, Finding, compare
 from harness.training.gguf_export import export
-from harness.training.parity import PASSES, Finding, compare
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
