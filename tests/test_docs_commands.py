@@ -110,7 +110,7 @@ NOT_RUN = {
         if re.match(r"harness eval --model '?http://", line)
     },
     "harness benchmark run v2v-safety-1.1 --model proxy --made-by 'Ada, of Example' --out reports/proxy": (
-        "takes 20 CPU seconds; tests/test_editions.py runs a small edition"
+        "takes 20 CPU seconds; tests/extensions/benchmark/test_editions.py runs a small edition"
     ),
     "harness benchmark verify reports/proxy.zip": "as above",
     "harness benchmark board 'reports/*.zip' --out board.html": "as above",

@@ -17,11 +17,6 @@ COMMANDS = {
     "plan": "plan",
     "report": "report",
     "view": "view",
-    "benchmark run": "benchmark:run",
-    "benchmark pack": "benchmark:pack",
-    "benchmark verify": "benchmark:verify",
-    "benchmark board": "benchmark:board",
-    "benchmark seeds": "benchmark:seeds",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",
@@ -71,7 +66,6 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "benchmark": "Run an edition of the benchmark; check and rank results.",
     "study": "Vary settings: sweeps, contents, attacks, schedules, grids.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; check, merge, export or film them.",
@@ -87,7 +81,7 @@ GROUPS = {
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report", "view"),
-    "More": ("plan", "benchmark", "study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("plan", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.

@@ -1,8 +1,9 @@
-"""Locate prompts, models, channels, devices, networks, schedules, calibrations, datasets and editions.
+"""Locate prompts, models, channels, devices, networks, schedules, calibrations, datasets and the like.
 
 They ship with the harness, at the checkout's top level or inside the wheel. A folder with a file
 `swarmdrive.toml` is a project: if it is the current directory, its own `prompts/`, `models/`, `channels/`,
-`devices/`, `networks/`, `schedules/`, `calibrations/`, `datasets/` and `editions/` are searched as well.
+`devices/`, `networks/`, `schedules/`, `calibrations/` and `datasets/` are searched as well, and so is what
+extensions keep so.
 """
 
 import os

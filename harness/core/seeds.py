@@ -4,18 +4,15 @@ Constants of scenarios and wordings of prompts are chosen on tune seeds, models 
 every number that is quoted comes from report seeds. The rule is the same for every scenario.
 """
 
-import hashlib
-import re
 from itertools import pairwise
 from typing import Literal
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 
 Purpose = Literal["tune", "train", "report"]
 
 FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # each range ends at the next
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
-SEALED = 1_000_000_000  # the first of as many layout seeds from which sealed layouts are taken
 
 
 def purpose(first: int, count: int) -> Purpose:
@@ -40,17 +37,3 @@ def purposes(first: int, count: int) -> list[Purpose]:
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
     return [n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count]
-
-
-def sealed(commit: str, scenario: str) -> int:
-    """Return the first layout seed of a scenario's sealed layouts: it follows from the id of a commit.
-
-    It is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9. Nobody knows the id of a
-    commit before it is made, so nobody has looked at the layouts before. Raises UserError for another id.
-    """
-    if not re.fullmatch("[0-9a-f]{40}|[0-9a-f]{64}", commit):
-        raise UserError(
-            f"commit {printable(commit, 70)}: give a whole id, 40 hex digits, as `git rev-parse` prints it"
-        )
-    number = int(hashlib.sha256(f"{commit} {scenario}".encode()).hexdigest(), 16)
-    return SEALED + number % SEALED

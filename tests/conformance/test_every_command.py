@@ -23,7 +23,6 @@ from evaluating import live_spec_of, spec_of
 from evaluating import run as evaluate
 from misbehaving import Asked, Server, completion, serving
 from starlette.testclient import TestClient
-from test_editions import EDITION
 
 from harness import cli
 from harness.coordination.operating_point import POINTS
@@ -66,6 +65,19 @@ model = "trace"
 [parameters]
 file = "../../secret.txt"
 latency_s = 0.01
+"""
+EDITION = """
+description = "d"
+condition = ["single-local", "6g"]
+ranked_by = "6g"
+seeds = "0:2"
+latency = "paper"
+ties = "drawn"
+metrics = ["success_rate"]
+[datasets]
+small = "{}"
+[prompts]
+v2 = "{}"
 """
 
 

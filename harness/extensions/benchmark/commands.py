@@ -20,8 +20,8 @@ from harness.core.figures import amount, shown
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
-    from harness.evaluate.rescore import Here, Rescored
-    from harness.report.board import Line
+    from harness.extensions.benchmark.board import Line
+    from harness.extensions.benchmark.rescore import Here, Rescored
 
 EDITION = "v2v-safety-1.1"  # taken if none is named
 
@@ -66,10 +66,10 @@ def run(
     """
     from harness.backends.cache import default_file
     from harness.dataset.suites import Suite
-    from harness.evaluate import edition as editions
     from harness.evaluate import resolve
     from harness.evaluate.dry_run import count
-    from harness.evaluate.rescore import Here
+    from harness.extensions.benchmark import edition as editions
+    from harness.extensions.benchmark.rescore import Here
 
     of = editions.named(edition)
     if not dry_run:
@@ -110,8 +110,9 @@ def pack(
     quiet: options.Quiet = False,
 ) -> None:
     """Pack runs of an edition, or a suite's folder, into one file."""
-    from harness.evaluate import edition as editions
-    from harness.runs import folder, results
+    from harness.extensions.benchmark import edition as editions
+    from harness.extensions.benchmark import results
+    from harness.runs import folder
     from harness.runs import suite as suites
 
     of = editions.named(edition)
@@ -141,7 +142,7 @@ def verify(
 
     No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
     """
-    from harness.evaluate.rescore import Here
+    from harness.extensions.benchmark.rescore import Here
 
     here, lines = Here(), list[dict[str, Any]]()
     for file in files:
@@ -157,7 +158,7 @@ def verify(
 
 @contextmanager
 def _rescored(file: Path, here: "Here", silent: bool) -> "Iterator[Rescored]":
-    from harness.evaluate.rescore import rescored
+    from harness.extensions.benchmark.rescore import rescored
 
     with tempfile.TemporaryDirectory(prefix="harness-") as folder:
         with bar(f"reading {printable(file.name, 30)}", quiet=silent, grows=True) as done:
@@ -199,9 +200,9 @@ def seeds(
     Their seeds follow from a commit. Nobody knew its id before it was made, so nobody, the makers included,
     had looked at these layouts.
     """
-    from harness.core.seeds import sealed
     from harness.dataset import load
-    from harness.evaluate import edition as editions
+    from harness.extensions.benchmark import edition as editions
+    from harness.extensions.benchmark.sealed import sealed
     from harness.world import scenarios
 
     if names:
@@ -232,8 +233,8 @@ def board(
     Entries share a rank where the layouts do not tell them apart. The page works offline. Exit code 1 means
     that a file was left out.
     """
-    from harness.evaluate.rescore import Here
-    from harness.report import board as boards
+    from harness.extensions.benchmark import board as boards
+    from harness.extensions.benchmark.rescore import Here
 
     if realpath(out) in map(realpath, files):
         raise UserError(f"--out {printable(out)} is one of the files to rank; name another file")

@@ -20,19 +20,18 @@ from harness.core.files import sha256_file
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset, released
 from harness.evaluate import resolve
-from harness.evaluate.edition import named, of_file
-from harness.evaluate.rescore import Here, Rescored, rescored
+from harness.extensions.benchmark import board, results
+from harness.extensions.benchmark.edition import named, of_file
+from harness.extensions.benchmark.rescore import Here, Rescored, rescored
+from harness.extensions.benchmark.results import CONTENTS, FILES, FORMAT, Contents
 from harness.prompts import versions
-from harness.report import board
-from harness.runs import results
 from harness.runs.folder import Run, read
-from harness.runs.results import CONTENTS, FILES, FORMAT, Contents
 from harness.runs.suite import SuiteRun
 
 Harness = Callable[..., tuple[int, str, str]]
 Once = Callable[[str, Callable[[Path], object]], Path]
 Change = Callable[[dict[str, bytes]], None]
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 SHIPPED = {
     "v2v-safety-1.0": "72eac34e97b6ec3154342ffafb03af7bfae3f6445e58a090c9110cc0d8f5cb10",
     "v2v-safety-1.1": "25ef2e32605a40c4a93ec2d0b7c80b863312d35b033c27b00595c253ffdd2808",

@@ -12,13 +12,13 @@ from msgspec import structs
 from harness.core.errors import Unanswered, UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.files import sha256_file
-from harness.evaluate import edition as editions
-from harness.evaluate.edition import Edition
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.recompute import computed
+from harness.extensions.benchmark import edition as editions
+from harness.extensions.benchmark.edition import Edition
+from harness.extensions.benchmark.results import Contents, contents_of, unpack
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode
-from harness.runs.results import Contents, contents_of, unpack
 from harness.runs.suite import SuiteRun
 
 

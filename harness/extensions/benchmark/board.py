@@ -11,8 +11,8 @@ from harness.backends.registry import reads_prompts
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.evaluate.edition import Edition
-from harness.evaluate.rescore import Rescored
+from harness.extensions.benchmark.edition import Edition
+from harness.extensions.benchmark.rescore import Rescored
 from harness.report.document import Section, Table, document, forest, reach
 from harness.report.page import save
 from harness.report.templating import visible
