@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 
 from harness.core.arrays import Floats
-from harness.studies.calibrated import Calibrated
-from harness.studies.ledger import tally
-from harness.studies.paper import panels
+from harness.extensions.paper.calibrated import Calibrated
+from harness.extensions.paper.ledger import tally
+from harness.extensions.paper.panels import panels
 from harness.studies.play import over_own_episodes
 
 SMALLEST = "--sets 1 --coverage 1"

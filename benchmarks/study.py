@@ -16,12 +16,12 @@ import pandas as pd
 from rows import Row, finish
 
 from harness.coordination.operating_point import POINTS
+from harness.extensions.paper.calibrated import STEPS, Calibrated
+from harness.extensions.paper.panels import panels
 from harness.report.drawing.pictures import FORMATS, lay_out, save
 from harness.studies.axes import Setting
-from harness.studies.calibrated import STEPS, Calibrated
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.lines import along
-from harness.studies.paper import panels
 from harness.studies.play import play
 
 SMALLEST = "--decisions 1000"

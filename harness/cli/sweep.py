@@ -7,9 +7,10 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
+from harness.core.errors import UserError
 from harness.evaluate.settings import parse_seeds
 
-PROXY_EPISODES = 300  # a seed, as in the paper's sweeps
+PROXY = "proxy"  # the source that an extension may add
 
 
 def command(
@@ -50,18 +51,19 @@ def command(
 
     The model is asked only where the run has no answer.
     """
-    from harness.studies.calibrated import Calibrated
-    from harness.studies.play import Source
+    from harness.studies.play import SOURCES, Source
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.sweep import folder_of, panels_over, run_sweep
 
+    if proxy and PROXY not in SOURCES:
+        raise UserError("--proxy: no extension that is installed has the calibrated proxy; leave it out")
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed = [ReplayedRun(run, latency, progress, not no_model, dataset, own) for run in runs]
         panels = panels_over(replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart)
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_of(runs[0], panels)
-        sources: list[Source] = [*replayed, *([Calibrated(PROXY_EPISODES)] if proxy else [])]
+        sources: list[Source] = [*replayed, *([SOURCES[PROXY]] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))
         study = run_sweep(sources, panels, draws, where, progress)
     finish(study, where, as_json, quiet)

@@ -7,6 +7,5 @@ SUITE = "suite.json"  # marks a folder that holds a suite's runs
 # Every kind of study, and what lists call it; `<kind>.json` marks its folder. Who makes a kind adds it here.
 STUDIES = {
     "sweep": "sweep", "contents": "contents", "grid": "grid", "repeats": "repeats", "trust": "trust",
-    "schedule": "schedule", "twins": "twins", "optimize": "optimize", "study": "study",
-    "closed-loop": "study", "fidelity": "study",
+    "schedule": "schedule", "twins": "twins", "optimize": "optimize", "fidelity": "study",
 }  # fmt: skip

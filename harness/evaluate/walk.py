@@ -1,6 +1,6 @@
 """The one loop over decision points: observe the world, get intents, coordinate under every condition, act.
 
-There are three kinds of world: frozen scenes, the closed loop, and the calibrated proxy of the paper's study.
+The kinds of world are frozen scenes, the closed loop, and those whose decision points are drawn.
 They differ only in where their decision points come from and where an action leads.
 """
 

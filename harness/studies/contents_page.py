@@ -31,7 +31,7 @@ from harness.studies.contents import (
     manifest_of,
     place,
 )
-from harness.studies.ledger import paper_numbers
+from harness.studies.paper_numbers import paper_numbers
 from harness.studies.study import Study, p_cell, percent
 
 if TYPE_CHECKING:

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
+from harness.core.plugins import Plugins
 from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.table import columns
 from harness.evaluate.walk import Ask, Decided, World, walk
@@ -58,8 +59,9 @@ class WalkResult:
     places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
 
 
+@runtime_checkable
 class Source(Protocol):
-    """Whose intents are coordinated: the calibrated proxy's, or a run's."""
+    """Whose intents are coordinated: a run's, or those that an extension draws."""
 
     name: str  # what figures call it
     episodes: int  # how many a seed plays
@@ -75,6 +77,9 @@ class Source(Protocol):
         A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
         """
         ...
+
+
+SOURCES = Plugins[Source]("swarmdrive.sources", Source, {})  # those that extensions add
 
 
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:

@@ -31,7 +31,7 @@ def paper(
 
     It plays the paper's study, and writes a page with both numbers, and Figures A and B.
     """
-    from harness.studies.paper import panels, run_paper
+    from harness.extensions.paper.panels import panels, run_paper
     from harness.studies.study import refuse_taken
 
     in_range("--episodes", episodes, 10, MOST_EPISODES)
@@ -79,8 +79,8 @@ def closed_loop(
     from harness.evaluate.agent import Agent
     from harness.evaluate.settings import DriveSettings
     from harness.evaluate.spec import Spec
+    from harness.extensions.paper.closed_loop import panels, run_closed_loop
     from harness.prompts import versions
-    from harness.studies.closed_loop import panels, run_closed_loop
     from harness.studies.study import refuse_taken
 
     named = scenario and options.typed_scenario(scenario)

@@ -45,7 +45,7 @@ TIES = "first"  # no two actions that these intents lead to are alike
 
 @dataclass(frozen=True)
 class Parameters:
-    """What `harness/studies/fit.py` gives; nothing of it knows a panel or a grid point."""
+    """What `harness/extensions/paper/fit.py` gives; nothing of it knows a panel or a grid point."""
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
     left_share: float = 0.406
@@ -74,9 +74,9 @@ FITTED_ON: Mapping[str, tuple[str, ...]] = {
     "others_sd_nats": ("B13", "B15"),
     "witness_nats": ("B15",),
     "inference_s": ("A2",),
-    "CUT (harness/studies/calibrated.py)": ("B20",),  # no decision is above .95 nats
-    "STEPS (harness/studies/calibrated.py)": ("A8", "A9"),
-    "WITNESS_M, EGO_M, OTHERS_M (harness/studies/calibrated.py)": ("B9",),  # the witness decides
+    "CUT (harness/extensions/paper/calibrated.py)": ("B20",),  # no decision is above .95 nats
+    "STEPS (harness/extensions/paper/calibrated.py)": ("A8", "A9"),
+    "WITNESS_M, EGO_M, OTHERS_M (harness/extensions/paper/calibrated.py)": ("B9",),  # the witness decides
     "6g jitter (harness/radio/profiles.py)": ("A6",),
     "density-coupled loss (harness/radio/constant.py)": ("B6", "B7", "B8"),
 }
@@ -291,3 +291,6 @@ def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
 
     below = ndtr(-CUT)
     return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))
+
+
+SWEPT = Calibrated(300)  # beside runs in a sweep; a seed has as many episodes as in the paper's sweeps

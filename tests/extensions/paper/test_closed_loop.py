@@ -12,7 +12,7 @@ import pytest
 from typer.main import get_command
 
 from harness.cli import app
-from harness.studies.closed_loop import panels
+from harness.extensions.paper.closed_loop import panels
 
 Said = tuple[int, str, str]
 OPTIONS = (

@@ -13,8 +13,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
 from harness.evaluate.walk import walk
-from harness.studies.axes import Setting
-from harness.studies.calibrated import (
+from harness.extensions.paper.calibrated import (
     ACTIONS,
     CUT,
     FITTED_ON,
@@ -26,7 +25,8 @@ from harness.studies.calibrated import (
     spread,
     stratified,
 )
-from harness.studies.fit import fit
+from harness.extensions.paper.fit import fit
+from harness.studies.axes import Setting
 from harness.studies.play import WalkResult
 
 SURE = OperatingPoint.of("6g", "6g", loss=0.0)  # nothing is lost

@@ -1,14 +1,12 @@
 """Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
 
-import csv
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.core.figures import PLAIN
-from harness.core.files import text_of
+from harness.extensions.paper.calibrated import FITTED_ON
 from harness.report.document import Table, strong
-from harness.studies.calibrated import FITTED_ON
+from harness.studies.paper_numbers import paper_numbers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,12 +32,6 @@ ASSUMED = {
     "A4": "the paper's window is 200 ms and its mean 218.9 ms: counted to the end of the exchange",
     "A6": "no roadside edge: the paper calls it optional",
 }
-
-
-def paper_numbers() -> list[dict[str, str]]:
-    """Return the rows of `paper_numbers.csv`, taken from the paper's text and figures."""
-    text = text_of(Path(__file__).with_name("paper_numbers.csv"))
-    return list(csv.DictReader(text.splitlines()))
 
 
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":

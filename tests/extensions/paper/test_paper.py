@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.studies.calibrated import Calibrated
+from harness.extensions.paper.calibrated import Calibrated
+from harness.extensions.paper.ledger import ledger, marks, tally, verdict
+from harness.extensions.paper.panels import panels, run_paper
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.lines import along
-from harness.studies.ledger import ledger, marks, paper_numbers, tally, verdict
-from harness.studies.paper import panels, run_paper
+from harness.studies.paper_numbers import paper_numbers
 from harness.studies.play import joined, over_own_episodes, play
 from harness.studies.study import Study, write_study
 

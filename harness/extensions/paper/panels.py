@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from harness.coordination.operating_point import POINTS
 from harness.core.versions import versions
+from harness.extensions.paper.calibrated import Calibrated
+from harness.extensions.paper.ledger import headline, ledger, marks, tables
 from harness.report.document import Table
 from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
-from harness.studies.calibrated import Calibrated
-from harness.studies.ledger import headline, ledger, marks, tables
 from harness.studies.play import joined, play
 from harness.studies.study import Study, percent
 

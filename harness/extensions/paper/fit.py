@@ -1,6 +1,6 @@
 """Fits the calibrated proxy to a few rows of the paper's numbers.
 
-    python -m harness.studies.fit
+    python -m harness.extensions.paper.fit
 
 Its mechanism can be solved for all but the helpers' entropies, which are set by hand. A witness is heard with
 probability (1 - l)^2, so that success is guess + share x (know - guess) x (1 - l)^2, where `share` is the
@@ -9,9 +9,9 @@ part of the dangers that helpers watch.
 
 import numpy as np
 
+from harness.extensions.paper.calibrated import CUT, FITTED_ON, Parameters
 from harness.radio.constant import density_coupled_loss
-from harness.studies.calibrated import CUT, FITTED_ON, Parameters
-from harness.studies.ledger import paper_numbers
+from harness.studies.paper_numbers import paper_numbers
 
 
 def fit() -> Parameters:
