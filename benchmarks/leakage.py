@@ -31,8 +31,8 @@ from harness.dataset.freeze import record_of
 from harness.dataset.load import Dataset, find, load
 from harness.learning.layouts import trees
 from harness.runs.records import Score
-from harness.world.audit import numbers
 from harness.world.scenario import Scenario
+from harness.world.scene_numbers import numbers
 from harness.world.world import World
 
 SMALLEST = "blind-merge-v1 --models proxy --layouts 1 --nearest 3"

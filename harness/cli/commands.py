@@ -55,7 +55,6 @@ COMMANDS = {
     "dataset scenario list": "scenario:list_scenarios",
     "dataset scenario show": "scenario:show",
     "dataset scenario drive": "scenario:drive",
-    "dataset scenario audit": "scenario:audit",
     "radio list": "radio:list_channels",
     "radio show": "radio:show",
     "radio check": "radio:check",

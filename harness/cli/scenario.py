@@ -9,12 +9,11 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.terminal import attributes, console, echo_each, echo_fields, echo_json, table
 from harness.core import resources
-from harness.core.errors import UserError, in_range, printable
+from harness.core.errors import in_range, printable
 from harness.core.figures import Unit, shown
-from harness.core.seeds import FIRST, purpose, stated
+from harness.core.seeds import purpose, stated
 
 if TYPE_CHECKING:
-    from harness.world.audit import Audit
     from harness.world.scenario import Scenario
 
 
@@ -88,40 +87,6 @@ def drive(
     else:
         typer.echo(printable(scenarios.title(scenario)))
         _table(episodes, seed, outcomes)
-
-
-def audit(
-    name: options.Scenario,
-    layouts: int = typer.Option(300, help="Number of layouts to look at."),
-    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first layout; the others follow."),
-    workers: options.Workers = "2",
-    as_json: options.Json = False,
-) -> None:
-    """Test whether the ego's view gives the hidden danger away. Exit code 1 if it does.
-
-    A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
-    """
-    scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
-    if scenario.is_environment:
-        raise UserError(
-            f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
-            "give a scenario"
-        )
-    from harness.world import scenarios
-    from harness.world.audit import audit as run
-
-    with bar(f"auditing {name}", layouts, as_json) as progress:
-        result = run(scenario, layouts, seed, progress, who)
-    if as_json:
-        echo_json({
-            "scenario": name, "layouts": layouts, "seed": seed, "steps": result.steps, "tells": result.tells,
-            "worst": result.worst, "auc": result.auc, "told_by": result.told_by,
-        })  # fmt: skip
-    else:
-        typer.echo(printable(scenarios.title(scenario)))
-        _print(result)
-    if result.tells:
-        raise typer.Exit(1)
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
@@ -202,21 +167,3 @@ def _seeds(seeds: list[int]) -> str:
     """Return how many seeds there are, and the first of them."""
     named = ", ".join(map(str, seeds[:10])) + (", …" if len(seeds) > 10 else "")
     return f"{len(seeds)}" + (f" (seeds {named})" if named else "")
-
-
-def _print(result: "Audit") -> None:
-    from harness.world.audit import MOST_AUC
-
-    table(
-        ("predicted from the ego's view", "AUC [95 % CI]"),
-        [(question, shown(auc, Unit(decimals=2))) for question, auc in result.auc.items()],
-    )
-    text = console()
-    text.print(f"n = {result.layouts} layouts, {stated(result.seed, result.layouts)};")
-    text.print(f"decision points {result.steps[0]} to {result.steps[-1]}, while the danger is out of sight")
-    if not result.tells:
-        text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
-        return
-    text.print(f"a tell: {result.worst} is above {MOST_AUC:.2f}; AUC lost without each number:")
-    for name, lost in result.told_by.items():
-        text.print(f"  {lost:.2f} {name}")

@@ -14,17 +14,18 @@ from importlib.metadata import version
 from io import BytesIO
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import msgspec
 
 from harness import __version__
-from harness.core import extras, shards, work
+from harness.core import shards, work
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, opened, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
+from harness.core.plugins import Plugins
 from harness.core.seeds import purpose, stated
 from harness.core.shards import Shard
 from harness.dataset.forest import Forest
@@ -40,7 +41,6 @@ from harness.dataset.schema import (
 )
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
-from harness.world.audit import Audit, audit
 from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
 from harness.world.environments.examination import examine
@@ -51,6 +51,24 @@ from harness.world.seats import refuse_agents
 TOGETHER = 8  # the most layouts that are frozen together
 CHECKED_EVERY = 10  # layouts whose number this divides are driven in closed loop as well
 LEAST_AUDITED = 100  # fewest layouts that are audited; an audit of fewer says little
+
+
+@runtime_checkable
+class Audit(Protocol):
+    """Looks at the layouts of a dataset that is built, for its card."""
+
+    def ready(self) -> None:
+        """Raise UserError if a package that it needs is missing."""
+        ...
+
+    def found(
+        self, scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers
+    ) -> str:
+        """Return what the card says of the layout seeds `seed` to `seed + layouts - 1`."""
+        ...
+
+
+AUDITS = Plugins[Audit]("swarmdrive.audits", Audit, {})  # those that extensions add
 
 
 def build(
@@ -70,9 +88,10 @@ def build(
     """
     refuse_agents(scenario, "a dataset")
     # An environment states no danger.
-    audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment
+    audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment and bool(AUDITS)
     if audits and not shard:
-        extras.need("an audit", "sklearn")
+        for plugin in AUDITS.values():
+            plugin.ready()
     config = {
         "scenario": scenario.name,
         "actions": list(scenario.actions),
@@ -166,10 +185,10 @@ def _write_dataset(
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
-    audited = None
-    if audits:
+    audited = list[str]()
+    for plugin in AUDITS.values() if audits else ():
         more(episodes)
-        audited = audit(scenario, episodes, seed, progress, workers)
+        audited.append(plugin.found(scenario, episodes, seed, progress, workers))
     command = _command(scenario, episodes, seed, audits)
     files = {
         "README.md": _readme(out.absolute().name, command, config, forest, audited).encode(),
@@ -273,20 +292,13 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
 
 
-def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, audited: Audit | None) -> str:
+def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, audited: Sequence[str]) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
         f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
     )
     parameters = config["parameters"]
-    audit_text = "Not audited for tells."
-    if audited:
-        auc = audited.auc["danger"]
-        audit_text = (
-            "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
-            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, n = "
-            f"{auc.n} layouts; .50 is a guess)."
-        )
+    audit_text = "\n\n".join(audited) or "Not audited for tells."
     return f"""# {name}
 
 Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:

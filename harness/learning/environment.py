@@ -20,7 +20,7 @@ from harness.core.seeds import purpose
 from harness.learning import asking
 from harness.learning.trips import Roads, Trees, Trip
 from harness.learning.values import Values, optimal
-from harness.world.audit import numbers
+from harness.world.scene_numbers import numbers
 
 Observation = Literal["text", "arrays"]
 Reward = Literal["regret", "success"]

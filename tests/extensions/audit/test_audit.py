@@ -10,11 +10,10 @@ import one_way_crossing
 import pytest
 
 from harness.core.errors import UserError
+from harness.dataset.build import build
+from harness.extensions.audit.tells import FOLDS, HiddenPoints, Ranks, _hidden, audit, judge
 from harness.world import scenarios
-from harness.world.audit import FOLDS, HiddenPoints, Ranks, _hidden, audit, judge, numbers
-from harness.world.perception.graph import scene_graph
 from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
-from harness.world.world import World
 
 pytestmark = pytest.mark.skipif(find_spec("sklearn") is None, reason="needs the audit extra")
 
@@ -133,16 +132,6 @@ def test_a_truck_that_is_elsewhere_where_there_is_danger_is_found():
     assert list(found.told_by) == ["oncoming: seen_share"]  # what a truck that is farther away hides
 
 
-def test_every_graph_gives_the_same_names():
-    road, names = SCENARIO.road(), set()
-    for seed in range(5):
-        state = World.start(SCENARIO, seed).state()
-        for viewer in ("v1", "v2"):
-            names.add(tuple(dict(numbers(scene_graph(SCENARIO, state, viewer), road))))
-    assert len(names) == 1
-    assert len(set(*names)) == len(*names)
-
-
 @pytest.mark.slow
 def test_a_car_that_is_heard_to_be_harmless_is_no_tell(monkeypatch):
     """What is judged is the same, to the last number, whether or not traffic says where it is."""
@@ -152,7 +141,7 @@ def test_a_car_that_is_heard_to_be_harmless_is_no_tell(monkeypatch):
         judged.append(points)
         return {}, {}
 
-    monkeypatch.setattr("harness.world.audit.judge", noted)
+    monkeypatch.setattr("harness.extensions.audit.tells.judge", noted)
     silent, loud = (scenarios.get(f"hard-brake-ahead:radio_share={share}") for share in (0, 1))
     for each in (silent, loud):
         audit(
@@ -195,7 +184,7 @@ def test_the_command_says_the_same_to_people_and_to_machines(harness, monkeypatc
             driven[seed] = _hidden(scenario, seed)
         return driven[seed]
 
-    monkeypatch.setattr("harness.world.audit._hidden", remembered)
+    monkeypatch.setattr("harness.extensions.audit.tells._hidden", remembered)
     words = ("dataset", "scenario", "audit", NAME, "--layouts", 20, "--seed", 42, "--workers", 1)
     code, out, err = harness(*words, "--json")
     found = json.loads(out)
@@ -209,3 +198,23 @@ def test_the_command_says_the_same_to_people_and_to_machines(harness, monkeypatc
     assert "n = 20 layouts, layout seeds 42 to 61 (tune);" in text
     assert f"{found['auc']['danger']['value']:.2f} [" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+@pytest.mark.slow
+def test_the_card_of_a_dataset_says_what_its_audit_found(tmp_path, monkeypatch):
+    dials = Parameters(danger_share=0.5, sector_shares=(1.0, 0.0, 0.0), decisions=1, time_limit_s=1.0)
+    scenario, counted = replace(SCENARIO, parameters=dials), []
+    monkeypatch.setattr("harness.dataset.build.LEAST_AUDITED", 20)
+    build(scenario, tmp_path / "audited", 20, 0, 1, quiet, more=counted.append)
+    auc = audit(scenario, 20, 0, quiet).auc["danger"]
+    card = (tmp_path / "audited/README.md").read_text()
+    assert f"with an AUC of {auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n" in card
+    assert "n = 20 layouts" in card
+    assert "--no-audit" not in card
+    assert counted == [20]
+    monkeypatch.setattr("harness.dataset.build.AUDITS", {})
+    build(scenario, tmp_path / "unaudited", 20, 0, 1, quiet, more=counted.append)
+    card = (tmp_path / "unaudited/README.md").read_text()
+    assert "\nNot audited for tells.\n" in card
+    assert "--no-audit" in card
+    assert counted == [20], "without the extension there is no audit"

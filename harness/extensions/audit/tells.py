@@ -10,7 +10,7 @@ Beacons of traffic (`radio_share`) are left out: who hears the car that would be
 is none, knows that and has not guessed it.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,9 +24,8 @@ from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, wilson
 from harness.world.drivers import choose
 from harness.world.perception.graph import scene_graph
-from harness.world.road import Road
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import SceneGraph
+from harness.world.scene_numbers import numbers
 from harness.world.world import World
 
 MOST_AUC = 0.60  # above it, a scenario gives its danger away
@@ -36,8 +35,6 @@ RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
 DANGER, NONE = "danger", ""
 Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]  # a danger's sector; steps and numbers
-INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
-BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
 
 @dataclass(frozen=True)
@@ -116,30 +113,6 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
             on.act(action)
             going.append((on, some))
     return start.layout.danger or NONE, hidden
-
-
-def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]:
-    """Yield a scene graph's numbers with names, the same names for every graph of a road; None if unknown."""
-    for name in ("speed_mps", "target_speed_mps", "zone_m"):
-        yield f"ego {name}", getattr(graph.ego, name)
-    for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
-        nodes = [node for node in graph.nodes if node.lane == lane]
-        node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
-        yield f"{lane}: vehicles", float(len(nodes))
-        for name in ("forward_m", "left_m", "speed_mps", "heading_deg", "range_rate_mps"):
-            yield f"{lane}: nearest {name}", getattr(node, name, None)
-        yield f"{lane}: nearest kind", BY_SIZE.get(node.type) if node else None
-        yield f"{lane}: nearest indicator", INDICATORS.get((node and node.indicator) or "")
-        yield f"{lane}: nearest sensors", float(len(node.sensors) if node else 0)
-    seen = {sector.sector: sector for sector in graph.sectors}
-    for name in road.sectors:
-        yield f"{name}: seen_share", seen[name].seen_share
-        yield f"{name}: hidden by", float(len(seen[name].by))
-        arrivals = [conflict.other for conflict in graph.conflicts if conflict.sector == name]
-        first = min(arrivals, key=lambda arrival: arrival.arc_m, default=None)
-        yield f"{name}: conflicts", float(len(arrivals))
-        for number in ("arc_m", "time_s", "speed_mps"):
-            yield f"{name}: first conflict {number}", getattr(first, number, None)
 
 
 def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
@@ -271,3 +244,23 @@ class Ranks:
         if low == high:  # AUC of 0 or 1: resampled layouts cannot differ
             low, high = wilson(self.auc, min(have, have_not))
         return Estimate(self.auc, float(low), float(high), have + have_not, 0)
+
+
+class OfDatasets:
+    """The audit of a dataset that is built."""
+
+    def ready(self) -> None:
+        extras.need("an audit", "sklearn")
+
+    def found(
+        self, scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers
+    ) -> str:
+        auc = audit(scenario, layouts, seed, progress, workers).auc[DANGER]
+        return (
+            "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
+            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, n = "
+            f"{auc.n} layouts; .50 is a guess)."
+        )
+
+
+OF_DATASETS = OfDatasets()
