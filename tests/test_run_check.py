@@ -9,8 +9,12 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from run_on_disk import Row, configure, damage, made_up
+from evaluating import live_spec_of
+from evaluating import run as evaluated
+from run_on_disk import Row, change, configure, damage
 
+from harness.coordination.operating_point import POINTS
+from harness.core import extras
 from harness.runs.folder import read
 
 Harness = Callable[..., tuple[int, str, str]]
@@ -234,13 +238,75 @@ def test_a_table_that_agrees_with_the_others_and_not_with_the_answers_is_found(
     assert "decisions.parquet has another fusion_ms in" in out
 
 
-def test_a_driven_run_has_its_tables_held_against_each_other(tmp_path: Path, harness: Harness) -> None:
-    made_up(tmp_path / "driven", closed_loop=True)
-    code, out, _ = harness("run", "check", tmp_path / "driven")
+@pytest.fixture(scope="session")
+def driven(once: Callable[..., Path]) -> Path:
+    """Two driven episodes, under one condition and seed, of which the proxy fails one."""
+    spec = live_spec_of(episodes=3, points=(POINTS["single-local"],), seeds=(0,))
+    return once("driven-to-check", lambda folder: evaluated(spec, folder / "run")) / "run"
+
+
+@pytest.fixture
+def drive(driven: Path, tmp_path: Path) -> Path:
+    """A driven run that a test may change."""
+    return Path(shutil.copytree(driven, tmp_path / "reports/driven"))
+
+
+def wider(row: Row) -> None:
+    row["least_gap_m"] += 1.0
+
+
+def later(row: Row) -> None:
+    row["time_s"] += 0.5
+
+
+def fewer(row: Row) -> None:
+    row["hard_brakings"] += 1
+
+
+@pytest.mark.slow
+def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
+    drive: Path, harness: Harness
+) -> None:
+    code, out, _ = harness("run", "check", drive)
+    words = " ".join(out.split())
+    assert code == 0, words
+    assert "equal where it can be checked: " in words
+    assert "held against each other, since it was driven, and 3 episodes driven again" in words
+    assert "Whether its answers make its decisions is not checked." in words
+    damage(drive, decision=faster)
+    assert harness("run", "check", drive)[0] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("episode", "name"), [(wider, "least_gap_m"), (later, "time_s"), (fewer, "hard_brakings")]
+)
+def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
+    episode: Callable[[Row], None], name: str, drive: Path, harness: Harness
+) -> None:
+    """Though all tables agree with each other."""
+    change(drive, episode=episode)
+    code, out, _ = harness("run", "check", drive)
+    assert code == 1
+    words = " ".join(out.split())
+    assert (
+        f"episodes.csv has another {name} of episode 0 in single-local, seed 0, than its actions lead to"
+        in words
+    )
+    assert "summary.csv" not in words
+    assert harness("report", drive)[0] == 0
+
+
+@pytest.mark.slow
+def test_a_driven_run_that_cannot_be_driven_again_says_so(
+    drive: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    code, out, _ = harness("run", "check", drive)
+    words = " ".join(out.split())
     assert code == 0
-    assert "whose tables were held against each other, since it was driven" in " ".join(out.split())
-    damage(tmp_path / "driven", decision=faster)
-    assert harness("run", "check", tmp_path / "driven")[0] == 1
+    assert "No episode was driven again: to drive again needs highway-env" in words
+    assert "driven again with" not in words
 
 
 def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(

@@ -129,8 +129,8 @@ def check(
 ) -> None:
     """Compute runs again from their own answers; compare each number.
 
-    No model is asked; rule-based drivers are. Of a driven run, only whether its tables agree is checked.
-    Exit code 1 means that a number differs.
+    No model is asked; rule-based drivers are. Of a driven run, tables are held against each other, and three
+    episodes are driven again with their recorded actions. Exit code 1 means that a number differs.
     """
     silent = as_json or quiet
     lines = [_checked(run, dataset, silent) for run in _runs_in(runs)]
@@ -154,7 +154,7 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
-    from harness.evaluate.recompute import differences
+    from harness.evaluate.recompute import AGAIN, differences, driven_otherwise
     from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import dataset_of, read
 
@@ -168,6 +168,14 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
         wrong = list(contradictions(run))
         how = "whose tables were held against each other, since it was driven"
     open_points = list(unchecked(run))
+    if run.world == "closed-loop":
+        open_points.append("Whether its answers make its decisions is not checked.")
+        try:
+            extras.need("to drive again", "highway_env")
+            wrong += driven_otherwise(run)
+            how += f", and {amount(min(AGAIN, len(run.episodes)), 'episode')} driven again"
+        except UserError as error:
+            open_points.append(f"No episode was driven again: {error}.")
     if not silent:
         rows = f"{amount(len(run.scores), 'figure')} and {amount(len(run.decisions), 'decision')}"
         equal = "equal where it can be checked" if open_points else "equal"

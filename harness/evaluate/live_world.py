@@ -236,18 +236,22 @@ class LiveWorld(SceneWorld):
         }
 
     def episodes(self) -> list[Episode]:
-        """Return how each ended; late is against a full-view driver whose decisions act after the lag.
+        return ended(self.scenario, self._ended)
 
-        Where several can decide nobody is late: there is no such driver for all of them together.
-        """
-        if agent_share(self.scenario):
-            alone_s = alone(self.scenario, list(dict.fromkeys(t.world.seed for t in self._ended)))
-            return [_swarm(t, course, alone_s[t.world.seed]) for t in self._ended for course in t.courses]
-        numbers = sorted({t.number for t in self._ended if t.world.outcome.success})
-        worlds = [World.start(self.scenario, self._first_seed + number) for number in numbers]
-        outcomes = reference.finish(worlds, [PRIVILEGED] * len(numbers))
-        references = dict(zip(numbers, outcomes, strict=True))
-        return [_episode(t, course, references.get(t.number)) for t in self._ended for course in t.courses]
+
+def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episode]:
+    """Return how each ended; late is against a full-view driver whose decisions act after the lag.
+
+    Where several can decide nobody is late: there is no such driver for all of them together.
+    """
+    if agent_share(scenario):
+        alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))
+        return [_swarm(t, course, alone_s[t.world.seed]) for t in trajectories for course in t.courses]
+    seeds = {t.number: t.world.seed for t in trajectories if t.world.outcome.success}
+    worlds = [World.start(scenario, seeds[number]) for number in sorted(seeds)]
+    outcomes = reference.finish(worlds, [PRIVILEGED] * len(worlds))
+    references = dict(zip(sorted(seeds), outcomes, strict=True))
+    return [_episode(t, course, references.get(t.number)) for t in trajectories for course in t.courses]
 
 
 def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:

@@ -1,5 +1,7 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
+import platform
+import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,6 +20,7 @@ from harness.core import work
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
+from harness.core.files import sha256_file
 from harness.dataset.load import Dataset
 from harness.dataset.select import Selection
 from harness.evaluate import latency as latencies
@@ -27,8 +30,14 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
-from harness.runs.records import FrozenScenes, Latency
+from harness.runs.records import Episode, FrozenScenes, Latency
 
+AGAIN = 3  # episodes of a driven run that are driven again
+OF_ENDS = (  # what an episode's row says of how it ended
+    "layout_seed", "danger", "success", "failure", "outcome", "delay_s", "time_s", "partner", "striker",
+    "fault", "least_gap_m", "hard_brakings", "other_crashes", "witnesses", "danger_radio", "agents", "arrived", "met",
+    "agents_lost_s", "most_lost_s", "gave_way", "journeys",
+)  # fmt: skip
 RULES = (DRIVER, "proxy")  # engines that are no models
 
 
@@ -107,6 +116,29 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
     if otherwise:
         wrong.append(f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here")
     return wrong
+
+
+def drawn(run: Run) -> list[Episode]:
+    """Draw a few episodes of a driven run, always the same of a run on a machine."""
+    draw = random.Random(f"{sha256_file(run.path / 'episodes.csv')} {platform.node()}")
+    return draw.sample(run.episodes, min(AGAIN, len(run.episodes)))
+
+
+def driven_otherwise(run: Run) -> Iterator[str]:
+    """Yield what episodes.csv says otherwise of a few episodes than the simulator, by the recorded actions.
+
+    Raises UserError if the scenario is not here as it was.
+    """
+    from harness.evaluate.replay import driven_again, played
+
+    for stated in drawn(run):
+        here = driven_again(played(run, stated.episode, stated.condition, stated.seed))
+        for name, _ in differing([stated], [here]):
+            if name in OF_ENDS and (current(run) or getattr(stated, name) is not None):
+                yield (
+                    f"episodes.csv has another {name} of episode {stated.episode} in "
+                    f"{printable(stated.condition)}, seed {stated.seed}, than its actions lead to"
+                )
 
 
 def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:

@@ -7,13 +7,17 @@ from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from harness.backends.registry import capabilities
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Scene
-from harness.evaluate.live_world import looks
+from harness.evaluate.branches import Course, Trajectory
+from harness.evaluate.live_world import ended, looks
 from harness.runs.folder import Run, read
-from harness.runs.records import ClosedLoop, Decision, Manifest
+from harness.runs.metrics import BASELINE
+from harness.runs.records import ClosedLoop, Decision, Episode, Manifest
 from harness.world import lockstep, scenarios
 from harness.world.outcome import Outcome
 from harness.world.parameters import Parameters
@@ -167,6 +171,20 @@ def _place(world: World, agent: str | None) -> int:
     return [vehicle.spawn.id for vehicle in world.vehicles].index(agent) if agent else 0
 
 
+def driven_again(played: ReplayedEpisode) -> Episode:
+    """Drive an episode to its end with the recorded actions; return how it ended, without its decisions."""
+    world = World.start(played.scenario, played.layout_seed)
+    for frame, acting in _actions_by_frame(played).items():
+        world.advance(frame)
+        if not world.ended:
+            _act(world, acting)
+    p = played.scenario.parameters
+    world.advance(p.due_frame(p.decisions))
+    course = Course(POINTS[BASELINE], played.seed)
+    [episode] = ended(played.scenario, [Trajectory(played.episode, world, [course])])
+    return replace(episode, condition=played.condition)
+
+
 def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
     """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
     p = played.scenario.parameters
@@ -195,9 +213,9 @@ def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda don
 
 def _turn(world: World, place: int, decision: Decision, p: Parameters) -> Turn:
     since_s = max(world.frame - _due_frame(world, decision), 0) / p.simulation_hz
-    ended = world.journeys[place].outcome
-    is_open = world.frame < _acting_frame(decision, p) and not ended.ended
-    return Turn(decision, since_s, is_open, _said(ended))
+    outcome = world.journeys[place].outcome
+    is_open = world.frame < _acting_frame(decision, p) and not outcome.ended
+    return Turn(decision, since_s, is_open, _said(outcome))
 
 
 def _ending(world: World) -> str:
