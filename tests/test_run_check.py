@@ -340,3 +340,16 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
     for text in (out, page[1], compared):
         words = " ".join(unescape(text).split())
         assert all(sentence in words for sentence in said)
+
+
+def test_a_column_that_a_run_by_older_rules_left_empty_is_named(run: Path, harness: Harness) -> None:
+    """Here by a forger, whose regret is not to be seen."""
+    stated = json.loads((run / "run.json").read_text())
+    change(run, decision=lambda row: row.update(regret=None))
+    code, out, _ = harness("run", "check", run)
+    assert (code, "decisions.parquet has another regret in" in " ".join(out.split())) == (1, True)
+    configure(run, versions={**stated["versions"], "figures": "1"})
+    code, out, _ = harness("run", "check", run)
+    words = " ".join(out.split())
+    assert "equal where it can be checked: " in words
+    assert "Columns are empty that its answers fill: regret. Older runs do not have them." in words

@@ -159,17 +159,17 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
     from harness.runs.folder import dataset_of, read
 
     run = read(path)
+    open_points = list(unchecked(run))
     if run.world == "frozen":
         reading = bar(f"reading {printable(path.name, 30)}", quiet=silent, grows=True)
         with tempfile.TemporaryDirectory(prefix="harness-") as folder, reading as progress:
-            wrong = differences(run, dataset_of(run, dataset), Path(folder) / "run", progress)
+            wrong, lacking = differences(run, dataset_of(run, dataset), Path(folder) / "run", progress)
+        open_points += lacking
         how = "computed again from its answers"
     else:
         wrong = list(contradictions(run))
-        how = "whose tables were held against each other, since it was driven"
-    open_points = list(unchecked(run))
-    if run.world == "closed-loop":
         open_points.append("Whether its answers make its decisions is not checked.")
+        how = "whose tables were held against each other, since it was driven"
         try:
             extras.need("to drive again", "highway_env")
             wrong += driven_otherwise(run)

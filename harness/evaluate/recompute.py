@@ -35,8 +35,8 @@ from harness.runs.records import Episode, FrozenScenes, Latency
 AGAIN = 3  # episodes of a driven run that are driven again
 OF_ENDS = (  # what an episode's row says of how it ended
     "layout_seed", "danger", "success", "failure", "outcome", "delay_s", "time_s", "partner", "striker",
-    "fault", "least_gap_m", "hard_brakings", "other_crashes", "witnesses", "danger_radio", "agents", "arrived", "met",
-    "agents_lost_s", "most_lost_s", "gave_way", "journeys",
+    "fault", "least_gap_m", "hard_brakings", "other_crashes", "witnesses", "danger_radio", "agents",
+    "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys",
 )  # fmt: skip
 RULES = (DRIVER, "proxy")  # engines that are no models
 
@@ -78,8 +78,12 @@ def computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]
     return read(out), sum(each.wrong for each in held)
 
 
-def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int], None]) -> list[str]:
-    """Compute a run of frozen scenes again, in an empty folder; return what its tables say otherwise.
+def differences(
+    run: Run, dataset: Dataset, out: Path, progress: Callable[[int], None]
+) -> tuple[list[str], list[str]]:
+    """Compute a run of frozen scenes again, in an empty folder.
+
+    Returns what its tables say otherwise, and which columns it lacks, as a run by older rules may.
 
     Args:
         run: the run, which is not changed.
@@ -94,7 +98,7 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
     selection = convert({"limit": world.limit, **world.selection}, Selection, f"{printable(run.path)}: world")
     source = FrozenSource(selection.of(dataset), selection)
     if source.dataset.episodes != run.grid.episodes:
-        return ["episodes.csv has other episodes than run.json says that were selected"]
+        return ["episodes.csv has other episodes than run.json says that were selected"], []
     stated, manifest = spec_of(run, source), run.manifest
     check_prompts(run, stated)
     profile = manifest.device_profile
@@ -115,7 +119,28 @@ def differences(run: Run, dataset: Dataset, out: Path, progress: Callable[[int],
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
     if otherwise:
         wrong.append(f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here")
-    return wrong
+    return wrong, list(_lacking(run, ours))
+
+
+def _lacking(stated: Run, ours: Run) -> Iterator[str]:
+    """Yield, in a sentence, the columns that are empty in a run by older rules, and are not here."""
+    if current(stated):
+        return
+    theirs, here = stated.decisions.table, ours.decisions.table
+    names = [
+        *(name for name in Episode.__struct_fields__ if _empty(stated, name) and not _empty(ours, name)),
+        *(name for name in here.column_names if _null(theirs, name) and not _null(here, name)),
+    ]
+    if names := list(dict.fromkeys(names)):
+        yield f"Columns are empty that its answers fill: {', '.join(names)}. Older runs do not have them."
+
+
+def _empty(run: Run, name: str) -> bool:
+    return all(getattr(episode, name) is None for episode in run.episodes)
+
+
+def _null(table: Any, name: str) -> bool:
+    return name not in table.column_names or table[name].null_count == len(table)
 
 
 def drawn(run: Run) -> list[Episode]:
@@ -161,7 +186,7 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
 def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
     """Yield which columns of episodes.csv differ; a column that an older run lacks does not."""
     for name, wrong in differing(stated.episodes, ours.episodes):
-        if current(stated) or any(getattr(episode, name) is not None for episode in stated.episodes):
+        if current(stated) or not _empty(stated, name):
             yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than its answers make"
 
 
@@ -175,8 +200,7 @@ def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
         return
     theirs, here = stated.decisions.table, ours.decisions.table
     for name in (name for name in here.column_names if name in theirs.column_names):
-        lacks = theirs[name].null_count == len(theirs) and not current(stated)  # an older run
-        if theirs[name].equals(here[name]) or lacks:
+        if theirs[name].equals(here[name]) or (_null(theirs, name) and not current(stated)):
             continue
         pairs = zip(theirs[name].to_pylist(), here[name].to_pylist(), strict=True)
         if wrong := sum(not close(a, b) for a, b in pairs):
