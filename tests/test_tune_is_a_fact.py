@@ -11,6 +11,7 @@ import msgspec
 import pytest
 from former import NAME
 
+from harness.cli import dataset as checking
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes
 from harness.dataset import rebuilt
@@ -179,3 +180,15 @@ def test_released_layouts_under_other_seeds_are_known(tmp_path: Path) -> None:
     relabel(tmp_path / "mine", {0: 0, 1: 1})
     with pytest.raises(UserError, match="of occluded-intersection-v3, and numbers are reported of that"):
         rebuilt.refuse(load(tmp_path / "mine"))
+
+
+@pytest.mark.slow
+def test_a_check_without_the_simulator_says_that_nothing_was_built(
+    small_path: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (rebuilt, checking):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    code, out, _ = harness("dataset", "check", small_path)
+    assert code == 0
+    assert "no layout was built again from its seed, since highway-env is not installed" in out
+    assert json.loads(harness("dataset", "check", small_path, "--json")[1])["built_again"] is False

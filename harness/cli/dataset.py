@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -91,7 +92,10 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     lost = 0 if problems else load.load(path).lost
     if as_json:
         counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
-        echo_json({**counts, "sha256": digest, "problems": problems, "lost_before_first_action": lost})
+        echo_json({
+            **counts, "sha256": digest, "problems": problems, "lost_before_first_action": lost,
+            "built_again": find_spec("highway_env") is not None,
+        })  # fmt: skip
     elif problems:
         typer.echo("\n".join(problems))
     else:
@@ -99,6 +103,8 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
             f"{manifest.name} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"
             f"manifest sha256 {digest}"
         )
+        if find_spec("highway_env") is None:
+            typer.echo("no layout was built again from its seed, since highway-env is not installed")
         if lost:
             console().print(
                 f"{lost} of {manifest.episodes} episodes are lost before the ego's first action: it begins "
