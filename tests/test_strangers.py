@@ -146,8 +146,30 @@ def test_a_rule_that_ends_the_program_is_bad_input_of_the_run(
     )
     code, _, said = harness(*typed, "--out", "run", "--quiet")
     assert code == 2
-    assert f"harness: a package ends the program ({type(ending).__name__}" in said
+    assert f"harness: rule mine ends the program ({type(ending).__name__}" in said
     assert not Path("run/run.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pool", "says"),
+    [
+        (lambda p, weights: 1 / 0, "rule mine fails (ZeroDivisionError: division by zero at "),
+        (lambda p, weights: p, "rule mine fails (ValueError: fused policies of shape ("),
+    ],
+)
+def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
+    pool: Callable[..., object], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RULES._loaded, "mine", Pool(pool))
+    monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
+    typed = ("eval", "--dataset", two_path, "--condition", "6g:consensus=mine", "--limit", "1", "--quiet")
+    code, out, said = harness(*typed, "--out", "run")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert said.startswith(f"harness: {says}")
+    assert said.endswith("repair or uninstall the package that registers it\n")
+    monkeypatch.setitem(RULES._loaded, "mine", Pool(RULES["linear"].pool))
+    assert harness(*typed, "--out", "run")[0] == 0
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
+from harness.core.strangers import worded
 from harness.radio.channel import Draws
 
 # From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if it failed
@@ -106,13 +107,17 @@ def fuse(
     else:
         if point.has_fusion_call:  # the ego's own intent is its answer to the larger graph
             p[..., 0, :] = fused
-        rule, (*batch, vehicles, actions) = RULES[point.fusion.consensus], p.shape
+        name, (*batch, vehicles, actions) = point.fusion.consensus, p.shape
+        rule = RULES[name]
         messages = Messages(
             p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims,
             intents.plans,
         )  # fmt: skip
-        state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
-        fused, weights, state, rule_trust = rule.fuse(messages, state)
+        with worded(f"rule {name}", built_in=name in RULES.built_in):
+            state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
+            fused, weights, state, rule_trust = rule.fuse(messages, state)
+            if fused.shape != heard.own.shape:
+                raise ValueError(f"fused policies of shape {fused.shape}, not {heard.own.shape}")
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where(heard_any[..., None], fused, heard.own)
     unknown = np.isnan(intents.inference_s[..., 0]) & (point.cloud.round_trip_s is None)

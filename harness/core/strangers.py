@@ -38,6 +38,25 @@ def strangers(what: str = "a package") -> Iterator[None]:
             print(f"harness: {line}", file=sys.stderr)
 
 
+@contextmanager
+def worded(what: str, built_in: bool = False) -> Iterator[None]:
+    """Run a package's code whose errors end a run; those of `built_in` code are raised as they are.
+
+    Raises UserError, in one line that names the package's thing, `what`, and where it failed.
+    """
+    try:
+        with strangers(what):
+            yield
+    except UserError:
+        raise
+    except Exception as error:
+        if built_in:
+            raise
+        raise UserError(
+            f"{what} fails ({_raised(error)}); repair or uninstall the package that registers it"
+        ) from error
+
+
 def ends_the_program(error: BaseException) -> bool:
     """Return whether this is no error, and nobody typed Ctrl-C: code that runs here has no right to it."""
     if isinstance(error, Stop):
@@ -49,10 +68,14 @@ def ends_the_program(error: BaseException) -> bool:
 
 def ended(what: str, error: BaseException) -> UserError:
     """Build the error for what a package raised to end the program; it says what, and where."""
+    return UserError(f"{what} ends the program ({_raised(error)}); repair or uninstall the package")
+
+
+def _raised(error: BaseException) -> str:
+    """Return what was raised, and where."""
     words = ": ".join(filter(None, (type(error).__name__, str(error))))
     last = traceback.extract_tb(error.__traceback__)[-1]
-    raised = printable(f"{words} at {last.filename}:{last.lineno}", 200)
-    return UserError(f"{what} ends the program ({raised}); repair or uninstall the package")
+    return printable(f"{words} at {last.filename}:{last.lineno}", 200)
 
 
 def _exits(error: BaseException) -> bool:

@@ -25,7 +25,6 @@ from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
 from harness.core.shards import Shard
-from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
 from harness.evaluate import costs, device, servers, timing
@@ -451,9 +450,7 @@ def _gather(
         decisions, ended, answers = folder.read_part(part, settings["actions"])
         grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
         episodes = counted(grid, decisions, ended)
-        with strangers():  # a metric may be a package's
-            figures = Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
-        return episodes, figures
+        return episodes, Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
 
     with uncollected():
         # One part after the other: the decisions of all would not fit into memory.
