@@ -123,13 +123,15 @@ def test_tables_that_contradict_each_other_are_named_and_are_neither_shown_nor_c
     changed: str, run: Path, proxy_run: Path, harness: Harness
 ) -> None:
     said = check_finds(IN_TABLES[changed], run, harness)
-    for typed in (("report", run), ("compare", proxy_run, run), ("compare", run, proxy_run)):
+    junit = ("run", "export", run, "--junit", "junit.xml")
+    for typed in (("report", run), ("compare", proxy_run, run), ("compare", run, proxy_run), junit):
         gate = ("--fail-if", "success_rate < 1") if typed[0] == "compare" else ()
         code, out, error = harness(*typed, *gate)
         assert (code, out, error.count("\n")) == (2, "", 1)
         assert f"{run} contradicts itself: " in error
         assert said in error
     assert not (run / "report.html").exists()
+    assert not Path("junit.xml").exists()
 
 
 def reworded(answer: Row) -> None:

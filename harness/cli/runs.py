@@ -280,6 +280,7 @@ def export(
 ) -> None:
     """Write a run's data for spreadsheets and other programs. Give exactly one format."""
     from harness.runs import export
+    from harness.runs.contradictions import refuse
     from harness.runs.folder import read
 
     files = {"--junit": junit, "--inspect": inspect, "--sft": sft, "--dpo": dpo}
@@ -304,6 +305,8 @@ def export(
         typer.echo(printable(junit, 1000))
         return
     source, folder = read(run), out or run
+    if junit:
+        refuse(source)
     target = files.get(option)
     try:
         if as_csv:
