@@ -3,10 +3,12 @@
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 from run_on_disk import Row, made_up
 
 from harness.core.arrays import Bools, Floats, Ints
@@ -15,8 +17,10 @@ from harness.report import contents, panels
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.report.runs import Runs
-from harness.runs.folder import read
+from harness.runs.contradictions import contradictions
+from harness.runs.folder import csv_text, read
 from harness.runs.metrics import ONE_OPTIMAL, entry
+from harness.runs.records import Score
 from harness.runs.reliability import (
     BINS,
     LEAST,
@@ -32,6 +36,7 @@ from harness.runs.reliability import (
     mass,
     right,
 )
+from harness.runs.summary import Figures
 
 ONE, TWO, NONE = [True, False, False], [True, True, False], [False, False, False]
 
@@ -259,3 +264,20 @@ def test_figures_of_an_older_definition_are_read_and_not_shown(tmp_path: Path) -
     assert all(run.score("single-local", name) for name in OLDER)
     shown = {metric["meaning"] for metric in contents.summary(run)}
     assert not {entry(name).meaning for name in OLDER} & shown
+
+
+@pytest.mark.slow
+def test_a_run_by_older_rules_is_held_against_these(tmp_path: Path) -> None:
+    """Version 1 knew a figure of twenty layouts, without an interval if all its decisions are alike."""
+    run = read(made_up(tmp_path / "run", decision=one_optimal_in_half, episodes=20, seeds=tuple(range(5))))
+    assert run.score("6g", ECE) is None, "too few layouts by today's rules"
+    stated = structs.replace(run.manifest, versions={"harness": "0"})
+    figures = Figures.of(run.world, run.grid, run.decisions, run.episodes, list(run.answers))
+    scores = figures.scores(older=True)
+    [ece] = [score for score in scores if score.key == ("6g", ECE, "episodes")]
+    assert (ece.value, ece.low, ece.high, ece.n) == (*[pytest.approx(0.4)] * 3, 20)
+    for change, found in (({}, 0), ({"low": None, "high": None}, 0), ({"value": 0.1}, 1), ({"low": 0.3}, 1)):
+        changed = [score if score is not ece else structs.replace(ece, **change) for score in scores]
+        (run.path / "run.json").write_bytes(msgspec.json.encode(stated))
+        (run.path / "summary.csv").write_text(csv_text(Score, changed, stated.variant))
+        assert len(list(contradictions(read(run.path)))) == found

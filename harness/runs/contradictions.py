@@ -15,6 +15,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
 from harness.runs.records import Episode, Score
+from harness.runs.reliability import SAME
 from harness.runs.success import any_time_scores
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
@@ -115,7 +116,9 @@ def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
         if other is None:
             yield f"{SUMMARY} has {_figure(score)}, which its other tables do not have"
         else:
-            yield from _otherwise(score, other, _COLUMNS, "its other tables make")
+            none = not current(run) and score.low is None and score.high is None and _narrow(other)
+            columns = ("value", "n", "n_excluded") if none else _COLUMNS
+            yield from _otherwise(score, other, columns, "its other tables make")
     may_lack = set() if current(run) else LATER - {key[1] for key in stated}
     for key in _lacking(run, here.values()):
         if key[1] not in may_lack:
@@ -163,6 +166,11 @@ def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) 
         a, b = getattr(stated, what), getattr(other, what)
         if not close(a, b):
             yield f"{SUMMARY} has {_figure(stated, what)}, and {whose} it {b}"
+
+
+def _narrow(score: Score) -> bool:
+    """Return whether a figure's interval has no width but that of rounding, which version 1 left out."""
+    return score.low is not None and score.high is not None and score.high - score.low < SAME
 
 
 def _figure(score: Score, what: str = "value") -> str:

@@ -141,7 +141,7 @@ def estimates(
     """Return some figures of the same decisions, as `estimate` does each; they share the resamples.
 
     By the `older` rules, version 1 of the figures, any number of episodes is enough, and a figure whose
-    resamples are all alike has no interval.
+    resamples are all alike has an interval of no width, which rounding may have left out.
     """
     known = [figure for figure in figures if _known(figure, judged, older)]
     values = [[figure(*sums) for figure in known] for sums in _sums(judged, episodes)] if known else []
@@ -187,9 +187,7 @@ def _estimate(values: Sequence[Floats], judged: Judged, episodes: int, older: bo
     n = len(np.unique(judged.episode))
     value, *others = np.concatenate(values).tolist()
     low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
-    if older and not low < high:
-        low, high = math.nan, math.nan
-    elif high - low < SAME and not older:
+    if high - low < SAME and not older:
         low, high = value - 3 / n, value + 3 / n
     return Estimate(value, float(low), float(high), n, episodes - n)
 
