@@ -14,7 +14,7 @@ import typer
 from packaged import register
 
 from harness.backends.base import Completion, Request
-from harness.coordination.consensus import Pool
+from harness.coordination.consensus import Pool, linear_pool
 from harness.coordination.rules import RULES
 from harness.core import parallel
 from harness.core.errors import UserError
@@ -159,7 +159,7 @@ def test_a_rule_that_ends_the_program_is_bad_input_of_the_run(
     ],
 )
 def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
-    pool: Callable[..., object], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+    pool: Callable[..., Any], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(RULES._loaded, "mine", Pool(pool))
     monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
@@ -168,7 +168,7 @@ def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
     assert (code, out, said.count("\n")) == (2, "", 1)
     assert said.startswith(f"harness: {says}")
     assert said.endswith("repair or uninstall the package that registers it\n")
-    monkeypatch.setitem(RULES._loaded, "mine", Pool(RULES["linear"].pool))
+    monkeypatch.setitem(RULES._loaded, "mine", Pool(linear_pool))
     assert harness(*typed, "--out", "run")[0] == 0
 
 
