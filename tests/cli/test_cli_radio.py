@@ -155,7 +155,10 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         (("show", "single-local"), "has no channel; `harness radio list` shows"),
         (("check", "6g"), "loses the same at every distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
-        (("check", "mode4", "--against", "bad.csv"), "bad.csv, line 3: Expected `float` <= 1.0"),
+        (
+            ("check", "mode4", "--against", "bad.csv"),
+            "bad.csv, line 3: reception is '1.9'; it must be a share from 0 to 1",
+        ),
         (("check", "mode4", "--against", "other.csv"), "did you mean 'rate_hz'"),
         (
             ("check", "mode4", "--against", "theirs.csv"),
