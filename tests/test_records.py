@@ -171,18 +171,11 @@ def test_driven_runs_are_held_against_frozen_ones(commit: str, harness: Typed) -
     assert (code, error) == (0, "")
 
 
-@pytest.mark.exhaustive
-def test_a_driven_run_is_drawn(harness: Typed) -> None:
-    code, _, error = harness("run", "video", HERE / "356ad2b/drive", "0", "--out", "episode.gif")
-    assert code == 0, error
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("commit", COMMITS)
 def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None:
     for words, why in {
         "study sweep {run}/drive": "was driven",
-        "run video {run}/proxy 0": "give a folder made by `harness drive`",
         "run merge {run}/proxy {run}/drive --out merged": "is no shard",
         "eval --model replay:{run}/begun": "is no finished run",
     }.items():

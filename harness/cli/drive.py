@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import typer
 
@@ -11,9 +11,9 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
 from harness.cli.terminal import echo_json
-from harness.core import extras
 from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import crossed
+from harness.core.plugins import Plugins
 from harness.core.seeds import stated
 from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
 
@@ -34,6 +34,22 @@ COLUMNS = (
     Column("gap", "least_gap_m"),
     Column("clear", "time_to_clear_s"),
 )
+
+
+@runtime_checkable
+class Videos(Protocol):
+    """Draws episodes of a run that was driven."""
+
+    def ready(self) -> None:
+        """Raise UserError if a package that it needs is missing."""
+        ...
+
+    def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
+        """Draw at most so many episodes that failed under the run's last condition; return the files."""
+        ...
+
+
+VIDEOS = Plugins[Videos]("swarmdrive.videos", Videos, {})  # those that extensions add
 
 
 @options.takes(DriveSettings)
@@ -82,10 +98,13 @@ def command(
             "--tracker out"
         )
     if save_video:
-        extras.need("--save-video", "matplotlib")
+        for drawer in VIDEOS.values():
+            drawer.ready()
     source = resolve.driven(world, name)
     driven = len(source.numbers)
     in_range("--save-video", save_video, 0, driven)
+    if save_video and not VIDEOS:
+        raise UserError("--save-video: no extension that is installed draws videos; leave it out")
     spec = resolve.spec(settings, source)
     if max_cost is not None and not isinstance(who, int):
         raise UserError(
@@ -103,10 +122,13 @@ def command(
         where = out or default_out(spec)
         videos: list[Path] = []
 
+        def draw() -> None:
+            for drawer in VIDEOS.values() if save_video else ():
+                videos.extend(drawer.write(where, save_video, silent))
+
         done, page = evaluate(
             spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
-            then=lambda: videos.extend(write_failures(where, save_video, silent) if save_video else ()),
-            hooks=trackers,
+            then=draw, hooks=trackers,
         )  # fmt: skip
     tell(done, as_json, quiet)
     if silent:
@@ -157,27 +179,3 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     several = any(score.metric == "arrived_rate" for score in done.scores)
     columns = tuple(TIME_OUT if several and each == LATE else each for each in COLUMNS)
     show(done, f"closed loop · {world.title}", columns, notes)
-
-
-def write_failures(run: Path, most: int, quiet: bool) -> list[Path]:
-    """Videos of a run's first failed episodes under its last condition, each with the first seed that failed.
-
-    They are written to the run's `videos`, the best kind that can be written here; returns the files.
-    """
-    from harness.evaluate.replay import played
-    from harness.report.drawing.video import formats, write_video
-    from harness.runs.folder import read
-
-    driven = read(run)
-    last = driven.conditions[-1]
-    failed: dict[int, int] = {}
-    for ended in sorted(driven.episodes, key=lambda ended: ended.episode):
-        if ended.condition == last and not ended.success and len(failed) < most:
-            failed.setdefault(ended.episode, ended.seed)
-    files = []
-    with bar("drawing failed episodes", len(failed), quiet) as progress:
-        for episode, seed in failed.items():
-            files.append(run / "videos" / f"{episode:05d}-seed{seed}{formats()[-1]}")
-            write_video(played(driven, episode, last, seed), files[-1], lambda done: None)
-            progress(1)
-    return files

@@ -1,4 +1,4 @@
-"""`harness run`: list and check finished runs, follow a metric, merge shards, export and film a run."""
+"""`harness run`: list and check finished runs, follow a metric, merge shards, export a run."""
 
 import tempfile
 from dataclasses import asdict
@@ -337,26 +337,3 @@ def export(
         raise UserError(f"{where} cannot be written ({error.strerror}); {remedy}") from None
     for file in written:
         typer.echo(printable(file, 1000))
-
-
-def video(
-    run: Path = typer.Argument(help="Folder of a finished run of `harness drive`."),
-    episode: int = typer.Argument(help="Number of the episode, from 0."),
-    condition: str | None = typer.Option(None, help="Condition to draw. Default: the run's last."),
-    seed: int | None = typer.Option(None, help="Channel seed to draw. Default: the run's first."),
-    out: Path = typer.Option(
-        Path("episode.gif"), help="File to write: .gif, or .mp4 if the extra `video` is installed."
-    ),
-) -> None:
-    """Draw an episode of a closed-loop run as a video.
-
-    It shows what is in sight, messages and the ego's policy.
-    """
-    from harness.evaluate.replay import find, stills
-    from harness.report.drawing.video import check, write_video
-
-    check(out)
-    played = find(run, episode, condition, seed)
-    with bar("drawing", sum(1 for _ in stills(played))) as progress:
-        write_video(played, out, progress)
-    typer.echo(f"wrote {printable(out)}")

@@ -14,7 +14,7 @@ from run_on_disk import change, damage, rows_of
 
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
-from harness.evaluate.replay import find, scenes_of
+from harness.evaluate.replay import played, scenes_of
 from harness.prompts import versions as prompts
 from harness.report.compare.pair import pair
 from harness.report.decisions import failures, pick
@@ -90,7 +90,7 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
     earlier = edited(
         driven, tmp_path, "run.json", lambda text: text.replace('"time_limit_s": 10.0', '"time_limit_s": 0.5')
     )
-    assert find(earlier, 0, None, None).scenario.parameters.time_limit_s == 0.5
+    assert played(read(earlier), 0, "6g", 0).scenario.parameters.time_limit_s == 0.5
     assert [replayed.id for replayed in scenes_of(read(earlier), [scene])] == [scene]
     gone = edited(
         driven, tmp_path / "gone", "run.json", lambda text: text.replace('"time_limit_s"', '"patience_s"')

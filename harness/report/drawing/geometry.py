@@ -3,9 +3,8 @@
 The frame of `harness.world.road` has south instead, so every position is flipped on its way in.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -20,7 +19,6 @@ LOW_M, LOW_SHAPE = 40.0, 0.6  # roads that reach no farther north to south; heig
 BEYOND_M = 80.0  # roads are drawn so far beyond the edge, for who is there
 MARGIN_M, LEAST_M = 8.0, 60.0  # around what a view holds; its width
 NEAR_M = VIEW_M - MARGIN_M  # what is farther north, south, east or west of the ego than this is not followed
-EASE = 8  # stills before a decision in which a video turns to its view
 
 
 def north_up(points: Floats) -> Floats:
@@ -93,15 +91,6 @@ class View:
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))
 
-    def toward(self, target: "View", share: float) -> "View":
-        """On the way to another view."""
-        return View(
-            self.west_m + share * (target.west_m - self.west_m),
-            self.south_m + share * (target.south_m - self.south_m),
-            self.width_m + share * (target.width_m - self.width_m),
-            self.height_m + share * (target.height_m - self.height_m),
-        )
-
 
 def spots(
     state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None],
@@ -139,27 +128,3 @@ def view_of(held: Floats, shape: float = 1.0) -> View:
         return min(max(middle, high + MARGIN_M - size / 2), low - MARGIN_M + size / 2) - size / 2
 
     return View(start(west, east, width), start(south, north, shape * width), width, shape * width)
-
-
-def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> list[View]:
-    """A view for each still of a video: held through each part, it turns to the next in its last stills.
-
-    Args:
-        held: spots of each still.
-        parts: the part that each still is of, such as the decision, in order.
-        shape: height by width.
-    """
-    starts = [0, *(n for n, (a, b) in enumerate(pairwise(parts), 1) if a != b), len(parts)]
-    turns = [begin if begin == 0 else max(begin - EASE, last) for last, begin in pairwise([0, *starts[:-1]])]
-    # What is on its way from one part into the next is in the views of both, and so in all between them.
-    targets = [
-        view_of(np.concatenate(held[turn:end]), shape) for turn, end in zip(turns, starts[1:], strict=True)
-    ]
-    stills = []
-    for n, target in enumerate(targets):
-        turn, end = turns[n + 1] if n + 1 < len(targets) else starts[n + 1], starts[n + 1]
-        stills += [target] * (turn - starts[n])
-        for still in range(turn, end):
-            share = (still - turn + 1) / (end - turn + 1)
-            stills.append(target.toward(targets[n + 1], share * share * (3 - 2 * share)))
-    return stills

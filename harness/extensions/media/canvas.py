@@ -20,7 +20,8 @@ from matplotlib.textpath import TextPath
 
 from harness.core.arrays import Floats, Pixels
 from harness.core.errors import printable
-from harness.evaluate.replay import ReplayedEpisode, Still, Turn
+from harness.evaluate.replay import ReplayedEpisode
+from harness.extensions.media.stills import Still, Turn
 from harness.report.drawing.artists import body, named, roads, scale_m, shade, sight, walls
 from harness.report.drawing.colours import BAD, BUILDING_NAME, GOOD, GREY, INK, LATE, LIGHT, ROLES
 from harness.report.drawing.colours import actions as colours_of

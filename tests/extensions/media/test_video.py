@@ -2,13 +2,13 @@
 
 import shutil
 import sys
+from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
-from driving import FROM_LEFT
 from evaluating import live_spec_of, run
 from former import DRIVE
 from PIL import Image, ImageSequence
@@ -16,9 +16,15 @@ from run_on_disk import made_up
 from typer.testing import CliRunner
 
 from harness.cli import app, main
+from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
-from harness.evaluate.replay import find, stills
-from harness.report.drawing.video import write_video
+from harness.evaluate.live_world import LiveSource
+from harness.extensions.media.stills import find, stills
+from harness.extensions.media.video import write_video
+from harness.runs import folder
+
+RECORDS = Path(__file__).parents[2] / "records"
+FROM_LEFT = 6  # a layout seed with a danger
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +145,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     # How each is drawn to its end is tested apart.
-    monkeypatch.setattr("harness.report.drawing.video.stills", lambda played: islice(stills(played), 2))
+    monkeypatch.setattr("harness.extensions.media.video.stills", lambda played: islice(stills(played), 2))
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"
@@ -163,3 +169,58 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
             find(*arguments)
     with pytest.raises(UserError, match=r"was made by `harness eval`; give a folder made by `harness drive`"):
         find(made_up(tmp_path / "frozen"), 0, None, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()])
+def test_an_old_episode_played_again_ends_as_it_did(commit):
+    """Its record lacks the parameters that came later."""
+    there = folder.read(RECORDS / commit / "drive")
+    *_, last = stills(find(there.path, 0, "single-local", 0))
+    [row] = [e for e in there.episodes if (e.episode, e.condition, e.seed) == (0, "single-local", 0)]
+    assert last.outcome.startswith(f"{row.failure or 'cleared'} at {row.time_s:.1f} s")
+
+
+@pytest.mark.slow
+def test_an_episode_of_agents_played_again_ends_as_it_did(tmp_path):
+    spec = live_spec_of(
+        prompt="v4", points=(named_point("single-local"),), seeds=(0,), latency="ego=1.3,helper=1.3,fusion=0"
+    )
+    source = LiveSource(50_000, 2, "all-way-crossing:agent_share=1")
+    there = folder.read(run(replace(spec, source=source), tmp_path / "run").out)
+    for e in there.episodes:
+        *_, last = stills(find(there.path, e.episode, e.condition, e.seed))
+        ended = {agent: turn.outcome for agent, turn in last.turns.items()}
+        assert sum(said.startswith("cleared") for said in ended.values()) == e.arrived
+        if not e.success:
+            how, partner = e.failure.replace("_", " "), f" with {e.partner}" if e.partner else ""
+            [worst] = {said for agent, said in ended.items() if last.outcome == f"{agent}: {said}"}
+            assert worst == f"{how} at {e.time_s:.1f} s{partner}"
+
+
+@pytest.mark.exhaustive
+def test_an_old_run_is_drawn(harness):
+    code, _, error = harness("run", "video", RECORDS / "356ad2b/drive", "0", "--out", "episode.gif")
+    assert code == 0, error
+
+
+@pytest.mark.parametrize("commit", sorted(path.parent.name for path in RECORDS.glob("*/proxy")))
+def test_a_run_of_frozen_scenes_is_no_film(commit, harness):
+    code, _, error = harness("run", "video", RECORDS / commit / "proxy", "0")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "give a folder made by `harness drive`" in error
+
+
+def test_more_videos_than_episodes_are_refused(harness, tmp_path):
+    code, out, error = harness("drive", "--episodes", 3, "--save-video", 4, "--out", tmp_path / "run")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "--save-video 4 is out of range; give 0 to 3" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_what_draws_them_no_videos_are_promised(harness, tmp_path, monkeypatch):
+    monkeypatch.setattr("harness.cli.drive.VIDEOS", {})
+    code, out, error = harness("drive", "--episodes", 3, "--save-video", 1, "--out", tmp_path / "run")
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "--save-video: no extension that is installed draws videos" in error
+    assert not (tmp_path / "run").exists()

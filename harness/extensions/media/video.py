@@ -16,10 +16,12 @@ from harness.core import extras
 from harness.core.arrays import Pixels
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing, write_whole
-from harness.evaluate.replay import ReplayedEpisode, Still, stills
-from harness.report.drawing.geometry import View, shape_of, spots, views
+from harness.evaluate.replay import ReplayedEpisode
+from harness.extensions.media.canvas import Canvas
+from harness.extensions.media.stills import Still, stills
+from harness.extensions.media.views import views
+from harness.report.drawing.geometry import View, shape_of, spots
 from harness.report.drawing.pictures import styled
-from harness.report.drawing.still import Canvas
 from harness.world.perception.graph import scene_graph
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph

@@ -1,0 +1,39 @@
+"""Videos of the episodes of a run that failed, for `harness drive --save-video`."""
+
+from pathlib import Path
+
+from harness.cli.progress import bar
+from harness.core import extras
+
+
+class Failures:
+    """Draws the first episodes that failed under a run's last condition."""
+
+    def ready(self) -> None:
+        extras.need("--save-video", "matplotlib")
+
+    def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
+        """Draw each with the first seed that failed, to the run's `videos`.
+
+        They are of the best kind that can be written here.
+        """
+        from harness.evaluate.replay import played
+        from harness.extensions.media.video import formats, write_video
+        from harness.runs.folder import read
+
+        driven = read(run)
+        last = driven.conditions[-1]
+        failed: dict[int, int] = {}
+        for ended in sorted(driven.episodes, key=lambda ended: ended.episode):
+            if ended.condition == last and not ended.success and len(failed) < most:
+                failed.setdefault(ended.episode, ended.seed)
+        files = []
+        with bar("drawing failed episodes", len(failed), quiet) as progress:
+            for episode, seed in failed.items():
+                files.append(run / "videos" / f"{episode:05d}-seed{seed}{formats()[-1]}")
+                write_video(played(driven, episode, last, seed), files[-1], lambda done: None)
+                progress(1)
+        return files
+
+
+FAILURES = Failures()
