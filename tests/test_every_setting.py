@@ -1,0 +1,130 @@
+"""Each setting, typed with a value that is not its default, is found wherever a run states its settings."""
+
+import json
+import shlex
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from evaluating import same_decisions
+from misbehaving import Asked, completion, serving
+
+from harness.evaluate.settings import WORLDS, Option, Settings, changed, kind_of, of_words, options
+
+Said = tuple[int, str, str]
+CARD = """engine = "openai"
+description = "thinks where it is asked to"
+weights = "m"
+thinking = "switch"
+[server]
+base_url = "http://127.0.0.1:1/v1"
+kind = "llama-server"
+[latency]
+source = "paper"
+basis = "none"
+"""
+RUNS = {
+    "rules": "eval --model proxy-faulty --prompt v4 --helper-model proxy,proxy-faulty --dataset {small} "
+    "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --control shuffled-messages --attack liar:share=1/3 "
+    "--sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first --tag night",
+    "selected": "eval --dataset {small} --only 0:3 --danger left --sample 1 --sample-seed 3",
+    "narrow": "eval --dataset {two} --condition single-local --until-width 99",
+    "decided": "eval --dataset {two} --condition single-local --seeds 0,1 --until-decided {two_run}",
+    "server": "eval --model mine --prompt v4 --dataset {two} --limit 1 --condition 6g --thinking "
+    "--helper-prompt v2 --helper-answer constrained --no-helper-thinking --temperature 0.5 "
+    "--sampling-seed 3 --server {server}",
+    "device": "eval --model mine --dataset {two} --limit 1 --condition 6g --server {server} "
+    "--device-profile agx-orin --device-model qwen3-4b",
+    "driven": "drive --scenario {scenario} --condition single-local --episodes 6 --first-seed 7 --sample 1 "
+    "--sample-seed 3 --seeds 3,7",
+    "driven until narrow": "drive --scenario {scenario} --episodes 1 --condition single-local "
+    "--until-width 99",
+    "driven until decided": "drive --scenario {scenario} --episodes 1 --condition single-local "
+    "--until-decided other",
+    "engine": "eval --model swarm-tiny --engine transformers --dataset {two} --limit 1 "
+    "--condition single-local --device cpu --dtype bfloat16 --answer readout --letters cyclic --flip",
+    "picture": "eval --model swarm-tiny-vl --prompt v8 --dataset {two} --limit 1 --condition single-local "
+    "--image blank",
+}
+NEEDS = {"engine": "torch", "picture": "llama_cpp"}
+SCENARIO = "occluded-intersection:limits=1,perception=1,witnesses=any,radio_share=0.0"
+# A run states its conditions by name, and its engine with its model.
+IN_OTHER_WORDS: dict[str, dict[str, Any]] = {
+    "rules": {
+        "condition": ["6g:tau=0.5", "6g:tau=0.5,messages=shuffled", "6g:tau=0.5,attack=liar:share=1/3"],
+        "control": [],
+        "attack": [],
+    },
+    "engine": {"model": "swarm-tiny:transformers", "engine": None},
+}
+
+
+def answer(asked: Asked) -> None:
+    """Answer by the seed of the sampling, and think where that is asked for."""
+    share = 0.1 + 0.01 * (asked.body.get("seed", 0) % 80)
+    p = f'{{"SLOWER":{0.9 - share:.2f},"IDLE":0.10,"FASTER":{share:.2f}}}'
+    helper = '"evidence":"","risk":"low",' if "evidence" in json.dumps(asked.body) else ""
+    thinks = asked.body["chat_template_kwargs"]["enable_thinking"]
+    said = f'{{{helper}"action_distribution":{p}}}'
+    asked.reply(completion(said, **({"reasoning_content": "Who comes?"} if thinks else {})))
+
+
+def unusual(settings: Settings) -> Iterator[Option]:
+    """The options whose value is not the default."""
+    return (each for each in options(type(settings.world)) if each.of(settings) != each.default)
+
+
+def settings_of(run: str) -> Settings:
+    """The settings that a run's command has, whatever its folders are called."""
+    return of_words(["harness", *shlex.split(RUNS[run])])
+
+
+def test_each_setting_is_typed_in_some_run() -> None:
+    tried = {(kind_of(settings_of(run)), each.path) for run in RUNS for each in unusual(settings_of(run))}
+    for kind, world in WORLDS.items():
+        for each in options(world):
+            kinds = {kind} if each.path[0] == "world" else WORLDS.keys()
+            assert any((its, each.path) in tried for its in kinds), f"add a run with an unusual {each.flag}"
+
+
+MARKS = {**dict.fromkeys(RUNS, pytest.mark.slow), **dict.fromkeys(NEEDS, pytest.mark.exhaustive)}
+
+
+@pytest.mark.parametrize("run", [pytest.param(run, marks=mark) for run, mark in MARKS.items()])
+def test_a_run_states_each_setting_and_repeats_it(
+    run: str, harness: Callable[..., Said], small_path: Path, two_path: Path, two_run: Path
+) -> None:
+    pytest.importorskip(NEEDS.get(run, "harness"))
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    Path("models/mine.toml").write_text(CARD)
+    places = {"small": small_path, "two": two_path, "two_run": two_run, "scenario": SCENARIO}
+    with serving(answer) as there:
+        typed = shlex.split(RUNS[run].format(**places, server=there.url))
+        beside = ["--server", there.url] if there.url in typed else []
+        silent = ("--quiet", "--no-cache", *(["--workers", "1"] if "drive" in typed else []), "--out")
+        if "other" in typed:
+            assert harness(*typed[:-2], "--model", "cruise", *silent, "other")[0] == 0
+        code, _, error = harness(*typed, *silent, "run")
+        assert code == 0, error
+        code, _, error = harness(typed[0], "run", *beside, *silent, "again")
+        assert code == 0, error
+    asked, [by_run, by_again] = of_words(["harness", *typed]), map(stated, ("run", "again"))
+    expected = changed(asked, IN_OTHER_WORDS.get(run, {}))
+    for each in unusual(expected):
+        for place, settings in by_run.items():
+            assert each.of(settings) == each.of(expected), f"{each.flag} in {place}"
+    assert by_again == by_run
+    assert same_decisions(Path("run"), Path("again"))
+
+
+def stated(run: str) -> dict[str, Settings]:
+    """The settings of a run by the place that states them."""
+    manifest = json.loads(Path(run, "run.json").read_text())
+    *command, flag, out = shlex.split(manifest["command"])
+    assert (flag, out) == ("--out", run)
+    text = Path(run, "run.toml").read_text()
+    return {"run.toml": msgspec.convert(tomllib.loads(text), Settings), "command": of_words(command)}
