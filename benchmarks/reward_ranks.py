@@ -25,9 +25,10 @@ from harness.backends.registry import open_backend
 from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset
-from harness.evaluate import latency, resolve, settings
+from harness.evaluate import latency, resolve
 from harness.evaluate.asking import Asker
 from harness.learning.values import balanced
+from harness.runs import settings
 from harness.world import drivers
 
 SMALLEST = "--layouts 1 --scenarios parking-exit --models proxy"

@@ -214,8 +214,9 @@ def run(
     """
     from harness.backends.cache import default_file
     from harness.cli.run import default_out, evaluate
-    from harness.evaluate import costs, hooks, resolve, settings
+    from harness.evaluate import costs, hooks, resolve
     from harness.evaluate.spec import Source
+    from harness.runs import settings
 
     names = {kind: {each.name: each for each in settings.options(kind)} for kind in settings.WORLDS.values()}
     frozen, driven = names.values()
@@ -306,7 +307,7 @@ def sweep(
         UserError: an axis, a value or a condition is unknown, or the folder holds another study.
     """
     from harness.cli.progress import bar
-    from harness.evaluate.settings import parse_seeds
+    from harness.runs.settings import parse_seeds
     from harness.studies.replayed_run import ReplayedRun
     from harness.studies.study import write_study
     from harness.studies.sweep import folder_of, panels_over, run_sweep

@@ -20,10 +20,10 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
-from harness.evaluate.settings import words
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs.folder import read
+from harness.runs.settings import words
 from harness.studies import replayed_run
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun

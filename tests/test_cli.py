@@ -20,8 +20,8 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.resolve import points
 from harness.evaluate.run import evaluate
-from harness.evaluate.settings import parse_seeds
 from harness.prompts import versions
+from harness.runs.settings import parse_seeds
 
 HEAVY = (
     "numpy", "pandas", "scipy", "torch", "transformers", "tokenizers", "jinja2", "jsonschema", "json_repair",

@@ -24,8 +24,8 @@ from harness.cli import app
 from harness.core.errors import UserError
 from harness.core.shards import shard_of
 from harness.evaluate.latency import NAMES, declared
-from harness.evaluate.settings import parse_seeds
 from harness.extensions.media.stills import stills
+from harness.runs.settings import parse_seeds
 
 Harness = Callable[..., tuple[int, str, str]]
 Copied = Callable[[str], str]

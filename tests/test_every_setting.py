@@ -12,7 +12,7 @@ import pytest
 from evaluating import same_decisions
 from misbehaving import Asked, completion, serving
 
-from harness.evaluate.settings import WORLDS, Option, Settings, changed, kind_of, of_words, options
+from harness.runs.settings import WORLDS, Option, Settings, changed, kind_of, of_words, options
 
 Said = tuple[int, str, str]
 CARD = """engine = "openai"

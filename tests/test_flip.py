@@ -23,12 +23,12 @@ from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import finished_with
 from harness.evaluate.resolve import agents
-from harness.evaluate.settings import HelperSettings, Settings
 from harness.evaluate.spec import Spec
 from harness.prompts import readout, versions
 from harness.report.caveats import of_run
 from harness.runs import folder
 from harness.runs.records import Answer
+from harness.runs.settings import HelperSettings, Settings
 
 Said = tuple[int, str, str]
 LETTERS = pytest.mark.parametrize("letters", ["raw", "cyclic"])

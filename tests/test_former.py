@@ -10,8 +10,8 @@ from harness.dataset import suites
 from harness.dataset.load import find, load
 from harness.evaluate import replay
 from harness.evaluate.live_world import LiveSource
-from harness.evaluate.settings import DriveSettings, Settings, read, text_of
 from harness.runs import folder
+from harness.runs.settings import DriveSettings, Settings, read, text_of
 from harness.world import scenarios
 from harness.world.parameters import SUITES
 

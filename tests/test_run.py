@@ -39,10 +39,10 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.run import evaluate
-from harness.evaluate.settings import words
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.runs.records import Answer, FrozenScenes
+from harness.runs.settings import words
 from harness.world.drivers import DRIVERS
 
 ALL = tuple(POINTS)

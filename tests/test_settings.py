@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve
-from harness.evaluate.settings import (
+from harness.runs.folder import read as read_run
+from harness.runs.settings import (
     WORLDS,
     DriveSettings,
     FrozenSettings,
@@ -27,7 +28,6 @@ from harness.evaluate.settings import (
     text_of,
     words,
 )  # fmt: skip
-from harness.runs.folder import read as read_run
 
 Said = tuple[int, str, str]
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8)

@@ -34,9 +34,9 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import finished
-from harness.evaluate.settings import words
 from harness.radio.channel import Draws
 from harness.runs.folder import read
+from harness.runs.settings import words
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 

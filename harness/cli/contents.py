@@ -9,7 +9,7 @@ from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.cli.terminal import echo_json
 from harness.core.errors import printable
-from harness.evaluate.settings import parse_seeds
+from harness.runs.settings import parse_seeds
 
 Runs = typer.Argument(
     help="Folders of finished runs of `harness eval`, or of suites. Several families of scenes are averaged.",

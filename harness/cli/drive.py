@@ -15,7 +15,7 @@ from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import crossed
 from harness.core.plugins import Plugins
 from harness.core.seeds import stated
-from harness.evaluate.settings import OUTPUT, DriveSettings, Settings, changed
+from harness.runs.settings import OUTPUT, DriveSettings, Settings, changed
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated

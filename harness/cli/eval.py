@@ -14,8 +14,8 @@ from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.figures import crossed
 from harness.core.seeds import stated
-from harness.evaluate.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 from harness.runs import leading
+from harness.runs.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers

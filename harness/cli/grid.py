@@ -13,7 +13,7 @@ from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
 from harness.cli.show import finish
 from harness.core.errors import UserError, printable
-from harness.evaluate.settings import FrozenSettings, Settings, changed
+from harness.runs.settings import FrozenSettings, Settings, changed
 
 MOST_CELLS = 256
 HELPERS = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")

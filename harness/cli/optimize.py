@@ -20,7 +20,7 @@ from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
 from harness.core.seeds import FIRST
-from harness.evaluate.settings import OUTPUT, FrozenSettings, Settings
+from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec

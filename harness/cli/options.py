@@ -9,8 +9,8 @@ from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of
-from harness.evaluate import settings as stated
-from harness.evaluate.settings import HELP
+from harness.runs import settings as stated
+from harness.runs.settings import HELP
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -10,7 +10,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.core.errors import UserError, printable, unknown
-from harness.evaluate.settings import parse_seeds
+from harness.runs.settings import parse_seeds
 
 TrainRuns = typer.Argument(
     help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."

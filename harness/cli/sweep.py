@@ -8,7 +8,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.core.errors import UserError
-from harness.evaluate.settings import parse_seeds
+from harness.runs.settings import parse_seeds
 
 PROXY = "proxy"  # the source that an extension may add
 

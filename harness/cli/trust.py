@@ -11,7 +11,7 @@ from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import UserError
-from harness.evaluate.settings import parse_seeds
+from harness.runs.settings import parse_seeds
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
@@ -97,7 +97,7 @@ def command(
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
     """Return the evaluation whose answers are walked."""
     from harness.evaluate import resolve
-    from harness.evaluate.settings import FrozenSettings, Settings
+    from harness.runs.settings import FrozenSettings, Settings
 
     settings = Settings(
         model=model,

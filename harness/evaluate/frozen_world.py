@@ -15,13 +15,13 @@ from harness.dataset.schema import Edge
 from harness.dataset.select import ALL, NONE, Selection
 from harness.evaluate.draws import channel_draws
 from harness.evaluate.looks import Until
-from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.difficulty import REFERENCES, Layout
 from harness.runs.metrics import World, by_danger
 from harness.runs.records import Episode, FrozenScenes, Looks
+from harness.runs.settings import FrozenSettings
 from harness.world.lookouts import radios
 from harness.world.outcome import rating
 from harness.world.parameters import ROUNDING_FRAMES

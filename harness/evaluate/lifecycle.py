@@ -16,10 +16,10 @@ from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
-from harness.evaluate.settings import difference, of_words, words
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
 from harness.runs.records import Latency, Looks, Manifest, Score
+from harness.runs.settings import difference, of_words, words
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):

@@ -25,10 +25,10 @@ from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
 from harness.evaluate.looks import Until
-from harness.evaluate.settings import DriveSettings
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
 from harness.runs.records import ClosedLoop, Episode, Looks
+from harness.runs.settings import DriveSettings
 from harness.world import conflict_measures, reference, scenarios
 from harness.world.drivers import PRIVILEGED
 from harness.world.lookouts import radios

@@ -19,11 +19,11 @@ from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.looks import until
-from harness.evaluate.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs import devices
 from harness.runs.folder import read
+from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
 

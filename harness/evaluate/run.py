@@ -44,7 +44,6 @@ from harness.evaluate.lifecycle import (
     unfinished,
 )
 from harness.evaluate.looks import looks
-from harness.evaluate.settings import FILE, of_words, text_of
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
@@ -56,6 +55,7 @@ from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT
 from harness.runs.metrics import Grid, metrics_of
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Looks, Manifest
+from harness.runs.settings import FILE, of_words, text_of
 from harness.runs.success import any_time_scores
 from harness.runs.summary import Figures, counted
 from harness.runs.unanswered import Tally

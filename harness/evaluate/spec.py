@@ -23,12 +23,12 @@ from harness.evaluate.costs import Budget
 from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.looks import Until
-from harness.evaluate.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs.devices import Device
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
+from harness.runs.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share

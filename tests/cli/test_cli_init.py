@@ -11,8 +11,8 @@ import pytest
 
 from harness.backends import cards
 from harness.core import resources
-from harness.evaluate import settings
 from harness.prompts import versions as prompts
+from harness.runs import settings
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]

@@ -22,7 +22,6 @@ from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import card_here
-from harness.evaluate.settings import FrozenSettings, Settings, parse_seeds
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import pinned
@@ -30,6 +29,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
+from harness.runs.settings import FrozenSettings, Settings, parse_seeds
 from harness.runs.success import Pairs, is_gain, mean_difference
 
 KIND = "editions"

@@ -6,7 +6,7 @@ import typer
 
 from harness.cli import options
 from harness.core.errors import UserError, in_range, printable
-from harness.evaluate.settings import HELP
+from harness.runs.settings import HELP
 
 TOKEN = "SWARMDRIVE_SERVE_TOKEN"
 LEAST = 8  # characters of a token

@@ -10,7 +10,7 @@ from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import FIRST
-from harness.evaluate.settings import HELP, parse_seeds
+from harness.runs.settings import HELP, parse_seeds
 
 MOST_EPISODES = 1_000_000
 
@@ -77,10 +77,10 @@ def closed_loop(
     from harness.backends.cache import default_file
     from harness.evaluate import resolve
     from harness.evaluate.agent import Agent
-    from harness.evaluate.settings import DriveSettings
     from harness.evaluate.spec import Spec
     from harness.extensions.paper.closed_loop import panels, run_closed_loop
     from harness.prompts import versions
+    from harness.runs.settings import DriveSettings
     from harness.studies.study import refuse_taken
 
     named = scenario and options.typed_scenario(scenario)

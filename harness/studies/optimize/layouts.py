@@ -16,8 +16,8 @@ from harness.dataset.verify import scenario_of
 from harness.evaluate import resolve
 from harness.evaluate.dry_run import count
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.settings import FrozenSettings
 from harness.evaluate.spec import Spec
+from harness.runs.settings import FrozenSettings
 from harness.world.scenario import Scenario
 
 

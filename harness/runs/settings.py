@@ -14,7 +14,7 @@ from msgspec import Meta, Struct, structs, to_builtins
 
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable
-from harness.core.resources import DATASET
+from harness.core.resources import DATASET, names
 
 FILE = "run.toml"
 COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
@@ -555,9 +555,7 @@ def _as_driven(settings: Settings, run: Path) -> Settings:
 
 
 def _is_card(model: str) -> bool:
-    from harness.backends.cards import names
-
-    return model.partition(":")[0] in names()
+    return model.partition(":")[0] in names("models")
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
