@@ -196,6 +196,15 @@ def test_a_run_stops_when_it_differs_from_another(small: Dataset, tmp_path: Path
     assert "by an interval of every look" in said
 
 
+def test_a_driven_run_is_held_against_one_of_the_same_scenes(tmp_path: Path) -> None:
+    spec = live_spec_of("constant", 2, points=(POINTS["single-local"],), seeds=(0,))
+    run(spec, tmp_path / "base")
+    against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
+    assert replace(spec, source=replace(spec.source, until=against))
+    with pytest.raises(UserError, match="base is not of the same scenes"):
+        replace(spec, source=replace(spec.source, first_seed=1, until=against))
+
+
 @pytest.mark.parametrize(
     ("base", "spec", "says"),
     [

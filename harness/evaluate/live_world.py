@@ -5,6 +5,7 @@ taken in the first frame that begins after the decision's latency; until then th
 decision that is still open when the next one is due continues, and the next one is skipped.
 """
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -77,7 +78,8 @@ class LiveSource:
         return [self.first_seed + number for number in self.numbers]
 
     def record(self) -> ClosedLoop:
-        parameters = self.scenario.parameters.stated()
+        # As a run's file has them, so that one that is read is of the same scenes: lists, and no tuples.
+        parameters = json.loads(json.dumps(self.scenario.parameters.stated()))
         return ClosedLoop(
             scenario={"name": self.scenario.name, "parameters": parameters}, first_seed=self.first_seed,
             episodes=len(self.numbers),
