@@ -7,6 +7,7 @@ import msgspec
 from evaluating import all_scenes, says, spec_of
 
 from harness.backends.base import Completion
+from harness.core.versions import FIGURES
 from harness.evaluate.asking import Asker, answer_of, requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
@@ -38,7 +39,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
         "model": {"name": model, "engine": "rule", "description": "brakes for what it sees"},
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
         "latency": PAPER, "identity": {"engine": "rule"},
-        "cached_answers": 0, "engine_errors": 0, "versions": dataset.manifest.versions,
+        "cached_answers": 0, "engine_errors": 0, "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
     }  # fmt: skip
     folder.write(
         out,
