@@ -39,7 +39,8 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
         "model": {"name": model, "engine": "rule", "description": "brakes for what it sees"},
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
         "latency": PAPER, "identity": {"engine": "rule"},
-        "cached_answers": 0, "engine_errors": 0, "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
+        "cached_answers": 0, "engine_errors": 0,
+        "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
     }  # fmt: skip
     folder.write(
         out,
