@@ -93,6 +93,10 @@ ODD = {
     'Extension(name="other")': "extension odd calls itself other; give both the same name",
     'Extension(name="odd", commands=["study x"])': "extension odd: its commands are no table of texts",
     'Extension(name="odd", adds={"rules": 3})': "extension odd: its adds are no table of texts",
+    'Extension(name="odd", commands={"": "x:y"})': "extension odd: nobody can type '' of its commands",
+    'Extension(name="odd", commands={"study  x": "x:y"})': "nobody can type 'study  x' of its commands",
+    'Extension(name="odd", studies={"../x": "x"})': "extension odd: nobody can type '../x' of its studies",
+    'Extension(name="odd", spellings={"old": ""})': "extension odd: nobody can type '' of its spellings",
     "1 / 0": "plug-in 'odd' (swarmdrive.extensions): of_others:ODD does not load (division by zero)",
     "Extension": "is of type type and no Extension",
     "exit()": "ends the program (SystemExit",
@@ -123,6 +127,53 @@ def test_a_name_that_is_taken_is_left_out_with_a_line(installed: Installed, harn
     assert code == 2
     assert "extension odd: eval of its commands is taken; it is left out" in err
     assert "extension other: odd of its commands is taken" in err
+
+
+@pytest.mark.parametrize("path", ["run", "run ls again", "benchmark", "serve"])
+def test_no_command_of_a_package_hides_another_or_a_group(
+    installed: Installed, harness: Typed, path: str
+) -> None:
+    installed(odd=f'Extension(name="odd", commands={{"{path}": "x:y"}})')
+    code, out, err = harness("--help")
+    assert code == 0
+    assert err.count("\n") == 1
+    assert f"extension odd: {path} of its commands is taken" in err
+    assert "  benchmark  " in out
+
+
+@pytest.mark.parametrize("kind", ["spellings", "short"])
+@pytest.mark.parametrize("path", ["run", "eval", "serve", "benchmark"])
+def test_no_spelling_of_a_package_hides_a_command_or_a_group(
+    installed: Installed, harness: Typed, kind: str, path: str
+) -> None:
+    usual = harness(path, "--help")
+    installed(odd=f'Extension(name="odd", {kind}={{"{path}": "study sweep"}})')
+    assert harness(path, "--help") == usual
+
+
+def test_a_panel_may_name_what_is_not_there(installed: Installed, harness: Typed) -> None:
+    installed(odd='Extension(name="odd", panels={"absent": "More", "gone": "Mine"})')
+    code, out, err = harness("--help")
+    assert (code, err) == (0, "")
+    assert "Mine" not in out
+
+
+def test_a_command_of_a_package_lies_in_any_module_and_its_failures_are_one_line(
+    installed: Installed, harness: Typed
+) -> None:
+    places = {"study good": "of_others:command", "study gone": "of_others:absent", "lost": "absent"}
+    installed(odd=f'Extension(name="odd", commands={places})')
+    source = Path(sys.path[0]) / "of_others.py"
+    source.write_text(f"{source.read_text()}\ndef command():\n    'Help it.'\n    print('done')\n")
+    assert harness("study", "good") == (0, "done\n", "")
+    for typed in (["study", "gone"], ["lost"]):
+        code, _, err = harness(*typed)
+        assert (code, err.count("\n")) == (2, 1)
+        assert f"command {' '.join(typed)} (" in err
+    code, out, err = harness("study", "--help")
+    assert (code, err) == (0, "")
+    assert "its package does not work" in out
+    assert "Help it." in out
 
 
 def test_another_package_takes_no_name_of_what_ships(installed: Installed, harness: Typed) -> None:

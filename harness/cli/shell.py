@@ -12,8 +12,9 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD, commands, groups, panels, short, spellings
-from harness.core.extensions import owner
-from harness.core.strangers import ended, ends_the_program
+from harness.core.errors import UserError, printable
+from harness.core.extensions import owner, taken
+from harness.core.strangers import ended, ends_the_program, worded
 
 UNREAD = object()
 DIGITS = 18  # most of a number that is read here
@@ -37,11 +38,11 @@ class Branch(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         if name not in self.loaded:
             path = self.core[name] if name in self.core else _below(self.path, commands())[name]
-            self.loaded[name] = (
-                Group(path, name=name)
-                if path in GROUPS or path in groups()
-                else _command(name, COMMANDS.get(path) or commands()[path])
-            )
+            if path in GROUPS or path in groups():
+                self.loaded[name] = Group(path, name=name)
+            else:
+                place = f"harness.cli.{COMMANDS[path]}" if path in COMMANDS else commands()[path]
+                self.loaded[name] = _command(path, place)
             hasten(self.loaded[name])
         return self.loaded[name]
 
@@ -59,12 +60,12 @@ def _below(path: str, table: Mapping[str, str]) -> dict[str, str]:
     return {words[depth]: " ".join(words[: depth + 1]) for words in paths}
 
 
-def _command(name: str, place: str) -> Any:
+def _command(path: str, place: str) -> Any:
     module, _, function = place.partition(":")
-    whole = module if "." in module else f"harness.cli.{module}"
     app = Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name, cls=Command)(getattr(import_module(whole), function or "command"))
-    return get_command(app)
+    with worded(f"command {path} ({printable(place)})", built_in=place.startswith("harness.")):
+        app.command(path.split()[-1], cls=Command)(getattr(import_module(module), function or "command"))
+        return get_command(app)
 
 
 class Command(TyperCommand):
@@ -134,18 +135,23 @@ class Group(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each panel's commands, each with the first sentence of its help."""
-        width = max(map(len, self.commands))
-        for panel, names in {"Commands": tuple(self.commands)}.items() if self.path else panels().items():
-            with formatter.section(panel):
-                formatter.write_dl(
-                    [
-                        (
-                            f"{name:<{width}}",
-                            self.commands[name].get_short_help_str(formatter.width - width - 6),
-                        )
-                        for name in names
-                    ]
-                )
+        here = [*self.commands]
+        width = max(map(len, here))
+        for panel, names in {"Commands": here}.items() if self.path else panels().items():
+            if shown := [name for name in names if name in here]:  # a package can name others
+                with formatter.section(panel):
+                    formatter.write_dl(
+                        [
+                            (f"{name:<{width}}", self._short_help(name, formatter.width - width - 6))
+                            for name in shown
+                        ]
+                    )
+
+    def _short_help(self, name: str, width: int) -> str:
+        try:
+            return str(self.commands[name].get_short_help_str(width))
+        except UserError:  # a package's
+            return "(its package does not work; type it to see why)"
 
 
 def respelt(args: list[str]) -> tuple[str, str]:
@@ -157,7 +163,8 @@ def respelt(args: list[str]) -> tuple[str, str]:
     if args[0] in COMMANDS or spelt[0] in _below(args[0], COMMANDS).values():
         return "", ""  # of the core: nobody looks for extensions
     others = {**spellings(), **short()}
-    return next(((typed, others[typed]) for typed in spelt if typed in others), ("", ""))
+    typed = next((typed for typed in spelt if typed in others and not taken(typed, commands())), "")
+    return typed, others.get(typed, "")
 
 
 def keep_encoding() -> None:

@@ -5,8 +5,9 @@ that ship are folders of `harness/extensions/`. The distribution's metadata name
 without the folder all else works, and says what a command was part of.
 """
 
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any
@@ -20,6 +21,8 @@ GROUP = "swarmdrive.extensions"
 COMMANDS, STUDIES = "swarmdrive.commands", "swarmdrive.studies"
 OURS = "harness.extensions."
 INTERFACE = 1
+WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
+TYPED = {"commands": "names", "groups": "names", "studies": "names", "spellings": "both", "short": "both"}
 Texts = Mapping[str, str]
 
 
@@ -62,6 +65,11 @@ def joined(core: Texts, kind: str) -> Texts:
     What is there already is not replaced; a line on stderr says so, once.
     """
     return _joined(tuple(core.items()), kind, tuple(sys.path))
+
+
+def taken(path: str, table: Iterable[str]) -> bool:
+    """Return whether a path is a command of a table, begins one, or goes on after one."""
+    return any(f"{each} ".startswith(f"{path} ") or f"{path} ".startswith(f"{each} ") for each in table)
 
 
 def studies() -> Texts:
@@ -123,6 +131,13 @@ def _checked(name: str, extension: Extension) -> Extension:
         tables = [*value.values()] if kind.name == "adds" and isinstance(value, Mapping) else [value]
         if kind.name not in ("name", "interface") and not all(map(_is_texts, tables)):
             raise UserError(f"{what}: its {kind.name} are no table of texts; repair its package")
+    for kind, what_is_typed in TYPED.items():
+        table = getattr(extension, kind)
+        for words in (*table, *(table.values() if what_is_typed == "both" else ())):
+            if not WORDS.fullmatch(words):
+                raise UserError(
+                    f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its package"
+                )
     return extension
 
 
@@ -135,11 +150,12 @@ def _joined(core: tuple[tuple[str, str], ...], kind: str, path: tuple[str, ...])
     table = dict(core)
     for extension in extensions().values():
         for name, value in getattr(extension, kind).items():
-            if name in table:
+            if name in table or (kind == "commands" and taken(name, table)):
                 print(
                     f"harness: extension {printable(extension.name)}: {printable(name)} of its {kind} is "
                     "taken; it is left out, and all else works",
                     file=sys.stderr,
                 )
-            table.setdefault(name, value)
+            else:
+                table[name] = value
     return table
