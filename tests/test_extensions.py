@@ -151,6 +151,15 @@ def test_no_spelling_of_a_package_hides_a_command_or_a_group(
     assert harness(path, "--help") == usual
 
 
+def test_what_a_package_prints_as_it_loads_is_no_output_of_a_command(
+    installed: Installed, harness: Typed
+) -> None:
+    installed(odd='print("hello") or Extension(name="odd")')
+    code, out, err = harness("model", "list", "--json")
+    assert (code, err) == (0, "hello\n")
+    assert json.loads(out)
+
+
 def test_a_panel_may_name_what_is_not_there(installed: Installed, harness: Typed) -> None:
     installed(odd='Extension(name="odd", panels={"absent": "More", "gone": "Mine"})')
     code, out, err = harness("--help")

@@ -4,6 +4,7 @@ import os
 import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -78,7 +79,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         what = f"plug-in {printable(name)!r} ({self.group}): {printable(entry.value)}"
         repair = "repair or uninstall the package that registers it"
         try:
-            with strangers(what):
+            with strangers(what), redirect_stdout(sys.stderr):  # a program may read what a command prints
                 plugin: T = entry.load()
                 # A class has the methods of its instances, so it would pass the check of the protocol.
                 fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)
