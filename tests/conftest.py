@@ -27,6 +27,7 @@ from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 
+pytest_plugins = ["browsing"]
 EPISODES, SEED = 4, 100
 Once = Callable[[str, Callable[[Path], object]], Path]
 
@@ -254,6 +255,12 @@ def unrebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
     """Build no layouts again, which takes seconds each time; test_tune_is_a_fact.py is about that."""
     monkeypatch.setattr(rebuilt, "differences", lambda dataset: iter(()))
     monkeypatch.setattr(rebuilt, "_reported", lambda scenario: iter(()))
+
+
+@pytest.fixture
+def svg_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Studies draw no PDF and no PNG, which take longest: which kinds a folder has, a few tests look at."""
+    monkeypatch.setattr("harness.report.drawing.pictures.FORMATS", ("svg",))
 
 
 @pytest.fixture

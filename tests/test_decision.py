@@ -21,7 +21,6 @@ from harness.parsing.parse import Status, parse
 from harness.prompts import versions
 from harness.prompts.decision import MEANINGS
 from harness.runs import folder
-from harness.studies.twins.declared import TWINS
 from harness.world import scenarios
 
 
@@ -85,20 +84,6 @@ def test_a_scenario_may_say_what_its_actions_mean(data: Dataset) -> None:
     question = agent.chats(graph, own.actions, own.prompt_words)["question"]
     assert question.meanings["IDLE"] == "wait for the robot"
     assert agent.chats(graph, ("HOVER", "IDLE"), own.prompt_words)["question"].meanings["HOVER"] is None
-
-
-@pytest.mark.parametrize("twin", ["units", "order", "paraphrase"])
-def test_a_twin_changes_the_question_with_the_chat(data: Dataset, twin: str) -> None:
-    spec = deciding(data, "v2")
-    change = TWINS[twin].text
-    assert change is not None
-    changed = [(r, change(spec, r)) for r in requests(spec, scenes_of(data)[:3])]
-    assert any(old.question != new.question for old, new in changed)
-    for old, new in changed:
-        assert old.question is not None
-        assert new.question is not None
-        assert (old.messages == new.messages) == (old.question == new.question)
-        assert new.messages[-1]["content"].startswith(new.question.state)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,6 @@ from harness.evaluate.spec import Spec
 from harness.prompts import difference
 from harness.prompts import versions as prompts
 from harness.prompts.examples import EXAMPLES, Example, Examples, read, text_of
-from harness.studies.twins.declared import TWINS
 from harness.world import scenarios
 
 Said = tuple[int, str, str]
@@ -233,25 +232,7 @@ def test_a_replay_gives_the_run_again(small: Dataset, tmp_path: Path) -> None:
         run(plain, tmp_path / "plain")
 
 
-# -- twins and differences ------------------------------------------------------------------------------
-
-
-def test_where_letters_stand_for_other_actions_so_do_those_of_the_examples(small: Dataset) -> None:
-    spec = with_examples(with_ego(spec_of(small, "swarm-tiny"), answer="readout"))
-    question = next(requests(spec, scenes_of(small)[:1]))
-    other = TWINS["letters"].text(spec, question)
-    assert "A FASTER, B SLOWER, C IDLE" in other.messages[-1]["content"]
-    assert [m["content"] for m in other.messages if m["role"] == "assistant"] == ["B", "A"]
-
-
-def test_a_prompt_with_metres_in_its_examples_has_no_twin_in_feet(small: Dataset) -> None:
-    spec, scene = spec_of(small, "swarm-tiny"), scenes_of(small)[0]
-    view = scene.graphs["v1"]
-    assert TWINS["units"].graph(spec, scene, view) != view
-    shown = with_examples(spec)
-    assert TWINS["units"].graph(shown, scene, view) == view
-    question = next(requests(shown, [scene]))
-    assert TWINS["units"].text(shown, question) == question
+# -- differences ----------------------------------------------------------------------------------------
 
 
 def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:

@@ -21,9 +21,6 @@ from harness.evaluate.live_world import LiveSource
 from harness.evaluate.pictures import GREY, another
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
-from harness.studies.twins.asking import _twins as twins_of
-from harness.studies.twins.asking import lack
-from harness.studies.twins.declared import TWINS
 from harness.world.perception.camera import frame
 
 QWEN3 = Vision(512, 256, patch_px=16, merge=2, least_px=65536, most_px=16777216)
@@ -115,28 +112,6 @@ def test_a_prompt_that_shows_no_objects_is_not_asked_again_with_more_of_them(
             replace(of, points=(point,))
         assert "\n" not in str(problem.value)
     assert replace(spec(crossing, image, "v7"), points=(point,)).points == (point,)
-
-
-# -- twins ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("version", ["v7", "v8"])
-def test_only_a_mirrored_scene_has_another_picture_which_is_mirrored(crossing: Dataset, version: str):
-    of, mirrored = spec(crossing, version=version), 0
-    for scene in crossing.scenes(crossing.forest.ids[:12:3]):
-        questions = list(requests(of, [scene]))
-        for twin in TWINS.values():
-            if twin.senders or lack(of, twin):
-                continue
-            for _, _, question, other in twins_of(of, twin, scene, questions):
-                assert question.image
-                assert other.image
-                same = question.image.pixels
-                if twin.name == "mirrored":
-                    mirrored += 1
-                    same = same[:, ::-1]
-                assert np.array_equal(other.image.pixels, same), twin.name
-    assert mirrored > 4
 
 
 # -- what is refused -----------------------------------------------------------------------------------------

@@ -198,7 +198,7 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: opti
 
     who = options.workers_of(workers)
     data = load.load(load.find(dataset))
-    from harness.studies.fidelity import rank
+    from harness.studies.both_worlds import rank
 
     episodes = data.manifest.episodes
     with bar(f"driving {printable(data.name, 30)}", episodes) as progress:

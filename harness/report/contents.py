@@ -15,7 +15,6 @@ from harness.runs.summary import judged_of
 HONEST = ("optimal_action_rate", "optimal_brier", "optimal_nll_nats")
 SURE = ("calibration_error_one_optimal", "coverage_at_5_risk_one_optimal")
 EXAMPLES = 3  # of each status of answers
-MOVED = 5  # decision points whose answers moved most
 
 
 def size(runs: Runs) -> str:
@@ -74,17 +73,6 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
             if answer.status != "strict":
                 by_status.setdefault(answer.status, []).append({"run": n, "answer": answer})
     return [{"status": status, "answers": every[:EXAMPLES]} for status, every in by_status.items()]
-
-
-def attributions(runs: Runs) -> list[dict[str, Any]]:
-    """Of each run whose decision points `harness study attribute` drew: how many, and where most moved."""
-    entries = []
-    for n, run in enumerate(runs.runs):
-        if a := run.attribution:
-            by_shift = sorted(a.left_out, key=lambda each: -(each.shift or 0.0))
-            scenes = list(dict.fromkeys(each.scene for each in by_shift))[:MOVED]
-            entries.append({"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes})
-    return entries
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:

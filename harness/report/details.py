@@ -27,6 +27,7 @@ from harness.parsing.parse import spans
 from harness.prompts.versions import Prompt
 from harness.report.drawing.geometry import conflict_points, spots, view_of
 from harness.report.library import packed, picture
+from harness.report.remarks import LeftOut
 from harness.report.runs import Runs
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, check_scenes
@@ -99,11 +100,13 @@ class Details:
     framed: frozenset[str]  # scenes that have their cameras' pictures
     prompts: Prompts  # as in `harness.report.page.write_report`
     full: bool  # whether prompts that a rule was given, and did not read, are among them
+    left_out: Sequence[LeftOut]  # of each run
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
         """Return the same with no more of the runs than these scenes need."""
         replayed = {name: self.replayed[name] for name in ids if name in self.replayed}
-        return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed)
+        left_out = [{name: of[name] for name in ids if name in of} for of in self.left_out]
+        return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed, left_out=left_out)
 
     def blocks(self, ids: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
         """Details of these scenes, so many a block."""
@@ -138,10 +141,6 @@ class Details:
     @cached_property
     def _episodes(self) -> list[Ints]:
         return [run.decisions.whole("episode") for run in self.runs.runs]
-
-    @cached_property
-    def _left_out(self) -> list[dict[str, list[dict[str, Any]]]]:
-        return [_left_out(run) for run in self.runs.runs]
 
     def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
         sent: dict[str, Any] = {}
@@ -210,7 +209,7 @@ class Details:
         if self.runs.live:  # in frozen scenes each action has its outcome
             ended = run.episodes_of(int(self._episodes[n][rows.start]))
             detail["ends"] = [_end(end) for end in ended]
-        if left_out := self._left_out[n].get(name):
+        if left_out := self.left_out[n].get(name):
             detail |= {"left_out": left_out}
         return detail
 
@@ -254,16 +253,6 @@ def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Return where in a recovered completion its answers stand."""
     role = "helper" if answer.role in ("helper", "blind") else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
-
-
-def _left_out(run: Run) -> dict[str, list[dict[str, Any]]]:
-    """What was left out of each decision point that `harness study attribute` drew, what moved most first."""
-    of: dict[str, list[dict[str, Any]]] = {}
-    if run.attribution:
-        for each in sorted(run.attribution.left_out, key=lambda each: -(each.shift or 0.0)):
-            plain = {**msgspec.to_builtins(each), "condition": run.attribution.condition}
-            of.setdefault(each.scene, []).append(plain)
-    return of
 
 
 def _end(e: Episode) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
 from harness.report.panels import panels
+from harness.report.remarks import sentences
 from harness.report.runs import Runs
 from harness.report.sections import sections
 from harness.report.templating import environment
@@ -156,7 +157,7 @@ def _pieces(
         least=LEAST,
         charts=charts,
         examples=contents.examples(runs),
-        attributions=contents.attributions(runs),
+        remarks=sentences(runs),
         notes=contents.notes(runs),
         sections=sections(runs),
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],

@@ -31,9 +31,8 @@ from harness.core.formats import SUITE
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset, find, load
 from harness.dataset.verify import read_manifest
-from harness.runs import attribution, formats
+from harness.runs import formats
 from harness.runs.answers import Answered, Answers
-from harness.runs.attribution import Attribution
 from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
 from harness.runs.devices import Speed
 from harness.runs.difficulty import FILE as DIFFICULTY
@@ -91,7 +90,7 @@ class Run:
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        return self._read("summary.csv", scores_of)
+        return self.read_file("summary.csv", scores_of)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -104,16 +103,18 @@ class Run:
 
     @cached_property
     def _placed(self) -> tuple[Grid, tuple[Episode, ...]]:
-        return self._read("episodes.csv", self._place)
+        return self.read_file("episodes.csv", self._place)
 
     @cached_property
     def decisions(self) -> Decisions:
         """The rows of `decisions.parquet`; each belongs to an episode of the run."""
-        return self._read("decisions.parquet", self._decisions)
+        return self.read_file("decisions.parquet", self._decisions)
 
     @cached_property
     def answers(self) -> Answers:
-        return self._read("answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions)))
+        return self.read_file(
+            "answers.jsonl", lambda file: Answers(bytes_of(file, "rows"), len(self.actions))
+        )
 
     @cached_property
     def answered(self) -> Answered:
@@ -143,7 +144,6 @@ class Run:
             "decisions": decisions,
             "_placed": (grid, tuple(grid.ordered([e for n in layouts for e in self.episodes_of(n)]))),
             "answers_by_scene": {scene: self.answers_by_scene.get(scene, []) for scene in ids},
-            "attribution": self.attribution,
         })  # fmt: skip
         return part
 
@@ -180,16 +180,10 @@ class Run:
         return viewers.index(answer.viewer)
 
     @cached_property
-    def attribution(self) -> Attribution | None:
-        """The content of `attribution.json`; None if `harness study attribute` did not write one."""
-        exists = (self.path / attribution.FILE).is_file()
-        return self._read(attribution.FILE, attribution.load) if exists else None
-
-    @cached_property
     def layouts(self) -> tuple[Layout, ...]:
         """The rows of `difficulty.csv`; none where the run came to all of its dataset's layouts."""
         exists = self.world == "frozen" and (self.path / DIFFICULTY).is_file()
-        return self._read(DIFFICULTY, self._layouts) if exists else ()
+        return self.read_file(DIFFICULTY, self._layouts) if exists else ()
 
     def _layouts(self, file: Path) -> tuple[Layout, ...]:
         layouts = _records(file, Layout)
@@ -240,7 +234,8 @@ class Run:
             raise ValueError("not every decision of episodes.csv is there")
         return decisions
 
-    def _read(self, name: str, reader: Callable[[Path], T]) -> T:
+    def read_file(self, name: str, reader: Callable[[Path], T]) -> T:
+        """Return what a file of the run's folder holds. Raises UserError if the reader calls it broken."""
         try:
             return whole(self.path / name, reader)
         except UserError as error:

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,26 +9,24 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from whole_figures import LONG, NAMES, check
 
 from harness.core.statistics import Estimate
 from harness.radio.profiles import CHANNELS
 from harness.radio.reception import DISTANCES_M, Compared, Curve, Drawn
 from harness.report.drawing.colours import COLOURS, CONDITIONS, INK, PAGE
-from harness.report.drawing.pictures import lay_out, save
+from harness.report.drawing.pictures import save
 from harness.report.library import on_dark_too
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
 from harness.studies.figures.lines import along, crowds, reception
-from harness.studies.figures.points import Rows, Steps, fronts, intervals, scatter
+from harness.studies.figures.points import Rows, Steps, fronts, intervals
 
-LONG = "v2x:schedule=always,weight_cap=0.5,max_helpers=2"
-NAMES = ["6g", "v2x", LONG, f"{LONG},tau=0.5", "single-local"]
 METRICS = (
     "success_rate", "latency_proxy_ms", "messages_per_episode", "trigger_rate", "effective_loss",
 )  # fmt: skip
 ESTIMATE = {"mean": 0.8253, "ci_low": 0.2, "ci_high": 0.9}
 SEEN = Estimate(0.5, 0.2, 0.8, 9, 0)
-NEARLY = 0.01  # inches
 SHARES = np.linspace(0, 100, 4).reshape(2, 2)
 
 
@@ -52,11 +49,6 @@ def over(*variables: str) -> Figure:
     return along([summary(variable, [0.1, 0.9], ["run"]) for variable in variables])
 
 
-def driven_and_frozen() -> Figure:
-    known = {f"{world}{end}": 0.5 for world in ("frozen", "closed") for end in ("", "_low", "_high")}
-    return scatter(pd.DataFrame([{"condition": name} | known for name in NAMES]), NAMES)
-
-
 def of_costs() -> Figure:
     lines = [Steps(name, [0, 9], [62.5, 82.5], {}, LONG) for name in NAMES]
     return fronts([(LONG, "messages", lines)], "balanced success")
@@ -77,7 +69,6 @@ FIGURES: Mapping[str, Callable[[], Figure]] = {
     "crossed axes": lambda: heat_map({f"{LONG}, loss {n}": SHARES for n in "123"}, ["a", LONG], ["1", "2"]),
     "intervals": of_rows,
     "fronts": of_costs,
-    "fidelity": driven_and_frozen,
     "reception": of_radio,
     "crowds": lambda: crowds([2, 4, 8], LOSSES, f"{LONG} {LONG}"),
 }
@@ -85,15 +76,7 @@ FIGURES: Mapping[str, Callable[[], Figure]] = {
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_nothing_sticks_out_of_a_figure_and_no_title_lies_over_another(name: str) -> None:
-    figure = FIGURES[name]()
-    lay_out(figure)
-    around, size = figure.get_tightbbox(), figure.get_size_inches()
-    assert min(around.x0, around.y0) > -NEARLY
-    assert max(around.x1 - size[0], around.y1 - size[1]) < NEARLY
-    assert max(size) < 12, "a figure that grows is still one for a page"
-    titles = [axes.title.get_window_extent() for axes in figure.axes if axes.get_title()]
-    beside = [pair for pair in pairwise(titles) if pair[0].y0 == pair[1].y0]
-    assert all(left.x1 < right.x0 for left, right in beside)
+    check(FIGURES[name]())
 
 
 def test_a_condition_has_the_colour_that_reports_have_and_of_several_runs_each_curve_its_own() -> None:

@@ -1,20 +1,14 @@
 """No sentence names a winner that cannot be told apart from the next."""
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from harness.core.arrays import Floats
 from harness.core.figures import some_of
-from harness.core.statistics import Estimate
 from harness.runs.success import Success
 from harness.studies.trust import BASE, PEACE, Bench, Cell, headline
-from harness.studies.twins.declared import TWINS
-from harness.studies.twins.scoring import Row
-from harness.studies.twins.scoring import headline as of_twins
 
 EPISODES = 60
 PLAIN = Success(np.zeros(EPISODES, dtype=bool))
@@ -76,17 +70,3 @@ def test_trust_names_none_where_its_numbers_do_not_tell() -> None:
     assert "no rule clearly has the most: it is 85.8 [" in said
     assert "these rules cannot be told apart there: trust and linear." in said
     assert "has the most, " not in said
-
-
-def test_twins_name_the_pair_that_clearly_holds_least_often() -> None:
-    def row(value: float, low: float, high: float) -> Row:
-        of = Estimate(value, low, high, 9, 0)
-        broken: Any = () if value == 1 else (None,)
-        return Row(twin, "ego", 9, of, of, of, broken)
-
-    twin = next(iter(TWINS.values()))
-    whole, low, near = row(1.0, 0.9, 1.0), row(0.5, 0.4, 0.6), row(0.55, 0.45, 0.7)
-    assert f"Least often holds {twin.name}, ego: 50.0 %" in of_twins([whole, low])
-    said = of_twins([whole, low, replace(near, role="helper")])
-    assert f"the intervals of these overlap: ({twin.name}, ego) and ({twin.name}, helper)." in said
-    assert "Least often holds" not in said

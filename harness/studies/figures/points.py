@@ -9,12 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.statistics import Estimate
-from harness.report.drawing.colours import GREY, INK, MARKERS, conditions
+from harness.report.drawing.colours import INK, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.studies.figures.axes import key, lettered, plain
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
 @dataclass(frozen=True)
@@ -98,40 +98,4 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> 
             )  # fmt: skip
     handles, labels = figure.axes[0].get_legend_handles_labels()
     key(figure, dict(zip(labels, handles, strict=True)))
-    return figure
-
-
-@styled
-def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
-    """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
-
-    Args:
-        table: of `harness.studies.fidelity`.
-        models: who drove, of each row.
-    """
-    figure = Figure(figsize=(4.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    axes.plot([0, 100], [0, 100], color=GREY, linewidth=0.8, linestyle="--", label="the same")
-    markers = {model: MARKERS[n % len(MARKERS)] for n, model in enumerate(dict.fromkeys(models))}
-    colours = conditions(table.condition)
-    for model, (_, row) in zip(models, table.iterrows(), strict=True):
-        (x, *x_ends), (y, *y_ends) = (
-            100 * np.array([row[f"{world}{end}"] for end in ("", "_low", "_high")])
-            for world in ("frozen", "closed")
-        )
-        axes.errorbar(
-            x, y, np.abs(np.array([y_ends]).T - y), np.abs(np.array([x_ends]).T - x),
-            color=colours[row["condition"]], marker=markers[model], markersize=4.5, linewidth=0.7,
-        )  # fmt: skip
-    for model, marker in markers.items():
-        axes.plot([], [], color=GREY, marker=marker, linestyle="none", label=model)
-    for condition, colour in colours.items():
-        axes.plot([], [], color=colour, linewidth=3, label=condition)
-    axes.set(
-        xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102)
-    )
-    axes.set_aspect("equal")
-    plain(axes, "both")
-    handles, labels = axes.get_legend_handles_labels()
-    key(figure, dict(zip(labels, handles, strict=True)), most=3)
     return figure

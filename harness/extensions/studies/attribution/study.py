@@ -28,12 +28,12 @@ from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.walk import Decided, Memory, places_of, shown, walk
+from harness.extensions.studies.attribution.record import FILE, Attribution, LeftOut
+from harness.extensions.studies.twins.scoring import distance
 from harness.prompts.versions import listed as listing
 from harness.report.document import Table
-from harness.runs.attribution import FILE, Attribution, LeftOut
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study
-from harness.studies.twins.scoring import distance
 from harness.world.perception.graph import scene_graph
 
 HIDDEN, SEEN, OTHER = "hidden conflict vehicle", "seen conflict vehicle", "other object"

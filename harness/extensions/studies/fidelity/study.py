@@ -1,10 +1,10 @@
-"""How far success on frozen scenes is success in closed loop, of models' runs and of the reference drivers.
+"""How far success on frozen scenes is success in closed loop, of models' runs.
 
 Runs of the same model, prompt and answer mode are compared episode by episode: the same layout, condition and
 channel seed.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,17 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec.structs import asdict
 
-from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.core.parallel import Workers
-from harness.core.statistics import Estimate
 from harness.core.versions import versions
-from harness.dataset.load import Dataset
 from harness.report.document import Table
 from harness.runs.folder import read
-from harness.runs.metrics import SUCCESS, World, difference, over_episodes
+from harness.runs.metrics import World
 from harness.runs.records import Variant
-from harness.world.drivers import DRIVERS
+from harness.studies.both_worlds import COMPARED, compared
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +28,6 @@ if TYPE_CHECKING:
 
 WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
-COMPARED = ("frozen", "closed", "difference", "agreement")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
 LEAST_RANKED = 5  # four in the same order are chance in 1 of 12, five in 1 of 60, both ways round
 PLACE = "model · prompt · answers, condition"
@@ -115,26 +110,6 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
         yield {**row, "n": group.layout_seed.nunique()}
 
 
-def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
-    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S, E)."""
-    both = difference(SUCCESS, [(frozen.T, closed.T)])
-    same = over_episodes("agreement_rate", (frozen == closed).astype(float))
-    worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
-    return dict(zip(COMPARED, (*worlds, both, same), strict=True))
-
-
-def rank(
-    dataset: Dataset, workers: Workers, progress: Callable[[int], None]
-) -> dict[str, dict[str, Estimate]]:
-    """Return each reference driver's `COMPARED` over a dataset's episodes, every one of which it drives."""
-    from harness.world.reference import drive_apart
-
-    ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
-    frozen = dataset.reference_success()
-    closed = {driver: np.array([[float(of[driver].success) for of in ends]]) for driver in DRIVERS}
-    return {driver: compared(frozen[driver][None], closed[driver]) for driver in DRIVERS}
-
-
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
     """Return how episodes ended that ended otherwise: a row a model, condition and two ends, with a count."""
     ends = both.assign(
@@ -183,7 +158,7 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
 
 
 def _scatter(result: Fidelity) -> "Figure":
-    from harness.studies.figures.points import scatter
+    from harness.extensions.studies.fidelity.figure import scatter
 
     return scatter(result.table, [_who(row) for row in result.table.to_dict("records")])
 

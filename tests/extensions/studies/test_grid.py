@@ -19,10 +19,10 @@ from harness.backends.proxy import Proxy
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
+from harness.extensions.studies.grid.study import Cell, Grid, front, grid_study, headline, run_cells
 from harness.prompts import versions
 from harness.runs.metrics import BALANCED, LATENCY, SUCCESS
 from harness.runs.success import Success
-from harness.studies.grid import Cell, Grid, front, grid_study, headline, run_cells
 from harness.studies.study import write_study
 
 pytestmark = pytest.mark.usefixtures("svg_alone")

@@ -17,7 +17,7 @@ from typer.main import get_command
 from harness.cli import app
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.studies.fidelity import disagreements, fidelity
+from harness.extensions.studies.fidelity.study import disagreements, fidelity
 
 Said = tuple[int, str, str]
 MODELS = ("proxy", "cruise", "brake", "local-view")

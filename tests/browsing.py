@@ -1,18 +1,16 @@
 """A real browser, Debian's chromium, and pages opened in it from disk without a network."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from opening import FLAGS, WIDE, wait
 
-HERE = Path(__file__).parent
 CHROMIUM = shutil.which("chromium")
 RUNNING = pytest.StashKey["Running"]()
 
 
 class Running:
-    """One browser for all tests of this folder that follow each other, which count it together."""
+    """One browser for all tests with it that follow each other, which count it together."""
 
     def __init__(self, counted):
         self.counted, self.engine, self.browser = counted, None, None
@@ -41,10 +39,10 @@ def running(shared_work, request):
     made.end()
 
 
-# While Playwright runs, so does its event loop, and tests of other folders have their own.
+# While Playwright runs, so does its event loop, and other tests have their own.
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item, nextitem):
-    if nextitem is None or HERE not in nextitem.path.parents:
+    if "running" not in getattr(nextitem, "fixturenames", ()):
         made = item.config.stash.get(RUNNING, None)
         if made is not None:
             made.end()

@@ -22,14 +22,14 @@ from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene, load
 from harness.evaluate.asking import requests
 from harness.evaluate.spec import Spec
+from harness.extensions.studies.twins import asking, declared, scoring
+from harness.extensions.studies.twins import study as twins_page
+from harness.extensions.studies.twins.asking import Questions
+from harness.extensions.studies.twins.declared import TWINS, changed
+from harness.extensions.studies.twins.scoring import METRICS, Pair
 from harness.prompts import versions
 from harness.prompts.decision import CARE
 from harness.report.compare.gate import gate
-from harness.studies.twins import asking, declared, scoring
-from harness.studies.twins import study as twins_page
-from harness.studies.twins.asking import Questions
-from harness.studies.twins.declared import TWINS, changed
-from harness.studies.twins.scoring import METRICS, Pair
 from harness.world import scenarios
 from harness.world.planner import plan
 from harness.world.scene_graph import SceneGraph

@@ -7,6 +7,7 @@ import msgspec
 from msgspec import Struct
 
 from harness.core.files import text_of
+from harness.runs.folder import Run
 
 FILE = "attribution.json"
 
@@ -21,7 +22,7 @@ class LeftOut(Struct, frozen=True, kw_only=True):
     # what the item was left out of: the prompt of the `ego` or a `helper`, or the `fusion`
     role: Literal["ego", "helper", "fusion"]
     item: str  # id of the object, or of the helper that sent the message
-    kind: str  # one of `harness.studies.attribution.KINDS`
+    kind: str  # one of `harness.extensions.studies.attribution.study.KINDS`
     action: str  # the likeliest action with the item
     instead: str | None  # the likeliest action without it; None if that answer failed
     change: float | None  # change of the probability of `action`; None if that answer failed
@@ -38,6 +39,10 @@ class Attribution(Struct, frozen=True, kw_only=True):
     left_out: tuple[LeftOut, ...]  # the items that were left out
 
 
-def load(file: Path) -> Attribution:
-    """Read a run's attribution. Raises OSError or ValueError if the file is broken."""
+def of_run(run: Run) -> Attribution | None:
+    """Return a run's attribution; None if there is none. Raises UserError if the file is broken."""
+    return run.read_file(FILE, _load) if (run.path / FILE).is_file() else None
+
+
+def _load(file: Path) -> Attribution:
     return msgspec.json.decode(text_of(file, "record"), type=Attribution)

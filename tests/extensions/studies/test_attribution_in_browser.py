@@ -10,10 +10,11 @@ from evaluating import run, spec_of
 from opening import NARROW, picture
 
 from harness.evaluate.resolve import points
+from harness.extensions.studies.attribution.record import of_run
+from harness.extensions.studies.attribution.study import attribute, write
 from harness.report.page import write_report
 from harness.report.runs import gather
 from harness.runs import folder
-from harness.studies.attribution import attribute, write
 from harness.studies.replayed_run import ReplayedRun
 
 pytestmark = pytest.mark.exhaustive
@@ -28,7 +29,7 @@ def made(small, tmp_path_factory):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_bars_stand_under_answers_and_decisions_of_the_sample_alone(opened, made, scheme):
-    found = folder.read(made.parent).attribution
+    found = of_run(folder.read(made.parent))
     most = max((each for each in found.left_out if each.role == "fusion"), key=lambda each: each.shift)
     page = opened(made, f"#scene={most.scene}&condition=6g&seed={most.seed}", scheme=scheme)
     here = [each for each in found.left_out if each.scene == most.scene]

@@ -13,15 +13,15 @@ from markupsafe import Markup, escape
 from harness.core.figures import PERCENT, Unit, as_mapping, shown
 from harness.core.files import write_whole
 from harness.core.versions import versions
+from harness.extensions.studies.twins.asking import Questions, lack
+from harness.extensions.studies.twins.declared import TWINS, Twin
+from harness.extensions.studies.twins.scoring import METRICS, ROLES, Pair, Row, headline
 from harness.report.compare.gate import Verdict
 from harness.report.compare.words import judged
 from harness.report.document import Table
 from harness.report.drawing.colours import ROLES as COLOUR_OF_ROLE
 from harness.report.templating import environment, visible
 from harness.studies.study import Study
-from harness.studies.twins.asking import Questions, lack
-from harness.studies.twins.declared import TWINS, Twin
-from harness.studies.twins.scoring import METRICS, ROLES, Pair, Row, headline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

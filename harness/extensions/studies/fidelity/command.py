@@ -18,7 +18,7 @@ def command(
 
     Give at least one run of `harness eval` and one of `harness drive`, with the same models and layouts.
     """
-    from harness.studies.fidelity import fidelity, fidelity_study
+    from harness.extensions.studies.fidelity.study import fidelity, fidelity_study
 
     with bar("comparing frozen with closed loop", quiet=as_json):
         study = fidelity_study(fidelity(runs), runs)

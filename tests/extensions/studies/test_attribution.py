@@ -25,15 +25,16 @@ from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate.agent import Agent
+from harness.extensions.studies.attribution import study as attribution
+from harness.extensions.studies.attribution.record import Attribution, LeftOut, of_run
+from harness.extensions.studies.attribution.study import Row, attribute, draw, headline, rows
 from harness.prompts.versions import listed
 from harness.prompts.versions import load as prompt
 from harness.report.decisions import Decisions
 from harness.report.runs import gather
 from harness.runs import folder
-from harness.runs.attribution import Attribution, LeftOut
 from harness.runs.records import Decision
-from harness.studies import attribution, replayed_run
-from harness.studies.attribution import Row, attribute, draw, headline, rows
+from harness.studies import replayed_run
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.perception.graph import scene_graph
@@ -368,7 +369,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     assert "10 of the " in out
     assert "decision points of 6g:loss=0, drawn with sample seed 0" in " ".join(out.split())
     told = json.loads(harness("study", "attribute", "run", "--sample", "10", "--json")[1])
-    kept = folder.read(tmp_path / "run").attribution
+    kept = of_run(folder.read(tmp_path / "run"))
     assert kept
     assert told["decision_points"] == kept.decision_points == 10
     assert sum(row["shift"]["n"] for row in told["rows"]) == len(kept.left_out)
@@ -377,7 +378,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     ] == (0, "")
     assert harness("report", "run")[0] == 0
     page = Path("run/report.html").read_text()
-    kept = folder.read(tmp_path / "run").attribution
+    kept = of_run(folder.read(tmp_path / "run"))
     assert kept
     assert f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind" in page
     for typed, said in {

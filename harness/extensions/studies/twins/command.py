@@ -59,11 +59,11 @@ def command(
     from harness.evaluate.agent import Agent
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
+    from harness.extensions.studies.twins import asking, scoring
+    from harness.extensions.studies.twins.declared import TWINS
+    from harness.extensions.studies.twins.study import twins_study, write_pairs
     from harness.prompts import versions
     from harness.report.compare.gate import gate
-    from harness.studies.twins import asking, scoring
-    from harness.studies.twins.declared import TWINS
-    from harness.studies.twins.study import twins_study, write_pairs
 
     who = options.workers_of(workers)
     for name in twin or ():

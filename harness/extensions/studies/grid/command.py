@@ -43,7 +43,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.evaluate import resolve
-    from harness.studies.grid import grid_study, run_cells
+    from harness.extensions.studies.grid.study import grid_study, run_cells
     from harness.studies.study import refuse_taken
 
     world: Any = settings.world

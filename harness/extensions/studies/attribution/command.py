@@ -32,7 +32,7 @@ def command(
     The run's model is asked the questions that the run has no answer for, each once. `harness report` then
     shows the result at each decision.
     """
-    from harness.studies.attribution import attribute, attribution_study, write
+    from harness.extensions.studies.attribution.study import attribute, attribution_study, write
     from harness.studies.replayed_run import ReplayedRun
 
     in_range("--sample", sample, 1, MOST)

@@ -8,8 +8,8 @@ import numpy as np
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import some_of
 from harness.core.statistics import Estimate, rate_interval
+from harness.extensions.studies.twins.declared import Twin
 from harness.report.compare.gate import OPERATORS, Gate, Verdict
-from harness.studies.twins.declared import Twin
 
 ROLES = ("ego", "helper", "fusion")
 METRICS = ("invariance_rate", "tv_distance", "failed_rate")

@@ -1,0 +1,23 @@
+"""Ask beyond one run: every pair of agents, twins of questions, what moved answers, frozen against driven."""
+
+from harness.core.extensions import Extension
+
+_HERE = "harness.extensions.studies"
+
+EXTENSION = Extension(
+    name="studies",
+    commands={
+        "study grid": f"{_HERE}.grid.command:command",
+        "study twins": f"{_HERE}.twins.command:command",
+        "study attribute": f"{_HERE}.attribution.command:command",
+        "study fidelity": f"{_HERE}.fidelity.command:command",
+    },
+    spellings={
+        "grid": "study grid",
+        "twins": "study twins",
+        "attribute": "study attribute",
+        "fidelity": "study fidelity",
+    },
+    studies={"grid": "grid", "twins": "twins", "fidelity": "study"},
+    adds={"remarks": {"attribution": f"{_HERE}.attribution.remarks:REMARKS"}},
+)

@@ -1,0 +1,42 @@
+"""What a run's page says of the decision points that `harness study attribute` drew."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from markupsafe import Markup
+
+from harness.extensions.studies.attribution.record import of_run
+from harness.report.remarks import LeftOut
+from harness.report.runs import Runs
+from harness.report.templating import environment
+from harness.runs.folder import Run
+
+MOVED = 5  # decision points whose answers moved most
+
+
+class Remarks:
+    """The remarks of attributions; see `harness.report.remarks.Remarks`."""
+
+    def sentences(self, runs: Runs) -> Iterator[Markup]:
+        """Of each run whose decision points were drawn: how many, and where most moved."""
+        template = environment(Path(__file__).parent).get_template("remark.html.j2")
+        for n, run in enumerate(runs.runs):
+            if a := of_run(run):
+                by_shift = sorted(a.left_out, key=lambda each: -(each.shift or 0.0))
+                scenes = list(dict.fromkeys(each.scene for each in by_shift))[:MOVED]
+                drawn = {"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes}
+                yield Markup(template.render(text=drawn, runs=runs))
+
+    def left_out(self, run: Run) -> LeftOut:
+        """What was left out of each decision point that was drawn, what moved most first."""
+        of: dict[str, list[dict[str, Any]]] = {}
+        if a := of_run(run):
+            for each in sorted(a.left_out, key=lambda each: -(each.shift or 0.0)):
+                plain = {**msgspec.to_builtins(each), "condition": a.condition}
+                of.setdefault(each.scene, []).append(plain)
+        return of
+
+
+REMARKS = Remarks()

@@ -1,0 +1,34 @@
+"""Success on frozen scenes and in closed loop, paired by episode; also that of the reference drivers."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.parallel import Workers
+from harness.core.statistics import Estimate
+from harness.dataset.load import Dataset
+from harness.runs.metrics import SUCCESS, difference, over_episodes
+from harness.world.drivers import DRIVERS
+
+COMPARED = ("frozen", "closed", "difference", "agreement")
+
+
+def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
+    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S, E)."""
+    both = difference(SUCCESS, [(frozen.T, closed.T)])
+    same = over_episodes("agreement_rate", (frozen == closed).astype(float))
+    worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
+    return dict(zip(COMPARED, (*worlds, both, same), strict=True))
+
+
+def rank(
+    dataset: Dataset, workers: Workers, progress: Callable[[int], None]
+) -> dict[str, dict[str, Estimate]]:
+    """Return each reference driver's `COMPARED` over a dataset's episodes, every one of which it drives."""
+    from harness.world.reference import drive_apart
+
+    ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
+    frozen = dataset.reference_success()
+    closed = {driver: np.array([[float(of[driver].success) for of in ends]]) for driver in DRIVERS}
+    return {driver: compared(frozen[driver][None], closed[driver]) for driver in DRIVERS}
