@@ -20,7 +20,6 @@ from harness.report.caveats import of_run
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
-from harness.report.history import history
 from harness.report.matrix import BEST, WORSE, headline, lines
 from harness.report.runs import Runs
 from harness.report.words import Pairing
@@ -143,8 +142,6 @@ def test_the_best_of_several_runs_has_the_most_balanced_success(tmp_path: Path) 
     assert headline(found).startswith("Best by balanced success under ")
     [worse] = [line.behind for line in found if line.behind and line.condition == "6g"]
     assert worse.change.value == pytest.approx(1 / 2 - 27 / 32)
-    [group] = history(tmp_path, None)
-    assert {line.score.metric for line in group.lines if line.score} == {BALANCED}
     assert [listed.success for listed in runs(tmp_path) if listed.name == "fair"] == [pytest.approx(27 / 32)]
 
 

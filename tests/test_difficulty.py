@@ -11,7 +11,7 @@ import pytest
 from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
-from run_on_disk import configure, made_up
+from run_on_disk import configure
 from scipy.stats import t as student
 
 from harness.coordination.operating_point import POINTS
@@ -28,7 +28,6 @@ from harness.report import words
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
-from harness.report.view.folder import whole
 from harness.report.words import adjusted_lines, as_good_as, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
 from harness.runs.folder import csv_text, read
@@ -215,15 +214,6 @@ def test_words_say_also_what_is_worse() -> None:
     plain, wider = Estimate(0.5, 0.4, 0.6, 50, 0), Estimate(0.5, 0.395, 0.605, 50, 0)
     assert as_good_as(plain, plain) == "as good as 1.0 times as many layouts"
     assert as_good_as(plain, wider) == "as good as 0.9 times as many layouts"
-
-
-def test_a_view_follows_no_link_out_of_its_folder(tmp_path: Path) -> None:
-    made_up(tmp_path / "reports/run")
-    assert whole(tmp_path / "reports", "run")
-    (tmp_path / "secret.csv").write_text("episode\n")
-    (tmp_path / "reports/run" / FILE).symlink_to(tmp_path / "secret.csv")
-    with pytest.raises(UserError, match=f"run has no {FILE} of its own; delete it"):
-        whole(tmp_path / "reports", "run")
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ CUT_ENDS = {
 # Held against the program's options, and not run.
 NOT_RUN = {
     "harness model device measure --model swarm-tiny": "needs a meter of energy",
-    "harness view": "serves until it is interrupted; tests/view starts it",
+    "harness view": "serves until it is interrupted; tests/extensions/view starts it",
     "harness serve --model swarm-tiny": "as above; tests/extensions/decide/test_serving.py starts it",
     "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision --prompt v9"
     " --batch-size 1": "needs that server; tests/extensions/decide/test_serving.py has one",

@@ -24,8 +24,8 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart
-from harness.report.view.access import cookie
-from harness.report.view.app import app
+from harness.extensions.view.access import cookie
+from harness.extensions.view.app import app
 from harness.runs import folder, formats, records
 from harness.runs.decisions import schema
 

@@ -15,8 +15,8 @@ from starlette.testclient import TestClient
 
 from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.build import build
-from harness.report.view.access import cookie
-from harness.report.view.app import app
+from harness.extensions.view.access import cookie
+from harness.extensions.view.app import app
 from harness.report.words import compared
 from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import runs

@@ -16,14 +16,12 @@ COMMANDS = {
     "compare": "compare",
     "plan": "plan",
     "report": "report",
-    "view": "view",
     "study sweep": "sweep",
     "study contents": "contents",
     "study trust": "trust",
     "study schedule compare": "schedule:compare",
     "study schedule learn": "schedule:learn",
     "run ls": "runs:ls",
-    "run history": "runs:history",
     "run check": "runs:check",
     "run merge": "runs:merge",
     "run export": "runs:export",
@@ -72,7 +70,7 @@ GROUPS = {
 # The panels of the first screen.
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
-    "Look at results": ("compare", "report", "view"),
+    "Look at results": ("compare", "report"),
     "More": ("plan", "study", "run", "model", "prompt", "dataset", "radio"),
 }
 
@@ -82,7 +80,6 @@ OLD = {
     "trust": "study trust",
     "schedule": "study schedule",
     "ls": "run ls",
-    "history": "run history",
     "merge": "run merge",
     "export": "run export",
     "distill": "model distill",

@@ -1,4 +1,4 @@
-"""`harness run`: list and check finished runs, follow a metric, merge shards, export a run."""
+"""`harness run`: list and check finished runs, merge shards, export a run."""
 
 import tempfile
 from dataclasses import asdict
@@ -9,19 +9,17 @@ import typer
 
 from harness.cli import drive, options
 from harness.cli.progress import bar
-from harness.cli.terminal import WIDTH, echo_json, echo_text, echo_wrong
+from harness.cli.terminal import WIDTH, echo_json, echo_text
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, PERCENT, amount, dataset_size
+from harness.core.figures import PERCENT, amount, dataset_size
 from harness.core.formats import SUITE
 from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
-    from harness.report.history import Line
     from harness.runs.listing import Listed
 
 MARGIN = 0.1  # by how much an answer is worth less than the one that is preferred to it
-VARIANT = 32  # columns of model, prompt and answer mode
 
 
 def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
@@ -60,65 +58,6 @@ def _outcome(run: "Listed") -> str:
         return ""
     what = " balanced" if run.metric == BALANCED else ""
     return f"{printable(run.condition, 24)}{what} {PERCENT.interval(run.success, run.low, run.high)} %"
-
-
-def history(
-    folder: options.Reports = Path("reports"),
-    metric: str | None = typer.Option(
-        None, help="Metric to show, by its name in summary.csv. Default: the success that leads."
-    ),
-    condition: str | None = typer.Option(
-        None, help="Condition to show. Default: the last of those that most runs have."
-    ),
-    dataset: str | None = typer.Option(
-        None, help="Show only runs on this dataset, or driven in this scenario."
-    ),
-    html: Path | None = typer.Option(None, help="Also write a page to this file."),
-    as_json: options.Json = False,
-) -> None:
-    """Show a metric over runs, by date, prompt version and model.
-
-    Runs on the same scenes are grouped, since only those compare.
-    """
-    from harness.report import history
-    from harness.runs.metrics import entry, written
-
-    wrong: dict[str, UserError] = {}
-    groups = history.history(folder, metric, condition, dataset, wrong.__setitem__)
-    if html:
-        history.write(groups, html)
-    if as_json:
-        echo_json([
-            {"scenes": group.of, "condition": group.condition, "metric": group.metric,
-             "runs": [_mapping(line) for line in group.lines]}
-            for group in groups
-        ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
-        return
-    names = {g.metric: f"{g.metric}{' %' * (entry(g.metric).unit.name == '%')}" for g in groups}
-    typer.echo(f"{' or '.join(names.values())} with its 95 % interval")
-    for group in groups:
-        of = f": {names[group.metric]}" if len(names) > 1 else ""
-        typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH - len(of))}{of}")
-        for line in group.lines:
-            value = n = DASH
-            if score := line.score:
-                value, n = written(score), str(score.n)
-            who = printable(line.run.manifest.variant, VARIANT)
-            typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
-    for name, error in wrong.items():
-        typer.echo()
-        echo_wrong(name, error)
-    if len(groups) > 1:
-        typer.echo("\nruns on different scenes do not compare, so each group has its own table")
-
-
-def _mapping(line: "Line") -> dict[str, object]:
-    variant, score = line.run.manifest.variant, line.score
-    numbers = {key: getattr(score, key, None) for key in ("value", "low", "high", "n", "n_excluded")}
-    return {
-        "run": line.name, "date": line.date.isoformat(), "model": variant.model, "prompt": variant.prompt,
-        "answer": variant.answer, "tags": line.run.manifest.tags, **numbers,
-    }  # fmt: skip
 
 
 def check(

@@ -8,8 +8,6 @@ from harness.report.library import on_dark_too, picture
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
-from harness.runs.notes import Note
-from harness.runs.notes import notes as notes_of
 from harness.runs.summary import judged_of
 
 HONEST = ("optimal_action_rate", "optimal_brier", "optimal_nll_nats")
@@ -83,15 +81,4 @@ def sweeps(run: Run) -> list[dict[str, str]]:
         for manifest in sorted(run.path.glob("*/sweep.json"))
         for svg in sorted(manifest.parent.glob("*.svg"))
         if svg.is_file() and svg.resolve().is_relative_to(here)
-    ]
-
-
-def notes(runs: Runs) -> list[tuple[int, Note]]:
-    """Return what people noted on the runs' decision points, each with the place of its run."""
-    return [
-        (place, note)
-        for place, run in enumerate(runs.runs)
-        if (noted := notes_of(run.path)) and (scenes := set(run.decisions.labels("scene")))
-        for note in noted
-        if note.scene in scenes
     ]

@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
 from harness.parsing.status import Status
 from harness.report.details import BLOCK, Details, Part, Prompts, prompts_of
-from harness.report.remarks import LeftOut, left_out
+from harness.report.remarks import left_out
 from harness.report.runs import Runs
 from harness.runs.folder import Run, check_scenes
 from harness.runs.sources import lacking
@@ -47,7 +46,7 @@ class Decisions:
         self._not_replayed = 0
         self._replayed = {} if runs.dataset else self._played(failed)
         framed = self._telling()
-        self._details = Details(runs, self._replayed, framed, prompts, full, _left_out(runs))
+        self._details = Details(runs, self._replayed, framed, prompts, full, [*map(left_out, runs.runs)])
         self.index = {
             "actions": runs.actions,
             "scenes": [[scene, *(place if several else place[:3])] for scene, place in order],
@@ -161,20 +160,6 @@ def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
         if scene.id == name
     }
     return {name: scenes[name] for name in names if name in scenes}
-
-
-def _left_out(runs: Runs) -> list[LeftOut]:
-    return [left_out(run) for run in runs.runs]
-
-
-def everything(runs: Runs, name: str) -> dict[str, Any]:
-    """Return what a full page has of one decision point. Raises UserError if no run has it."""
-    if not any(name in run.decisions.scenes for run in runs.runs):
-        raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
-    scenes = replayed(runs, [name]) if runs.live else {}
-    details = Details(runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True, _left_out(runs))
-    [[detail]] = details.blocks([name])
-    return detail
 
 
 def failures(run: Run) -> dict[str, int]:

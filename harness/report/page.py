@@ -20,7 +20,7 @@ from harness.parsing.parse import Repair, Status
 from harness.report import caveats, contents, library, matrix, words
 from harness.report.charts import policies, timeline
 from harness.report.constancy import ignores_input, tile
-from harness.report.decisions import Decisions, everything
+from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
@@ -112,14 +112,6 @@ def render(
     return "".join(_pieces(runs, Decisions(runs, prompts, full), progress, 1))
 
 
-def with_decision(page: str, runs: Runs, scene: str) -> str:
-    """Return the page of some runs with everything about one decision of theirs, prompts and pictures too."""
-    detail = library.packed({scene: everything(runs, scene)})
-    return page.replace(
-        "<script>", f'<script type="application/gzip" id="opened">{detail}</script>\n<script>', 1
-    )
-
-
 def _pieces(
     runs: Runs, decisions: Decisions, progress: Callable[[int], None], workers: Workers
 ) -> Iterator[str]:
@@ -158,7 +150,6 @@ def _pieces(
         charts=charts,
         examples=contents.examples(runs),
         remarks=sentences(runs),
-        notes=contents.notes(runs),
         sections=sections(runs),
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),

@@ -8,14 +8,13 @@ pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of
-from opening import NARROW, picture
+from opening import NARROW, SCROLLS, picture
 
 from harness.coordination.operating_point import named_point
 from harness.report.compare.difference import compare
 from harness.report.compare.page import render
 from harness.report.compare.pair import pair
 from harness.report.document import Section, Table, document
-from harness.report.view.export import export
 
 LONG = "6g:schedule=always,weight_cap=0.5,max_helpers=2"
 DRAWN = "<svg xmlns='http://www.w3.org/2000/svg' width='1056' height='300'></svg>"
@@ -24,7 +23,7 @@ WIDTH_REM = 66
 
 @pytest.fixture(scope="module")
 def pages(small, tmp_path_factory):
-    """A page as studies write them, one of a comparison, and an exported list, by name."""
+    """A page as studies write them, and one of a comparison, by name."""
     folder = tmp_path_factory.mktemp("documents")
     points = named_point("single-local"), named_point(LONG)
     runs = [folder / "reports" / name for name in ("proxy", "cruise")]
@@ -36,14 +35,9 @@ def pages(small, tmp_path_factory):
     study = Section(f"A study of {LONG}", [LONG], tables=[table], pictures={"figure": (data, WIDTH_REM)})
     (folder / "study.html").write_text(document([study]))
     (folder / "compare.html").write_text(render(compare(pair(*runs)), (), 10, lambda run: None))
-    export(folder / "reports", folder / "site", lambda done: None)
-    return {"study": folder / "study.html", "compare": folder / "compare.html",
-            "export": folder / "site/index.html"}  # fmt: skip
+    return {"study": folder / "study.html", "compare": folder / "compare.html"}
 
 
-# Of what may be wider than its place: whether it is, and whether it says so.
-SIGNS = """() => [...document.querySelectorAll(".scroll")].filter((e) => e.checkVisibility()).map((e) => [
-  e.ariaLabel, e.scrollWidth > e.clientWidth, getComputedStyle(e, "::before").maxHeight !== "0px"])"""
 WIDELY = pytest.mark.exhaustive
 
 
@@ -54,15 +48,13 @@ WIDELY = pytest.mark.exhaustive
         pytest.param("study", "dark", marks=WIDELY),
         pytest.param("compare", "light", marks=WIDELY),
         pytest.param("compare", "dark", marks=pytest.mark.slow),
-        pytest.param("export", "light", marks=WIDELY),
-        pytest.param("export", "dark", marks=WIDELY),
     ],
 )
 def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, scheme):
     page = browser.new_page(viewport=NARROW, color_scheme=scheme)
     page.goto(pages[name].as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
-    said = page.evaluate(SIGNS)
+    said = page.evaluate(SCROLLS)
     assert [label for label, wider, sign in said if wider != sign] == []
     assert any(sign for _, _, sign in said)
     assert Axe().run(page).response["violations"] == []

@@ -1,12 +1,10 @@
 """A file that is wrong stands in its list as such; only the command that needs it fails."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from run_on_disk import made_up
 
 Typed = Callable[..., tuple[int, str, str]]
 # What is listed, by which command, what else it must have, and a command that needs the wrong one.
@@ -70,21 +68,3 @@ def test_a_wrong_file_of_suites_takes_no_shipped_suite_with_it(project: Path, ha
     assert named("suite:v2v-safety").datasets
     code, _, said = harness("eval", "--dataset", "suite:mine")
     assert (code, "datasets/suites.toml" in said) == (2, True)
-
-
-def test_a_broken_run_takes_no_history_with_it(tmp_path: Path, harness: Typed) -> None:
-    for name in ("good", "bad"):
-        made_up(tmp_path / "reports" / name)
-    (tmp_path / "reports/bad/summary.csv").write_text(
-        (tmp_path / "reports/bad/summary.csv").read_text() + "not,a,row\n"
-    )
-    code, said, _ = harness("run", "history")
-    assert code == 0
-    assert "bad · wrong" in said
-    code, said, _ = harness("run", "history", "--json")
-    *groups, wrong = json.loads(said)
-    assert (code, [run["run"] for group in groups for run in group["runs"]]) == (0, ["good"])
-    assert wrong["run"] == "bad"
-    assert "summary.csv" in wrong["error"]
-    shutil.rmtree(tmp_path / "reports/bad")
-    assert "wrong" not in harness("run", "history")[1]

@@ -33,7 +33,7 @@ def reports(made: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def browser(reports: Path) -> TestClient:
+def client(reports: Path) -> TestClient:
     return visitor(reports)
 
 
@@ -45,5 +45,5 @@ def kept_reports(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def reader(kept_reports: Path) -> TestClient:
-    """As `browser`, of who changes nothing."""
+    """As `client`, of who changes nothing."""
     return visitor(kept_reports)

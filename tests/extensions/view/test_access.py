@@ -7,8 +7,8 @@ import pytest
 from starlette.testclient import TestClient
 from viewing import TOKEN, said
 
-from harness.report.view.access import cookie
-from harness.report.view.app import app
+from harness.extensions.view.access import cookie
+from harness.extensions.view.app import app
 
 PAGES = ["/", "/progress", "/style.css", "/run?path=first", "/picture?path=first/sweep-tau&name=sweep.svg",
          "/compare?path=first&path=second", "/report?path=first", "/notes?path=first",
@@ -84,5 +84,5 @@ def test_two_viewers_on_two_ports_keep_their_cookies_apart(reports: Path, tmp_pa
     other = shutil.copytree(reports / "second", tmp_path / "others/second").parent
     cookies = {cookie(7654): TOKEN, cookie(7655): "another"}
     for folder, port, token in ((reports, 7654, TOKEN), (other, 7655, "another")):
-        browser = TestClient(app(folder, token), base_url=f"http://127.0.0.1:{port}", cookies=cookies)
-        assert browser.get("/").status_code == 200
+        client = TestClient(app(folder, token), base_url=f"http://127.0.0.1:{port}", cookies=cookies)
+        assert client.get("/").status_code == 200

@@ -31,12 +31,12 @@ Look = tuple[Extent, str, dict[str, Any]]
 def seen(made: Path, small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Look]:
     """What is seen of a real run at each answer and after it: its extent, the list, what changes in it."""
     reports = Path(shutil.copytree(made, tmp_path_factory.mktemp("going") / "reports"))
-    browser = visitor(reports)
+    client = visitor(reports)
     spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tags=("slow",), batch_size=1)
     looks = []
 
     def look(done: int) -> None:
-        looks.append((extent(reports / "now"), browser.get("/").text, browser.get("/progress").json()))
+        looks.append((extent(reports / "now"), client.get("/").text, client.get("/progress").json()))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "TREES_AT_ONCE", 2)
@@ -65,21 +65,21 @@ def test_the_list_says_how_far_a_run_is_while_it_goes_on(seen: list[Look]) -> No
 
 @pytest.mark.slow
 def test_the_list_runs_its_own_script_and_only_while_a_run_goes_on(
-    seen: list[Look], browser: TestClient, reports: Path
+    seen: list[Look], client: TestClient, reports: Path
 ) -> None:
     *looks, (_, last, _) = seen
     assert all(page.count("<script") == 1 for _, page, _ in looks)
     assert "<script" not in last
-    after = browser.get("/")
+    after = client.get("/")
     assert "<script" not in after.text
     assert "script-src" not in after.headers["content-security-policy"]
     work = reports / "begun/.work"
     work.mkdir(parents=True)
     (work / "config.json").write_text(BEGUN)
-    assert "<script" not in browser.get("/").text, "it is stopped"
+    assert "<script" not in client.get("/").text, "it is stopped"
     with alone(work / "lock"):
-        while_it_goes = browser.get("/")
-        assert "<script" not in browser.get("/?q=proxy").text, "what is shown has ended"
+        while_it_goes = client.get("/")
+        assert "<script" not in client.get("/?q=proxy").text, "what is shown has ended"
     [script] = re.findall("<script>(.*?)</script>", while_it_goes.text, re.S)
     policy = while_it_goes.headers["content-security-policy"]
     assert f"script-src 'sha256-{digest(script)}'; connect-src 'self'" in policy
@@ -132,10 +132,10 @@ def test_episodes_that_are_driven_are_counted_as_they_end(
 
 @pytest.mark.parametrize("name", ["turned\u202eround", "no text \udcff", "<b>&quot;</b>"])
 def test_a_run_of_any_name_is_followed_by_what_the_list_calls_it(
-    name: str, browser: TestClient, reports: Path
+    name: str, client: TestClient, reports: Path
 ) -> None:
     work = reports / name / ".work"
     work.mkdir(parents=True)
     (work / "config.json").write_text(BEGUN)
-    [called] = browser.get("/progress").json()["unfinished"]
-    assert f'<small data-run="{escape(called)}">stopped: 0 of 3 episodes' in browser.get("/").text
+    [called] = client.get("/progress").json()["unfinished"]
+    assert f'<small data-run="{escape(called)}">stopped: 0 of 3 episodes' in client.get("/").text

@@ -12,15 +12,16 @@ from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, sha256_bytes, text_of
+from harness.extensions.view import notes as run_notes
+from harness.extensions.view.decision import with_decision
+from harness.extensions.view.folder import own_file, whole
 from harness.report import suite as suites
 from harness.report.compare import page as comparison
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.report.page import render, with_decision
+from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.templating import environment, visible
-from harness.report.view.folder import own_file, whole
-from harness.runs import notes as run_notes
 from harness.runs.folder import Run
 from harness.runs.folder import read as read_run
 from harness.runs.listing import UNREAD, Listed, runs

@@ -11,8 +11,8 @@ from pathlib import Path
 from httpx import Response
 from starlette.testclient import TestClient
 
-from harness.report.view.access import cookie
-from harness.report.view.app import app
+from harness.extensions.view.access import cookie
+from harness.extensions.view.app import app
 
 TOKEN = "a-token-of-these-tests"
 SECRET = "what lies outside, or is hidden"

@@ -16,19 +16,19 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import configure, names, said
 
-from harness.report.view import pages
-from harness.report.view.app import View
+from harness.extensions.view import pages
+from harness.extensions.view.app import View
 from harness.runs.folder import read
 
 
-def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestClient, reports: Path) -> None:
+def test_the_list_tells_finished_unfinished_and_broken_runs_apart(client: TestClient, reports: Path) -> None:
     manifest = json.loads((reports / "second/run.json").read_text())
     (reports / "killed/.work").mkdir(parents=True)
     begun = {"created": manifest["created"], "settings": manifest, "tags": ["half"]}
     (reports / "killed/.work/config.json").write_text(json.dumps(begun))
     shutil.copytree(reports / "second", reports / "spoilt")
     (reports / "spoilt/summary.csv").write_text("")
-    page = browser.get("/").text
+    page = client.get("/").text
     picked = set(re.findall(r'<input type="checkbox" name="path" value="([^"]+)"', page))
     opened = set(re.findall(r'<a href="/run\?path=([^"]+)"', page))
     assert picked == {"first", "second"}
@@ -58,14 +58,14 @@ def test_the_list_tells_finished_unfinished_and_broken_runs_apart(browser: TestC
     ],
 )
 def test_the_list_is_sorted_and_filtered_by_its_address(
-    query: str, order: list[str], browser: TestClient, reports: Path
+    query: str, order: list[str], client: TestClient, reports: Path
 ) -> None:
     shutil.rmtree(reports / "first/sweep-tau")
-    assert list(names(browser.get(f"/?{query}").text)) == order
+    assert list(names(client.get(f"/?{query}").text)) == order
 
 
-def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: TestClient) -> None:
-    page = browser.get("/?q=v2+json&sort=name").text
+def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(client: TestClient) -> None:
+    page = client.get("/?q=v2+json&sort=name").text
     links = dict(re.findall(r'<a href="/\?(sort=-?(\w+)[^"]*)"', page))
     assert {of: link for link, of in links.items()} == {
         of: f"sort={order}&amp;q=v2+json" for of, order in (
@@ -77,60 +77,60 @@ def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(browser: 
 
 
 @pytest.mark.slow
-def test_a_run_opens_with_its_report_unless_that_is_older(browser: TestClient, reports: Path) -> None:
+def test_a_run_opens_with_its_report_unless_that_is_older(client: TestClient, reports: Path) -> None:
     report = reports / "first/report.html"
     shown = pages.with_way_back(report.read_text(), [("Notes", "/notes?path=first")])
-    assert browser.get("/run?path=first").text == shown
+    assert client.get("/run?path=first").text == shown
     report.write_text("an old one")
     os.utime(report, (1, 1))
-    made = browser.get("/run?path=first").text
+    made = client.get("/run?path=first").text
     assert "Conditions side by side" in made
-    assert "<h1>cruise · v2</h1>" in browser.get("/run?path=second").text
+    assert "<h1>cruise · v2</h1>" in client.get("/run?path=second").text
     assert report.read_text() == "an old one", "nothing is written"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("address", ["/run?path=first", "/run?path=second", "/report?path=first&path=second"])
 def test_one_decision_opens_with_what_its_page_leaves_out(
-    address: str, browser: TestClient, reports: Path
+    address: str, client: TestClient, reports: Path
 ) -> None:
     scene = next(iter(read(reports / "first").decisions.scenes))
     links = '<p class="way-back">.*?</p>'
-    whole = re.sub(links, "", browser.get(f"{address}&scene={scene}").text)
+    whole = re.sub(links, "", client.get(f"{address}&scene={scene}").text)
     without = re.sub('<script [^>]*id="opened">.*?</script>\n', "", whole)
-    assert re.sub(links, "", browser.get(address).text) == without
+    assert re.sub(links, "", client.get(address).text) == without
     detail = json.loads(packed(whole, "opened"))[scene]
     assert list(detail["cameras"]) == list(detail["world"]["viewers"])
     assert all(detail["prompts"][a["prompt"]] for run in detail["runs"] if run for a in run["answers"])
-    refused = browser.get(f"{address}&scene=none")
+    refused = client.get(f"{address}&scene=none")
     assert (refused.status_code, "no run here has a decision none" in refused.text) == (400, True)
 
 
-def test_a_study_opens_with_its_page_or_its_pictures(browser: TestClient, reports: Path) -> None:
-    page = browser.get("/run?path=first/sweep-tau").text
+def test_a_study_opens_with_its_page_or_its_pictures(client: TestClient, reports: Path) -> None:
+    page = client.get("/run?path=first/sweep-tau").text
     pictures = re.findall(r'<img src="(/picture[^"]+)"', page)
     assert [link.rpartition("=")[2] for link in pictures] == ["more.png", "sweep.svg"], "one of each figure"
-    found = browser.get(pictures[1].replace("&amp;", "&"))
+    found = client.get(pictures[1].replace("&amp;", "&"))
     assert (found.text, found.headers["content-type"]) == ("<svg>sweep.svg</svg>", "image/svg+xml")
     (reports / "paper").mkdir()
     (reports / "paper/study.json").write_text("{}")
     (reports / "paper/index.html").write_text("<p>the paper's numbers")
-    assert browser.get("/run?path=paper").text == "<p>the paper's numbers"
+    assert client.get("/run?path=paper").text == "<p>the paper's numbers"
 
 
 @pytest.mark.slow
-def test_two_runs_are_compared_and_the_older_is_a(browser: TestClient) -> None:
+def test_two_runs_are_compared_and_the_older_is_a(client: TestClient) -> None:
     for query in ("path=first&path=second", "path=second&path=first"):
-        page = browser.get(f"/compare?{query}").text
+        page = client.get(f"/compare?{query}").text
         assert "A: proxy · prompt v2 · json<br>B: cruise · prompt v2 · json" in page
         assert "latency_p95_ms" in page
 
 
 @pytest.mark.slow
-def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(browser: TestClient) -> None:
-    page = browser.get("/compare?path=first&path=second").text
+def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(client: TestClient) -> None:
+    page = client.get("/compare?path=first&path=second").text
     links = {text: unescape(href) for href, text in re.findall('<a href="([^"]+)">([^<]+)</a>', page)}
-    swapped = browser.get(links["Swap A and B"]).text
+    swapped = client.get(links["Swap A and B"]).text
     assert "A: cruise · prompt v2 · json<br>B: proxy · prompt v2 · json" in swapped
     assert 'href="/compare?path=second&amp;path=first&amp;a=first">Swap A and B' in swapped
     side_by_side, _, where = links["Answers side by side"].partition("#")
@@ -146,8 +146,8 @@ def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(
         "/compare?path=first&path=second",
     ],
 )
-def test_every_page_leads_back_to_the_list(page: str, browser: TestClient) -> None:
-    text = browser.get(page).text
+def test_every_page_leads_back_to_the_list(page: str, client: TestClient) -> None:
+    text = client.get(page).text
     assert text.index('<a href="/"') < text.index("<h1")
 
 
@@ -177,9 +177,9 @@ def test_nothing_is_drawn_for_who_left_while_others_pages_were_drawn(
 
 
 @pytest.mark.slow
-def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
-    assert "<h1>cruise · v2</h1>" in browser.get("/report?path=second").text
-    assert "<h1>2 runs</h1>" in browser.get("/report?path=second&path=first").text
+def test_a_report_is_of_what_is_picked(client: TestClient) -> None:
+    assert "<h1>cruise · v2</h1>" in client.get("/report?path=second").text
+    assert "<h1>2 runs</h1>" in client.get("/report?path=second&path=first").text
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_a_report_is_of_what_is_picked(browser: TestClient) -> None:
     ],
 )
 def test_what_cannot_be_shown_is_one_readable_line(
-    address: str, line: str, browser: TestClient, reports: Path, request: pytest.FixtureRequest
+    address: str, line: str, client: TestClient, reports: Path, request: pytest.FixtureRequest
 ) -> None:
     manifest = json.loads((reports / "second/run.json").read_text())
     (reports / "killed/.work").mkdir(parents=True)
@@ -211,7 +211,7 @@ def test_what_cannot_be_shown_is_one_readable_line(
     (reports / "garbled/decisions.parquet").write_text("{")
     if "other" in address:
         shutil.copytree(request.getfixturevalue("two_run"), reports / "other")
-    answer = browser.get(address)
+    answer = client.get(address)
     assert answer.status_code == 400
     assert line in said(answer)
     assert "other" not in address or "are not of the same scenes (" in said(answer)
@@ -219,16 +219,16 @@ def test_what_cannot_be_shown_is_one_readable_line(
 
 
 def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
-    browser: TestClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(pages, "report", lambda *_: 1 / 0)
-    answer = browser.get("/report?path=second")
+    answer = client.get("/report?path=second")
     assert (answer.status_code, said(answer)) == (500, "this page cannot be made; the terminal says why")
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
+def test_hostile_text_stays_text(client: TestClient, reports: Path) -> None:
     name = '<img src=x onerror="a()"> & ?#%2e'
     (reports / "second").rename(reports / name)
     configure(
@@ -236,7 +236,7 @@ def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
         tags=["<script>tag</script>", "\u202egat"],
         model={"name": "</table><script>", "engine": "proxy"},
     )
-    page = browser.get('/?q="><script>').text + (listed := browser.get("/").text)
+    page = client.get('/?q="><script>').text + (listed := client.get("/").text)
     tags: list[tuple[str, dict[str, str | None]]] = []
 
     class Parser(HTMLParser):
@@ -248,25 +248,25 @@ def test_hostile_text_stays_text(browser: TestClient, reports: Path) -> None:
     assert "\u202e" not in page
     assert "⟨U+202E⟩gat" in page
     [link] = re.findall(r'href="(/run\?path=%3Cimg[^"]+)"', listed)
-    assert browser.get(link).status_code == 200
+    assert client.get(link).status_code == 200
     [value] = [a["value"] for tag, a in tags if a.get("type") == "checkbox" and a["value"] != "first"]
     assert value == name
-    assert browser.get("/report", params={"path": value}).status_code == 200
+    assert client.get("/report", params={"path": value}).status_code == 200
 
 
 @pytest.mark.parametrize("name", [b"not \xff UTF-8", b"two\nlines", b"\x1b[31m"])
 def test_a_name_that_cannot_be_sent_is_listed_and_not_opened(
-    name: bytes, browser: TestClient, reports: Path
+    name: bytes, client: TestClient, reports: Path
 ) -> None:
     os.rename(reports / "second", os.path.join(os.fsencode(reports), name))
-    page = browser.get("/")
+    page = client.get("/")
     assert page.status_code == 200
     assert page.text.count('type="checkbox"') == 1
     assert "cruise" in page.text
 
 
 def test_a_long_report_does_not_keep_the_list_waiting(
-    browser: TestClient, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
@@ -277,24 +277,24 @@ def test_a_long_report_does_not_keep_the_list_waiting(
 
     monkeypatch.setattr(pages, "report", slow)
     answers: list[str] = []
-    with browser:
-        drawing = threading.Thread(target=lambda: answers.append(browser.get("/report?path=second").text))
+    with client:
+        drawing = threading.Thread(target=lambda: answers.append(client.get("/report?path=second").text))
         drawing.start()
         assert begun.wait(60)
-        assert "tag of first" in browser.get("/").text
+        assert "tag of first" in client.get("/").text
         assert answers == []
         go_on.set()
         drawing.join(60)
     assert answers == ["slow"]
 
 
-def test_it_works_without_scripts_and_from_the_keyboard(browser: TestClient) -> None:
+def test_it_works_without_scripts_and_from_the_keyboard(client: TestClient) -> None:
     for address in ("/", "/run?path=first/sweep-tau", "/run?path=nowhere"):
-        page = browser.get(address).text
+        page = client.get(address).text
         assert "<script" not in page
         assert not re.search(r"\son\w+=|style=|tabindex", page)
         assert not re.findall(r'(?:href|src|action)="(?!/|data:,)', page), "nothing is fetched from elsewhere"
-    page = browser.get("/").text
+    page = client.get("/").text
     labelled = re.findall(r'<label for="(\w+)"', page)
     assert labelled == ["q"]
     assert page.count('type="checkbox"') == page.count('aria-label="Pick ')

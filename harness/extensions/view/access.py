@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from harness.report.view import pages
+from harness.extensions.view import pages
 
 TOKEN = "token"
 

@@ -14,15 +14,16 @@ pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of
-from opening import NARROW, WIDE, picture, wait
+from opening import NARROW, SCROLLS, WIDE, picture, wait
 from playwright.sync_api import expect
 
 from harness.coordination.operating_point import POINTS
 from harness.core.work import tidy
 from harness.evaluate.run import evaluate as evaluation
+from harness.extensions.view.export import export
+from harness.extensions.view.notes import notes
 from harness.report.page import write_report
 from harness.report.runs import gather
-from harness.runs.notes import notes
 
 SPY = """<title>not told</title><script>
 fetch("/").then(() => { document.title = "read" }, () => { document.title = "refused at " + self.origin })
@@ -253,3 +254,18 @@ def test_a_note_is_written_from_a_runs_page_and_stands_on_it(page, address, fold
     noted.get_by_role("link").click()
     page.wait_for_url(f"**#scene={scene}*")
     (folder / "first/notes.json").unlink()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_an_exported_list_fits_a_telephone_and_is_read_aloud(browser, folder, tmp_path, scheme):
+    export(folder, tmp_path / "site", lambda done: None)
+    page = browser.new_page(viewport=NARROW, color_scheme=scheme)
+    page.goto((tmp_path / "site/index.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    said = page.evaluate(SCROLLS)
+    assert [label for label, wider, sign in said if wider != sign] == []
+    assert any(sign for _, _, sign in said)
+    assert Axe().run(page).response["violations"] == []
+    picture(page, f"export-narrow-{scheme}")
+    page.close()

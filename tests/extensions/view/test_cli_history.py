@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from html import unescape
 from pathlib import Path
-from shutil import copytree
+from shutil import copytree, rmtree
 from typing import Any
 
 import msgspec
@@ -13,7 +13,9 @@ import pytest
 from run_on_disk import Row, configure, made_up
 
 from harness.coordination.operating_point import POINTS
+from harness.extensions.view.history import history
 from harness.runs.folder import read
+from harness.runs.metrics import BALANCED
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
@@ -137,3 +139,30 @@ def test_what_cannot_be_shown_is_one_line(
     code, out, err = harness("run", "history", *args)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
+
+
+def test_a_broken_run_takes_no_history_with_it(tmp_path: Path, harness: Harness) -> None:
+    for name in ("good", "bad"):
+        made_up(tmp_path / "reports" / name)
+    (tmp_path / "reports/bad/summary.csv").write_text(
+        (tmp_path / "reports/bad/summary.csv").read_text() + "not,a,row\n"
+    )
+    code, said, _ = harness("run", "history")
+    assert code == 0
+    assert "bad · wrong" in said
+    code, said, _ = harness("run", "history", "--json")
+    *groups, wrong = json.loads(said)
+    assert (code, [run["run"] for group in groups for run in group["runs"]]) == (0, ["good"])
+    assert wrong["run"] == "bad"
+    assert "summary.csv" in wrong["error"]
+    rmtree(tmp_path / "reports/bad")
+    assert "wrong" not in harness("run", "history")[1]
+
+
+def test_balanced_success_leads_where_runs_know_the_danger(tmp_path: Path) -> None:
+    def danger(row: Row) -> None:
+        row["danger"] = "left" if row["episode"] < 8 else "none"
+
+    made_up(tmp_path / "run", episode=danger, episodes=40)
+    [group] = history(tmp_path, None)
+    assert {line.score.metric for line in group.lines if line.score} == {BALANCED}

@@ -9,8 +9,13 @@ from urllib.parse import quote
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from run_on_disk import made_up
 from starlette.testclient import TestClient
 from viewing import SECRET, laid_out, said, visitor
+
+from harness.core.errors import UserError
+from harness.extensions.view.folder import whole
+from harness.runs.difficulty import FILE as DIFFICULTY
 
 NOWHERE = [
     "..", "../secret", "first/..", "first/../../secret", "first/../second", "./first", "first/", "/first",
@@ -126,14 +131,14 @@ def test_whatever_is_asked_for_nothing_outside_is_read(
 
 
 @pytest.mark.slow
-def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path) -> None:
+def test_links_that_lead_out_are_not_followed(client: TestClient, reports: Path) -> None:
     outside = reports.parent / "secret"
     (reports / "lent").symlink_to(outside)
     report = reports / "first/report.html"
     report.unlink()
     report.symlink_to(outside / "report.html")
-    assert browser.get("/run?path=lent").status_code == 404
-    made = browser.get("/run?path=first")
+    assert client.get("/run?path=lent").status_code == 404
+    made = client.get("/run?path=first")
     assert made.status_code == 200
     assert SECRET not in made.text
     assert "Conditions side by side" in made.text
@@ -141,7 +146,7 @@ def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path
         (reports / "second" / file).rename(outside / file)
         (reports / "second" / file).symlink_to(outside / file)
         for page in ("/run?path=second", "/report?path=second", "/compare?path=first&path=second"):
-            answer = browser.get(page)
+            answer = client.get(page)
             assert (answer.status_code, said(answer)) == (
                 400, f"second has no {file} of its own; make the run again",
             )  # fmt: skip
@@ -150,14 +155,14 @@ def test_links_that_lead_out_are_not_followed(browser: TestClient, reports: Path
     (reports / "paper").mkdir()
     (reports / "paper/study.json").write_text("{}")
     (reports / "paper/index.html").symlink_to(outside / "index.html")
-    assert "This folder has no page and no picture to show" in browser.get("/run?path=paper").text
+    assert "This folder has no page and no picture to show" in client.get("/run?path=paper").text
 
 
-def test_links_within_are_followed_but_not_to_what_is_hidden(browser: TestClient, hiding: Path) -> None:
+def test_links_within_are_followed_but_not_to_what_is_hidden(client: TestClient, hiding: Path) -> None:
     (hiding / "latest").symlink_to(hiding / "first")
     (hiding / "shown").symlink_to(hiding / ".hidden")
-    assert browser.get("/run?path=latest").status_code == 200
-    answer = browser.get("/run?path=shown")
+    assert client.get("/run?path=latest").status_code == 200
+    answer = client.get("/run?path=shown")
     assert answer.status_code == 400
     assert SECRET not in answer.text
 
@@ -227,3 +232,12 @@ def common(headers: Mapping[str, str]) -> None:
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert headers["cache-control"] == "no-store"
     assert not {"server", "access-control-allow-origin", "set-cookie"} & set(headers)
+
+
+def test_a_view_follows_no_link_out_of_its_folder(tmp_path: Path) -> None:
+    made_up(tmp_path / "reports/run")
+    assert whole(tmp_path / "reports", "run")
+    (tmp_path / "secret.csv").write_text("episode\n")
+    (tmp_path / "reports/run" / DIFFICULTY).symlink_to(tmp_path / "secret.csv")
+    with pytest.raises(UserError, match=f"run has no {DIFFICULTY} of its own; delete it"):
+        whole(tmp_path / "reports", "run")

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from harness.core import web
-from harness.report.view.access import TOKEN
-from harness.report.view.app import app
+from harness.extensions.view.access import TOKEN
+from harness.extensions.view.app import app
 
 
 def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:

@@ -8,13 +8,13 @@ from urllib.parse import quote
 
 from harness.core.errors import UserError, printable
 from harness.core.files import making, refuse_taken, write_whole
+from harness.extensions.view.folder import own_file, whole
+from harness.extensions.view.pages import RUNS, suite_of, whole_text, with_way_back
 from harness.report import caveats, words
 from harness.report import suite as suites
 from harness.report.document import Section, Table, document, linked
 from harness.report.page import render
 from harness.report.runs import gather
-from harness.report.view.folder import own_file, whole
-from harness.report.view.pages import RUNS, suite_of, whole_text, with_way_back
 from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.listing import Listed, runs

@@ -5,8 +5,8 @@ import stat
 from pathlib import Path
 
 from harness.core.errors import UserError, printable
+from harness.extensions.view.notes import FILE as NOTES
 from harness.runs.difficulty import FILE as DIFFICULTY
-from harness.runs.notes import FILE as NOTES
 
 PICTURES = {".svg": "image/svg+xml", ".png": "image/png"}
 # What a page of a run is made from.

@@ -35,12 +35,12 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from harness.core.errors import UserError, printable
+from harness.extensions.view import pages
+from harness.extensions.view.access import Access
+from harness.extensions.view.folder import PICTURES, own_file, pictures, whole
+from harness.extensions.view.notes import FILE as NOTES
 from harness.report.library import digest
-from harness.report.view import pages
-from harness.report.view.access import Access
-from harness.report.view.folder import PICTURES, own_file, pictures, whole
 from harness.runs.listing import Listed, runs
-from harness.runs.notes import FILE as NOTES
 
 SENT_S = 30.0  # within which a form must have come
 CLOSED = {"connection": "close"}  # of what is left of a request nothing is read

@@ -17,8 +17,8 @@ import httpx
 import pytest
 import uvicorn
 
+from harness.extensions.view.access import cookie
 from harness.report.document import Section, document
-from harness.report.view.access import cookie
 from harness.report.words import cell
 from harness.runs.folder import read
 from harness.runs.leading import lead_of

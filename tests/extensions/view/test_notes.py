@@ -13,13 +13,13 @@ from starlette.requests import Request
 from starlette.testclient import TestClient
 from viewing import SECRET, TOKEN, said
 
+from harness.extensions.view import app
+from harness.extensions.view.access import cookie
+from harness.extensions.view.app import View
+from harness.extensions.view.notes import LONGEST, MOST, notes
 from harness.report.page import render
 from harness.report.runs import gather
-from harness.report.view import app
-from harness.report.view.access import cookie
-from harness.report.view.app import View
 from harness.runs.folder import read
-from harness.runs.notes import LONGEST, MOST, notes
 
 HERE = {"Origin": "http://127.0.0.1:7654"}
 
@@ -35,47 +35,47 @@ def scene(reports: Path) -> str:
 
 @pytest.mark.slow
 def test_a_note_stays_with_its_run_and_stands_on_its_page(
-    browser: TestClient, reports: Path, scene: str
+    client: TestClient, reports: Path, scene: str
 ) -> None:
-    written = browser.post("/notes", data=form(scene, " it brakes <b>late</b>\r\nhere "), headers=HERE)
+    written = client.post("/notes", data=form(scene, " it brakes <b>late</b>\r\nhere "), headers=HERE)
     assert (written.status_code, written.url.path) == (200, "/notes")
     assert "it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in written.text
     [note] = notes(reports / "first")
     assert (note.scene, note.text) == (scene, "it brakes <b>late</b>\nhere")
-    assert f'value="{scene}"' in browser.get(f"/notes?path=first&scene={scene}").text
+    assert f'value="{scene}"' in client.get(f"/notes?path=first&scene={scene}").text
     page = render(gather([reports / "first"]))
     assert f">{scene}</a>: it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in page
     assert "Noted on" not in render(gather([reports / "second"]))
-    assert f'name="before" value="{note.date}"' in browser.get(f"/notes?path=first&scene={scene}").text
-    browser.post("/notes", data=form(scene, "once more", before=note.date), headers=HERE)
+    assert f'name="before" value="{note.date}"' in client.get(f"/notes?path=first&scene={scene}").text
+    client.post("/notes", data=form(scene, "once more", before=note.date), headers=HERE)
     [note] = notes(reports / "first")
     assert note.text == "once more"
-    browser.post("/notes", data=form(scene, " ", before=note.date), headers=HERE)
+    client.post("/notes", data=form(scene, " ", before=note.date), headers=HERE)
     assert notes(reports / "first") == []
 
 
 @pytest.mark.parametrize("began_with", ["", "2026-01-01T00:00:00+00:00"])
 @pytest.mark.parametrize("text", ["of another tab", ""])
 def test_a_note_that_its_form_did_not_show_is_not_lost(
-    text: str, began_with: str, browser: TestClient, reports: Path, scene: str
+    text: str, began_with: str, client: TestClient, reports: Path, scene: str
 ) -> None:
-    browser.post("/notes", data=form(scene, "first"), headers=HERE)
-    answer = browser.post("/notes", data=form(scene, text, before=began_with), headers=HERE)
+    client.post("/notes", data=form(scene, "first"), headers=HERE)
+    answer = client.post("/notes", data=form(scene, text, before=began_with), headers=HERE)
     assert said(answer).startswith(f"{scene} has another note than this form began with")
     assert [note.text for note in notes(reports / "first")] == ["first"]
 
 
 def test_a_page_that_was_written_before_a_note_is_drawn_anew(
-    browser: TestClient, reports: Path, scene: str
+    client: TestClient, reports: Path, scene: str
 ) -> None:
     (reports / "first/report.html").write_text("<body>written before")
-    before = browser.get("/run?path=first").text
+    before = client.get("/run?path=first").text
     assert "written before" in before
     assert 'href="/notes?path=first"' in before
-    browser.post("/notes", data=form(scene, "new"), headers=HERE)
+    client.post("/notes", data=form(scene, "new"), headers=HERE)
     later = (reports / "first/report.html").stat().st_mtime + 1
     os.utime(reports / "first/notes.json", (later, later))
-    assert f">{scene}</a>: new</p>" in browser.get("/run?path=first").text
+    assert f">{scene}</a>: new</p>" in client.get("/run?path=first").text
 
 
 @pytest.mark.parametrize(
@@ -84,26 +84,26 @@ def test_a_page_that_was_written_before_a_note_is_drawn_anew(
      {**HERE, "Sec-Fetch-Site": "cross-site"}],
 )  # fmt: skip
 def test_no_other_site_and_no_page_of_a_run_writes_a_note(
-    headers: dict[str, str], browser: TestClient, reports: Path, scene: str
+    headers: dict[str, str], client: TestClient, reports: Path, scene: str
 ) -> None:
-    assert browser.post("/notes", data=form(scene, "evil"), headers=headers).status_code == 403
+    assert client.post("/notes", data=form(scene, "evil"), headers=headers).status_code == 403
     assert not (reports / "first/notes.json").exists()
 
 
 @pytest.mark.parametrize("given", ["", "wrong"])
 def test_without_the_token_no_note_is_written(
-    given: str, browser: TestClient, reports: Path, scene: str
+    given: str, client: TestClient, reports: Path, scene: str
 ) -> None:
-    browser.cookies.set(cookie(7654), given)
-    browser.cookies.clear()
+    client.cookies.set(cookie(7654), given)
+    client.cookies.clear()
     sent = {**HERE, "Cookie": f"{cookie(7654)}={given}"}
     for address in ("/notes", f"/notes?token={TOKEN}x"):
-        assert browser.post(address, data=form(scene, "evil"), headers=sent).status_code == 403
+        assert client.post(address, data=form(scene, "evil"), headers=sent).status_code == 403
     assert not (reports / "first/notes.json").exists()
 
 
-def test_a_browser_says_which_site_sends_the_form(browser: TestClient) -> None:
-    answer = browser.get("/notes?path=first")
+def test_a_browser_says_which_site_sends_the_form(client: TestClient) -> None:
+    answer = client.get("/notes?path=first")
     assert answer.headers["referrer-policy"] == "same-origin", "without it a browser sends `Origin: null`"
     assert "form-action 'self'" in answer.headers["content-security-policy"]
 
@@ -121,46 +121,46 @@ def test_a_browser_says_which_site_sends_the_form(browser: TestClient) -> None:
     ],
 )
 def test_what_cannot_be_noted_is_one_line(
-    sent: dict[str, str], line: str, browser: TestClient, reports: Path, scene: str
+    sent: dict[str, str], line: str, client: TestClient, reports: Path, scene: str
 ) -> None:
     sent = {key: value.replace("SCENE", scene) for key, value in sent.items()}
-    answer = browser.post("/notes", data=sent, headers=HERE)
+    answer = client.post("/notes", data=sent, headers=HERE)
     assert answer.status_code in (400, 404, 413)
     assert said(answer).startswith(line)
     assert not list(reports.rglob("notes.json"))
 
 
 def test_the_longest_note_of_any_characters_can_be_kept(
-    browser: TestClient, reports: Path, scene: str
+    client: TestClient, reports: Path, scene: str
 ) -> None:
     text = "\U0001f697" * LONGEST
-    assert browser.post("/notes", data=form(scene, text), headers=HERE).status_code == 200
+    assert client.post("/notes", data=form(scene, text), headers=HERE).status_code == 200
     assert notes(reports / "first")[0].text == text
 
 
-def test_a_run_has_so_many_notes_and_no_more(browser: TestClient, reports: Path, scene: str) -> None:
+def test_a_run_has_so_many_notes_and_no_more(client: TestClient, reports: Path, scene: str) -> None:
     full = [{"scene": f"s{n:04d}", "text": "x", "date": ""} for n in range(MOST)]
     (reports / "first/notes.json").write_text(json.dumps(full))
-    assert said(browser.post("/notes", data=form(scene, "x"), headers=HERE)).startswith("a note has")
+    assert said(client.post("/notes", data=form(scene, "x"), headers=HERE)).startswith("a note has")
     assert "Noted on" not in render(gather([reports / "first"])), "they are on no decision point of the run"
 
 
 def test_a_link_in_the_place_of_notes_is_neither_read_nor_written_through(
-    browser: TestClient, reports: Path, tmp_path: Path, scene: str
+    client: TestClient, reports: Path, tmp_path: Path, scene: str
 ) -> None:
     (reports / "first/notes.json").symlink_to(tmp_path / "secret/secret.txt")
     for answer in (
-        browser.get("/notes?path=first"),
-        browser.post("/notes", data=form(scene, "x"), headers=HERE),
+        client.get("/notes?path=first"),
+        client.post("/notes", data=form(scene, "x"), headers=HERE),
     ):
         assert said(answer) == "first has no notes.json of its own; delete it"
     assert (tmp_path / "secret/secret.txt").read_text() == SECRET
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"scene": 1}]', "[" * 100_000])
-def test_broken_notes_are_one_line(text: str, browser: TestClient, reports: Path) -> None:
+def test_broken_notes_are_one_line(text: str, client: TestClient, reports: Path) -> None:
     (reports / "first/notes.json").write_text(text)
-    answer = browser.get("/notes?path=first")
+    answer = client.get("/notes?path=first")
     assert answer.status_code == 400
     assert "notes.json is broken (" in said(answer)
 

@@ -1,0 +1,30 @@
+"""The page of some runs with everything about the one decision that somebody opened."""
+
+from typing import Any
+
+from harness.core.errors import UserError, printable
+from harness.report import library
+from harness.report.decisions import replayed
+from harness.report.details import Details, prompts_of
+from harness.report.remarks import left_out
+from harness.report.runs import Runs
+
+
+def with_decision(page: str, runs: Runs, scene: str) -> str:
+    """Return the page of some runs with everything about one decision of theirs, prompts and pictures too."""
+    detail = library.packed({scene: everything(runs, scene)})
+    return page.replace(
+        "<script>", f'<script type="application/gzip" id="opened">{detail}</script>\n<script>', 1
+    )
+
+
+def everything(runs: Runs, name: str) -> dict[str, Any]:
+    """Return what a full page has of one decision point. Raises UserError if no run has it."""
+    if not any(name in run.decisions.scenes for run in runs.runs):
+        raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
+    scenes = replayed(runs, [name]) if runs.live else {}
+    details = Details(
+        runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True, [*map(left_out, runs.runs)]
+    )
+    [[detail]] = details.blocks([name])
+    return detail

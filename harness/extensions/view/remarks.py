@@ -1,0 +1,33 @@
+"""What people noted on decision points, on the page of a run."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from markupsafe import Markup
+
+from harness.extensions.view.notes import notes
+from harness.report.remarks import LeftOut
+from harness.report.runs import Runs
+from harness.report.templating import environment
+from harness.runs.folder import Run
+
+
+class Remarks:
+    """The remarks of notes; see `harness.report.remarks.Remarks`."""
+
+    def sentences(self, runs: Runs) -> Iterator[Markup]:
+        """Each note on a decision point that its run has."""
+        template = environment(Path(__file__).parent).get_template("remark.html.j2")
+        for place, run in enumerate(runs.runs):
+            if noted := notes(run.path):
+                scenes = set(run.decisions.labels("scene"))
+                for note in noted:
+                    if note.scene in scenes:
+                        yield Markup(template.render(note=note, place=place, runs=runs))
+
+    def left_out(self, run: Run) -> LeftOut:
+        """Notes leave nothing out."""
+        return {}
+
+
+REMARKS = Remarks()

@@ -1,1 +1,0 @@
-"""A folder of runs in a browser on this machine."""
