@@ -22,7 +22,7 @@ COMMANDS, STUDIES = "swarmdrive.commands", "swarmdrive.studies"
 OURS = "harness.extensions."
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
-TYPED = {"commands": "names", "groups": "names", "studies": "names", "spellings": "both", "short": "both"}
+TYPED = ("commands", "groups", "studies", "spellings", "short")  # tables of what somebody types
 Texts = Mapping[str, str]
 
 
@@ -32,6 +32,7 @@ class Extension:
 
     name: str  # the same as that of its entry point
     interface: int = INTERFACE  # the version of this class that it was written for
+    # What follows are tables by name.
     commands: Texts = field(default_factory=dict)  # what is typed after `harness`, and the function's place
     groups: Texts = field(default_factory=dict)  # the groups of commands that it opens, and their help
     panels: Texts = field(default_factory=dict)  # its words of the first screen, and the panel of each
@@ -126,14 +127,15 @@ def _checked(name: str, extension: Extension) -> Extension:
         )
     if extension.name != name:
         raise UserError(f"{what} calls itself {printable(extension.name)}; give both the same name")
-    for kind in fields(Extension):
-        value = getattr(extension, kind.name)
-        tables = [*value.values()] if kind.name == "adds" and isinstance(value, Mapping) else [value]
-        if kind.name not in ("name", "interface") and not all(map(_is_texts, tables)):
-            raise UserError(f"{what}: its {kind.name} are no table of texts; repair its package")
-    for kind, what_is_typed in TYPED.items():
-        table = getattr(extension, kind)
-        for words in (*table, *(table.values() if what_is_typed == "both" else ())):
+    for table in fields(Extension)[2:]:
+        value = getattr(extension, table.name)
+        tables = [*value.values()] if table.name == "adds" and isinstance(value, Mapping) else [value]
+        if not all(map(_is_texts, tables)):
+            raise UserError(f"{what}: its {table.name} are no table of texts; repair its package")
+    for kind in TYPED:
+        names = getattr(extension, kind)
+        replacements = names.values() if kind in ("spellings", "short") else ()
+        for words in (*names, *replacements):
             if not WORDS.fullmatch(words):
                 raise UserError(
                     f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its package"
