@@ -24,8 +24,9 @@ from harness.cli import app
 from harness.core.errors import UserError
 from harness.core.shards import shard_of
 from harness.evaluate.latency import NAMES, declared
-from harness.extensions.media.stills import stills
 from harness.runs.settings import parse_seeds
+
+pytest.importorskip("harness.extensions")  # whose commands the documents show, too
 
 Harness = Callable[..., tuple[int, str, str]]
 Copied = Callable[[str], str]
@@ -242,6 +243,8 @@ def difference(shown: str, printed: str) -> str:
 def reader(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Harness:
     """The command as a reader types it, who sees stdout and stderr in one place."""
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
+    from harness.extensions.media.stills import stills
+
     monkeypatch.setattr("harness.extensions.media.video.stills", lambda played: [*stills(played)][::20])
     monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)  # a reader's terminal has a bar instead
     monkeypatch.setattr(sys, "stderr", sys.stdout)

@@ -36,7 +36,6 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.core.image import Image
-from harness.extensions.checkups.parity import compare
 from harness.training.gguf_export import export, projector_of
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
@@ -205,6 +204,7 @@ def test_parity_is_measured_with_pictures_too(tiny: Path, theirs: Any) -> None:
     asked, letters = (
         [question(n, image, how) for n, image in enumerate((A, B))] for how in ("json", "readout")
     )
+    compare = pytest.importorskip("harness.extensions.checkups.parity").compare
     compared = compare(theirs.engine.card, card_of(tiny), asked, letters, lambda done: None)
     found = {finding.what: finding for finding in compared.findings}
     assert found["F32: token ids equal"].measured == 1.0

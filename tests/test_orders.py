@@ -15,9 +15,9 @@ from harness.backends.orders import average_orders
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.evaluate.agent import Agent
-from harness.extensions.checkups import questions
 from harness.prompts import readout, versions
 
+questions = pytest.importorskip("harness.extensions.checkups.questions")
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 SHARES = st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3)
 

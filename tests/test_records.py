@@ -24,8 +24,6 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart
-from harness.extensions.view.access import cookie
-from harness.extensions.view.app import app
 from harness.runs import folder, formats, records
 from harness.runs.decisions import schema
 
@@ -134,9 +132,9 @@ def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], 
 
 def opened(reports: Path) -> TestClient:
     """A browser that may see a folder of runs."""
-    return TestClient(
-        app(reports, "token"), base_url="http://127.0.0.1:7654", cookies={cookie(7654): "token"}
-    )
+    view, access = (pytest.importorskip(f"harness.extensions.view.{name}") for name in ("app", "access"))
+    cookies = {access.cookie(7654): "token"}
+    return TestClient(view.app(reports, "token"), base_url="http://127.0.0.1:7654", cookies=cookies)
 
 
 @pytest.mark.parametrize("commit", COMMITS)

@@ -20,7 +20,6 @@ from harness.core import parallel
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.strangers import strangers
-from harness.extensions.decide.desk import Desk
 
 ROOT = Path(__file__).parents[1]
 Typed = Callable[..., tuple[int, str, str]]
@@ -117,7 +116,7 @@ class Leaving:
 
 def test_a_served_engine_that_ends_the_program_answers_the_next_question() -> None:
     async def ask() -> list[Completion]:
-        desk: Any = Desk(Leaving(), 1)  # type: ignore[arg-type]
+        desk: Any = pytest.importorskip("harness.extensions.decide.desk").Desk(Leaving(), 1)
         request = Request("a", "ego", (), ("SLOWER", "IDLE", "FASTER"), 1)
         with pytest.raises(UserError, match="ends the program"):
             await asyncio.wait_for(desk.ask([request]), 10)

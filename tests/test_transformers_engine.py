@@ -27,7 +27,6 @@ from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import find_checkpoint
 from harness.core.errors import UserError
-from harness.extensions.checkups import answers as checkup
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
@@ -438,6 +437,7 @@ def test_a_checkup_shows_the_prompt_its_tokens_and_one_answer_asked_alone(
     backend: LanguageModel,
 ) -> None:
     asked = ask(0)
+    checkup = pytest.importorskip("harness.extensions.checkups.answers")
     seen = checkup.check(backend, [asked])
     assert seen.prompt == backend.chat.render(asked.messages, thinking=False)
     assert seen.tokens is not None

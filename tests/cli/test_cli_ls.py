@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness import cli, extensions, studies
+from harness import cli, studies
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.core.extensions import studies as kinds_of_study
@@ -239,7 +239,8 @@ def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., S
 
 def kinds_of_studies() -> set[str]:
     """The kinds that the program makes, by its text: `Study("trust", …)`."""
-    rooms = (Path(studies.__file__).parent, Path(extensions.__file__).parent)
+    room = Path(studies.__file__).parent
+    rooms = (room, room.parent / "extensions")
     calls = [
         node
         for room in rooms
