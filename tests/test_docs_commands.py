@@ -116,7 +116,7 @@ NOT_RUN = {
     "harness benchmark verify reports/proxy.zip": "as above",
     "harness benchmark board 'reports/*.zip' --out board.html": "as above",
     "harness benchmark pack reports/proxy --made-by 'Ada, of Example' --out ada.zip": "as above",
-    "harness eval --model proxy --limit 40 --tracker mlflow": "needs mlflow; tests/test_trackers.py has it",
+    "harness eval --model proxy --limit 40 --tracker mlflow": "needs mlflow; tests of trackers have it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
     "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",

@@ -24,7 +24,7 @@ COMMANDS = {
     "run ls": "runs:ls",
     "run check": "runs:check",
     "run merge": "runs:merge",
-    "run export": "runs:export",
+    "run export": "export",
     "model list": "model:list_models",
     "model pull": "model:pull",
     "model calibrate": "calibrate",

@@ -1,4 +1,4 @@
-"""`harness run`: list and check finished runs, merge shards, export a run."""
+"""`harness run`: list and check finished runs, merge shards."""
 
 import tempfile
 from dataclasses import asdict
@@ -18,8 +18,6 @@ from harness.runs.leading import BALANCED
 
 if TYPE_CHECKING:
     from harness.runs.listing import Listed
-
-MARGIN = 0.1  # by how much an answer is worth less than the one that is preferred to it
 
 
 def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
@@ -176,103 +174,3 @@ def merge(
     drive.tell(done, as_json, quiet)
     if not silent:
         typer.echo(f"wrote {printable(page)}")
-
-
-def export(
-    run: Path = typer.Argument(help="Folder of a finished run.", metavar="RUN"),
-    as_csv: bool = typer.Option(
-        False,
-        "--csv",
-        help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
-        "spreadsheet would take for a formula gets an apostrophe before it.",
-    ),
-    as_jsonl: bool = typer.Option(False, "--jsonl", help="Write decisions.jsonl, one object per decision."),
-    out: Path | None = typer.Option(
-        None, help="Folder for the files of --csv and --jsonl. Default: the run's."
-    ),
-    junit: Path | None = typer.Option(
-        None, help="Write a JUnit XML file: one test case per episode and condition."
-    ),
-    inspect: Path | None = typer.Option(
-        None, help="Write an Inspect AI log, NAME.eval: one sample per answer."
-    ),
-    sft: Path | None = typer.Option(
-        None,
-        help="Write chats to fine-tune on as JSON Lines; their answers are those that the decision trees "
-        "show to be right.",
-    ),
-    dpo: Path | None = typer.Option(
-        None,
-        help="Write the same chats with the model's own answers as the rejected ones, where these are worse.",
-    ),
-    margin: float | None = typer.Option(
-        None,
-        help="With --dpo: how much less an answer must be worth, above 0 to 1. Default: 0.1.",
-        show_default=False,
-    ),
-    dataset: options.RunsDataset = None,
-    report_seeds_too: bool = typer.Option(
-        False,
-        "--report-seeds-too",
-        help="With --sft and --dpo: also allow layouts with report seeds (200000 and above).",
-    ),
-) -> None:
-    """Write a run's data for spreadsheets and other programs. Give exactly one format."""
-    from harness.runs import export
-    from harness.runs.contradictions import refuse
-    from harness.runs.folder import read
-
-    files = {"--junit": junit, "--inspect": inspect, "--sft": sft, "--dpo": dpo}
-    asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
-    [option, *surplus] = [name for name, given in asked.items() if given] or [""]
-    if surplus or not option:
-        raise UserError(f"{', '.join(asked)}: give exactly one of them")
-    if report_seeds_too and not (sft or dpo):
-        raise UserError("--report-seeds-too only goes with --sft and --dpo; give one, or leave it out")
-    if margin is not None and not (dpo and 0 < margin <= 1):
-        raise UserError(f"--margin {margin:g}: it goes with --dpo, and is above 0 and at most 1")
-    if dataset and option not in ("--inspect", "--sft", "--dpo"):
-        raise UserError("--dataset only goes with --inspect, --sft and --dpo; leave it out")
-    if out and option in files:
-        raise UserError(
-            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
-        )
-    if junit and (reason := work.unanswered(run)):
-        from harness.report.page import save
-
-        save([export.junit_of_none(run, reason)], junit, "--junit")
-        typer.echo(printable(junit, 1000))
-        return
-    source, folder = read(run), out or run
-    if junit:
-        refuse(source)
-    target = files.get(option)
-    try:
-        if as_csv:
-            decisions, answers = source.decisions, source.answers  # both are read before anything is written
-            written = [
-                export.decisions_csv(decisions, folder / "decisions.csv"),
-                export.answers_csv(answers, source.actions, folder / "answers.csv"),
-            ]
-        elif as_jsonl:
-            written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
-        elif junit:
-            written = [export.junit(source, junit)]
-        elif lessons := sft or dpo:
-            from harness.training import pairs
-
-            least = (margin or MARGIN) if dpo else None
-            with bar("writing chats"):
-                written = [pairs.write(source, lessons, report_seeds_too, dataset, least)]
-        elif inspect:
-            extras.need("--inspect", "inspect_ai")
-            from harness.report import inspect_log
-
-            with bar("writing a log"):
-                written = [inspect_log.write(source, inspect, dataset)]
-    except OSError as error:
-        where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
-        remedy = "name another file" if target else "choose another folder with --out"
-        raise UserError(f"{where} cannot be written ({error.strerror}); {remedy}") from None
-    for file in written:
-        typer.echo(printable(file, 1000))

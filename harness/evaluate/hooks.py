@@ -19,9 +19,6 @@ from harness.core import extras, process
 from harness.core.errors import one_line, printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.strangers import strangers
-from harness.evaluate.trackers.mlflow import Mlflow
-from harness.evaluate.trackers.trackio import Trackio
-from harness.evaluate.trackers.wandb import Wandb
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
@@ -35,7 +32,10 @@ SAID_S = 3.0  # after which it is said that a hook is waited for
 
 @runtime_checkable
 class Hook(Protocol):
-    """What follows a command's runs, one run after the other; it may raise anything."""
+    """What follows a command's runs, one run after the other; it may raise anything.
+
+    One that needs modules of an extra (`harness.core.extras.OPTIONAL`) states these as its `needs`.
+    """
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Take note of a run, before the first answer counts.
@@ -53,8 +53,7 @@ class Hook(Protocol):
         ...
 
 
-BUILT_IN: Mapping[str, Hook] = {"mlflow": Mlflow(), "trackio": Trackio(), "wandb": Wandb()}
-HOOKS: Plugins[Hook] = Plugins("swarmdrive.hooks", Hook, BUILT_IN)
+HOOKS: Plugins[Hook] = Plugins("swarmdrive.hooks", Hook, {})
 
 
 def chosen(names: Iterable[str]) -> dict[str, Hook]:
@@ -69,9 +68,12 @@ def chosen(names: Iterable[str]) -> dict[str, Hook]:
     for name in typed:
         if name not in HOOKS:
             raise unknown("tracker", name, HOOKS, hint)
-        if name in BUILT_IN:
-            extras.need(f"{where}{name}", name)
-    return {name: HOOKS[name] for name in typed}
+    hooks = {name: HOOKS[name] for name in typed}
+    for name, hook in hooks.items():
+        needs = getattr(hook, "needs", ())
+        if isinstance(needs, tuple):  # a package's may be anything
+            extras.need(f"{where}{name}", *(module for module in extras.OPTIONAL if module in needs))
+    return hooks
 
 
 class _Caller:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluate.trackers import flat
+from harness.extensions.interop.trackers import flat
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 class Wandb:
     """A hook that keeps runs in Weights & Biases."""
+
+    needs = ("wandb",)  # without which it cannot begin
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         import wandb
@@ -33,3 +35,6 @@ class Wandb:
                 kept.add_file(str(file))
             self._run.log_artifact(kept)
         self._run.finish(exit_code=0 if done else 1)
+
+
+TRACKER = Wandb()

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluate.trackers import flat
+from harness.extensions.interop.trackers import flat
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
@@ -15,6 +15,8 @@ AT_ONCE = 100  # parameters, by MLflow's limit
 
 class Mlflow:
     """A hook that keeps runs in MLflow."""
+
+    needs = ("mlflow",)  # without which it cannot begin
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         import mlflow
@@ -42,3 +44,6 @@ class Mlflow:
 def _name(figure: str) -> str:
     """Return a figure's name with the characters that MLflow takes."""
     return re.sub(r"[^\w./ :-]", "_", figure)
+
+
+TRACKER = Mlflow()

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.evaluate.trackers import flat
+from harness.extensions.interop.trackers import flat
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 class Trackio:
     """A hook that keeps runs in Trackio."""
+
+    needs = ("trackio",)  # without which it cannot begin
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         import trackio
@@ -31,3 +33,6 @@ class Trackio:
         if done:
             trackio.log(flat.figures(done))
         trackio.finish()
+
+
+TRACKER = Trackio()
