@@ -1,0 +1,66 @@
+"""What extensions say of decision points, and that one that fails takes nothing with it."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from markupsafe import Markup
+from run_on_disk import made_up
+
+from harness.core.errors import UserError
+from harness.report import remarks
+from harness.report.runs import Runs
+from harness.runs.folder import Run, read
+
+
+class Says:
+    """Says one thing."""
+
+    def sentences(self, runs: Runs) -> Iterator[Markup]:
+        yield Markup("<b>said</b> of {}").format(len(runs.runs))
+
+    def left_out(self, run: Run) -> Mapping[str, list[dict[str, Any]]]:
+        return {"00000-0": [{"item": "v1"}]}
+
+
+class Fails:
+    """Raises whatever it is asked."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def sentences(self, runs: Runs) -> Iterator[Markup]:
+        raise self.error
+
+    def left_out(self, run: Run) -> Mapping[str, list[dict[str, Any]]]:
+        raise self.error
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Runs:
+    made_up(tmp_path / "run")
+    return Runs((read(tmp_path / "run"),), ("run",), None)
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, **added: Any) -> None:
+    monkeypatch.setattr(remarks.REMARKS, "built_in", added)
+    monkeypatch.setattr(remarks.REMARKS, "_loaded", dict(added))
+
+
+def test_what_one_says_stands_though_another_fails(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked(monkeypatch, broken=Fails(ValueError("<i>no</i>")), mine=Says(), again=Says())
+    said = [text for text in remarks.sentences(runs) if "said" in text or "broken" in text]
+    assert said == [
+        "broken: its package failed: &lt;i&gt;no&lt;/i&gt;",
+        "<b>said</b> of 1",
+        "<b>said</b> of 1",
+    ]
+    assert remarks.left_out(runs.runs[0])["00000-0"] == [{"item": "v1"}] * 2
+
+
+def test_a_broken_file_of_the_run_is_an_error(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked(monkeypatch, mine=Fails(UserError("its file is broken")))
+    for ask in (lambda: remarks.sentences(runs), lambda: remarks.left_out(runs.runs[0])):
+        with pytest.raises(UserError, match="its file is broken"):
+            ask()
