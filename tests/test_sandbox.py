@@ -116,6 +116,13 @@ def test_what_draws_is_rendered_each_time():
     assert len({template.render({"actions": actions}, ("system",))[0] for _ in range(9)}) > 1
 
 
+@pytest.mark.parametrize("written", ["'\\ud800'", "'%c' | format(55296)", "'é' ~ '\\udfff'"])
+def test_half_of_a_surrogate_pair_is_not_written(written: str):
+    template = Template(f"{{% block system %}}{{{{ {written} }}}}{{% endblock %}}")
+    with pytest.raises(ValueError, match="half of a surrogate pair"):
+        template.render({}, ("system",))
+
+
 @pytest.mark.parametrize("sandbox", [SANDBOX, PLAIN_SANDBOX], ids=["prompts", "chats"])
 @pytest.mark.parametrize(
     "written",

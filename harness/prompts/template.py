@@ -42,4 +42,14 @@ class Template:
             parent={**self._empty.parent, **variables},
             eval_ctx=EvalContext(self._empty.environment),
         )
-        return ["".join(self._blocks[block](context)) for block in blocks]
+        texts = ["".join(self._blocks[block](context)) for block in blocks]
+        if not all(map(_is_written, texts)):
+            raise ValueError("it writes half of a surrogate pair, which no file and no server can hold")
+        return texts
+
+
+def _is_written(text: str) -> bool:
+    try:
+        return text.isascii() or bool(text.encode())
+    except UnicodeEncodeError:
+        return False
