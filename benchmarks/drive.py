@@ -35,6 +35,7 @@ from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.prompts import versions as prompts
 from harness.runs.records import Episode, Latency
+from harness.runs.settings import Settings
 from harness.world import lockstep
 from harness.world import reference as live
 
@@ -66,7 +67,7 @@ def main() -> None:
     )  # fmt: skip
     swarm = Spec(
         Agent(cards.resolve("right-hand"), prompts.load("v4")), LiveSource(0, given.episodes, SWARM),
-        (POINTS["single-local"],), spec.seeds, latency="paper",
+        (POINTS["single-local"],), spec.seeds, settings=Settings(latency="paper"),
     )  # fmt: skip
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 

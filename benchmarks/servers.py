@@ -53,6 +53,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.runs.settings import Settings
 
 SMALLEST = "--requests 80 --repeats 1 --seconds 0.005 --workers 2"
 TABLE = "--requests 1000 --repeats 3"
@@ -103,7 +104,7 @@ def main() -> None:
         dataset = load.load(load.find(DATASET))
         spec = Spec(
             Agent(card, prompts.load("v2")), FrozenSource(dataset), tuple(POINTS.values()), (0,),
-            batch_size=batch_size,
+            settings=Settings(batch_size=batch_size),
         )  # fmt: skip
         asked = list(requests(spec, dataset.scenes(dataset.courses())))
         assert card.server
@@ -199,7 +200,7 @@ def together(parts: Sequence[Part]) -> tuple[float, float, float]:
 
 def model(spec: Spec) -> Backend:
     """The backend of this process."""
-    return opened(spec.ego.card, None, None, spec.batch_size)
+    return opened(spec.ego.card, None, None, spec.settings.batch_size)
 
 
 def of_part(drawn: Sequence[Any], part: range) -> Iterator[Any]:

@@ -26,7 +26,7 @@ from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.sharing import as_asked
-from harness.evaluate.spec import Spec
+from harness.evaluate.spec import Source, Spec
 from harness.evaluate.table import table
 from harness.evaluate.walk import Decided, walk
 from harness.prompts import versions as prompts
@@ -36,6 +36,7 @@ from harness.runs.decisions import Decisions
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
+from harness.runs.settings import Settings
 from harness.runs.summary import Figures, counted
 from harness.world.drivers import DRIVERS
 
@@ -48,7 +49,14 @@ def spec_of(
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
     asked = {name: options.pop(name) for name in ("answer", "thinking") if name in options}
     ego = Agent(cards.resolve(model), prompts.load(prompt), **asked)
-    return Spec(ego, FrozenSource(dataset, Selection(limit)), **options)
+    return made(ego, FrozenSource(dataset, Selection(limit)), **options)
+
+
+def made(ego: Agent, source: Source, **options: Any) -> Spec:
+    """An evaluation of what is opened and of plain settings, each by its name."""
+    plain = {*Settings.__struct_fields__} - Spec.__dataclass_fields__.keys()
+    settings = Settings(**{name: options.pop(name) for name in plain & options.keys()})
+    return Spec(ego, source, settings=settings, **options)
 
 
 def with_ego(spec: Spec, **changes: Any) -> Spec:
@@ -61,7 +69,7 @@ def live_spec_of(
 ) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
     ego = Agent(cards.resolve(model), prompts.load(prompt))
-    return Spec(ego, LiveSource(first_seed, episodes, former.NAME), **options)
+    return made(ego, LiveSource(first_seed, episodes, former.NAME), **options)
 
 
 def run(spec: Spec, out: Path) -> Evaluated:

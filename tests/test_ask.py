@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import Watched
+from evaluating import Watched, made
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
@@ -41,7 +41,7 @@ TABLES = ("decisions.parquet", "episodes.csv")
 
 def spec(source: Source, ask: str, names: tuple[str, ...] = POINTS, model: str = "proxy") -> Spec:
     agent = Agent(cards.resolve(model), versions.load(source.scenario.prompt))
-    return Spec(agent, source, tuple(map(named_point, names)), (0, 1), ask=ask)
+    return made(agent, source, points=tuple(map(named_point, names)), seeds=(0, 1), ask=ask)
 
 
 def frozen(episodes: int = 8) -> FrozenSource:
@@ -120,7 +120,7 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("ask", ["all", "used"])
 def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
-    typed = " ".join(words(spec(frozen(2), ask).stated()))
+    typed = " ".join(words(spec(frozen(2), ask).settings))
     assert ("--ask all" in typed) == (ask == "all")
     assert "--ask used" not in typed  # the default
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from evaluating import Scripted, failed, same_decisions, spec_of
+from evaluating import Scripted, failed, made, same_decisions, spec_of
 from former import SCENARIO
 from hypothesis import given
 from hypothesis import strategies as st
@@ -290,9 +290,8 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     card = replace(cards.resolve(str(tiny)), max_new_tokens=6, latency=latency)
     points = tuple(POINTS.values())
     source = FrozenSource(data)
-    spec = Spec(
-        Agent(card, prompts.load("v2")), source, points, (0,), device="cpu", dtype="float32", **options
-    )
+    ego, device = Agent(card, prompts.load("v2")), {"device": "cpu", "dtype": "float32"}
+    spec = made(ego, source, points=points, seeds=(0,), **device, **options)
     return evaluate(spec, out, lambda done: None, cache)
 
 

@@ -105,9 +105,9 @@ def test_what_a_decision_cannot_do_is_refused_in_one_line(
 def test_a_decision_is_not_sampled_and_helps_an_ego_that_is(data: Dataset) -> None:
     spec = deciding(data)
     with pytest.raises(UserError, match=r"--temperature 0.7: a decision is a distribution already; use"):
-        replace(spec, temperature=0.7)
+        spec.changed(temperature=0.7)
     written = replace(spec.ego, answer="json", letters=None)
-    mixed = replace(spec, ego=written, helpers=(spec.ego,), temperature=0.7, sampling_seed=1)
+    mixed = replace(spec, ego=written, helpers=(spec.ego,)).changed(temperature=0.7, sampling_seed=1)
     ego, *helpers = requests(mixed, scenes_of(data)[:1])
     assert (ego.temperature, ego.sample, ego.question) == (0.7, 1, None)
     assert {(helper.temperature, helper.question is None) for helper in helpers} == {(0.0, False)}

@@ -245,7 +245,7 @@ def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
         small, "swarm-tiny", limit=2, device_profile=devices.load("agx-orin"), device_model="qwen3-4b"
     )
     for batch_size in (1, 8):
-        run(replace(spec, batch_size=batch_size), tmp_path / str(batch_size))
+        run(spec.changed(batch_size=batch_size), tmp_path / str(batch_size))
     one, other = (tmp_path / str(batch_size) for batch_size in (1, 8))
     assert same_decisions(one, other)
     assert (one / "summary.csv").read_bytes() == (other / "summary.csv").read_bytes()
@@ -278,7 +278,7 @@ def test_workers_count_a_models_tokens_as_one_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker is forked with the model that answers here."""
-    monkeypatch.setattr(evaluation, "opened", lambda *_: Wordy({}))
+    monkeypatch.setattr(evaluation, "opened", lambda *_, **__: Wordy({}))
     monkeypatch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
     spec = live_spec_of(
         "swarm-tiny", points=(POINTS["6g"],), seeds=(0,), batch_size=4,

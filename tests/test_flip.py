@@ -156,7 +156,7 @@ def test_a_run_and_its_replay_count_it_and_decide_as_without(
         finished_with({"flip": False}, done.out)
     other: Letters = "raw" if letters == "cyclic" else "cyclic"
     with pytest.raises(UserError, match="another letters"):
-        finished_with(spec_with(small, other, flip=False).settings(), plain.out)
+        finished_with(spec_with(small, other, flip=False).record(), plain.out)
     again = run(with_ego(spec, card=cards.resolve(f"replay:{done.out}")), tmp_path / "again")
     assert (again.out / "answers.jsonl").read_bytes() == (done.out / "answers.jsonl").read_bytes()
     with pytest.raises(UserError, match="was run without --flip; leave it out, or make the run again"):

@@ -18,6 +18,7 @@ from evaluating import (
     course,
     decisions,
     figure,
+    made,
     run,
     same_decisions,
     same_files,
@@ -114,9 +115,8 @@ def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
     )
     points = tuple(POINTS.values())
     source = FrozenSource(data)
-    return Spec(
-        Agent(card, prompts.load("v2")), source, points, (0,), device="cpu", dtype="float32", **options
-    )
+    ego, device = Agent(card, prompts.load("v2")), {"device": "cpu", "dtype": "float32"}
+    return made(ego, source, points=points, seeds=(0,), **device, **options)
 
 
 @pytest.mark.slow
@@ -492,4 +492,4 @@ def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(small: Datas
     (tmp_path / "proxy").mkdir()
     (tmp_path / "proxy" / "config.json").write_text("{}")
     spec = spec_of(small, str(tmp_path / "proxy"))
-    assert f"--model {tmp_path / 'proxy'} " in shlex.join(words(spec.stated()))
+    assert f"--model {tmp_path / 'proxy'} " in shlex.join(words(spec.settings))

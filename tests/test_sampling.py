@@ -189,9 +189,9 @@ def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_pat
     spec = spec_of(
         small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2, points=alone
     )
-    one, again = (run(replace(spec, batch_size=n), tmp_path / str(n)) for n in (8, 3))
+    one, again = (run(spec.changed(batch_size=n), tmp_path / str(n)) for n in (8, 3))
     assert same_decisions(one.out, again.out)
-    other = run(replace(spec, sampling_seed=2), tmp_path / "other")
+    other = run(spec.changed(sampling_seed=2), tmp_path / "other")
     texts = [[a.raw for a in read(done.out).answers] for done in (one, again, other)]
     assert texts[0] == texts[1] != texts[2]
     assert (one.manifest.temperature, one.manifest.sampling_seed) == (1.0, 1)

@@ -147,7 +147,7 @@ def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Data
         said_back(asked)
 
     with serving(play) as there:
-        spec = replace(with_ego(spec_of(small), card=card(there.url)), batch_size=4)
+        spec = with_ego(spec_of(small, batch_size=4), card=card(there.url))
         backend, asked, counts = opened(there), decisions(32), []
         asker = Asker(spec, lambda: backend, PAPER, tmp_path / "answers.jsonl", progress=counts.append)
         asked += [request(f"t/v{v}") for v in range(3)]
@@ -372,7 +372,7 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
 def served_spec(small: Dataset, *urls: str) -> Spec:
     """An evaluation of a card that names another server, at these."""
     mine = replace(card("http://127.0.0.1:9/v1"), server=Where("http://127.0.0.1:9/v1", retries=2))
-    return replace(with_ego(spec_of(small, seeds=(0,)), card=mine), servers=urls, batch_size=4)
+    return with_ego(spec_of(small, seeds=(0,), batch_size=4), card=mine).changed(server=urls)
 
 
 def evaluated(spec: Spec, out: Path, cache: Path | None = None, workers: int = 1) -> Path:

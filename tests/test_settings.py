@@ -12,9 +12,11 @@ from evaluating import same_decisions, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve
+from harness.evaluate.frozen_world import FrozenSource
 from harness.runs.folder import read as read_run
 from harness.runs.settings import (
     WORLDS,
@@ -22,6 +24,7 @@ from harness.runs.settings import (
     FrozenSettings,
     HelperSettings,
     Settings,
+    changed,
     of_words,
     options,
     read,
@@ -67,10 +70,13 @@ def test_what_is_no_command_of_a_run_is_refused() -> None:
 
 
 def test_an_evaluation_states_the_settings_that_make_it(small: Dataset) -> None:
-    spec = replace(spec_of(small), tags=("nightly",), latency="paper", seeds=(3, 7))
-    settings = spec.stated()
+    settings = replace(spec_of(small), seeds=(3, 7)).changed(tag=("nightly",), latency="paper").settings
     assert (settings.tag, settings.latency, settings.seeds) == (("nightly",), "paper", "3,7")
-    assert resolve.spec(settings, spec.source) == spec
+    spec = resolve.spec(settings, FrozenSource(small))
+    assert (spec.settings, spec.seeds, spec.points) == (settings, (3, 7), tuple(POINTS.values()))
+    assert replace(spec, seeds=(1,)).settings == changed(settings, {"seeds": "1:2"})
+    with pytest.raises(ValueError, match="seeds is what is opened here"):
+        spec.changed(seeds="1:2")
 
 
 @pytest.mark.slow

@@ -193,7 +193,7 @@ def test_a_run_without_the_setting_took_the_first(
     assert ReplayedRun(old).spec.ties == "first"
     assert finished(spec, old).manifest.ties == "first"
     with pytest.raises(UserError, match="ties"):
-        finished(replace(spec, ties="drawn"), old)
+        finished(spec.changed(ties="drawn"), old)
     again = tmp_path / "again"
     options = ("--dataset", small.path, "--prompt", "v2", "--condition", ALONE.name, "--seeds", "0:2")
     assert harness("eval", "--model", f"replay:{old}", *options, "--quiet", "--out", again)[0] == 0
@@ -203,7 +203,7 @@ def test_a_run_without_the_setting_took_the_first(
 
 @pytest.mark.parametrize("ties", ["drawn", "first"])
 def test_the_command_that_repeats_a_run_falls_alike(ties: str, small: Dataset) -> None:
-    assert ("--ties first" in " ".join(words(spec_of(small, ties=ties).stated()))) == (ties == "first")
+    assert ("--ties first" in " ".join(words(spec_of(small, ties=ties).settings))) == (ties == "first")
 
 
 def test_another_word_is_refused_in_one_line(

@@ -191,7 +191,7 @@ def _reflecting(model: str, first: "Spec", place: Path, settings: Mapping[str, A
     from harness.prompts.versions import ROLES
     from harness.studies.optimize.engines import Reflecting, asked_of
 
-    backend = open_backend(resolve(model), device=first.device, dtype=first.dtype, batch_size=1)
+    backend = open_backend(resolve(model), **{**first.opening, "batch_size": 1})
     roles = ROLES if first.points[0].asks and not first.ego_alone else ROLES[:1]
     return Reflecting(asked_of(backend), place / "reflections.jsonl", settings, roles)
 

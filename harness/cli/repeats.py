@@ -20,12 +20,12 @@ def check(spec: "Spec", repeats: int) -> None:
     from harness.evaluate.latency import MEASURED
 
     in_range("--repeats", repeats, 2, MOST)
-    if not spec.temperature:
+    if not spec.settings.temperature:
         raise UserError(
             f"--repeats {repeats}: greedy answers are the same every time; give a --temperature above 0, "
             "such as 0.7"
         )
-    if spec.latency == MEASURED:
+    if spec.settings.latency == MEASURED:
         raise UserError(
             f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
             "once without --repeats, and give the seconds that its run.json has"

@@ -89,7 +89,7 @@ def evaluate(
         progress = bar(f"asking {name}", quiet=quiet, grows=True)
     else:
         progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
-    with following(hooks, folder, spec.settings()) as followers:
+    with following(hooks, folder, spec.record()) as followers:
         with progress as done:
             run = evaluated(spec, folder, followers.counting(done), cache, done.more, workers, opens)
         dataset = dataset and walked(dataset, run)

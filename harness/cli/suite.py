@@ -36,7 +36,7 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
             "give each family one dataset"
         )
     first = specs[0]
-    if first.latency == MEASURED:
+    if first.settings.latency == MEASURED:
         raise UserError(
             f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
             "on one dataset, and give the seconds that its run.json has"

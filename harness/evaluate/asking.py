@@ -94,7 +94,7 @@ def _blank(spec: Spec, index: int, role: Role) -> Request:
     agent = spec.agents[index]
     sampled: dict[str, Any] = {}
     if agent.samples:
-        sampled = {"temperature": spec.temperature, "sample": spec.sampling_seed}
+        sampled = {"temperature": spec.settings.temperature, "sample": spec.settings.sampling_seed}
     return agent.blank(role, spec.actions).alike(agent=index, **sampled)
 
 
@@ -221,7 +221,7 @@ class Asker:
             return
         # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and
         # all but the last are equally long. So what a resumed run lacks falls into the same chunks.
-        backend, batch = self._backend(), self.spec.batch_size
+        backend, batch = self._backend(), self.spec.settings.batch_size
         size = batch * math.ceil(CHUNK / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
@@ -288,7 +288,7 @@ class Asker:
 
     def _first(self) -> int:
         """Return how many questions are asked before anything was answered: whole batches."""
-        return self.spec.batch_size * math.ceil(FIRST / self.spec.batch_size)
+        return self.spec.settings.batch_size * math.ceil(FIRST / self.spec.settings.batch_size)
 
     def _refused_so_far(self) -> bool:
         return self.tally.asked == self.tally.unanswered

@@ -47,7 +47,7 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
         asked["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
     return {
-        **spec.settings(), "requests": asked.total(), "requests_by_role": dict(asked),
+        **spec.record(), "requests": asked.total(), "requests_by_role": dict(asked),
         "scenes": len(scenes), "prompt_tokens": stats or None, **({"cost": costs} if costs else {}),
     }  # fmt: skip
 

@@ -60,8 +60,8 @@ def begin(
     """Return `begun`, or a new record. Raises UserError if the run began with another model."""
     if begun is None:
         return RunStart(
-            settings=spec.settings(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=words(spec.stated()), identity=identity, tags=spec.tags, latency=latency,
+            settings=spec.record(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=words(spec.settings), identity=identity, tags=spec.settings.tag, latency=latency,
             versions=versions(),
         )  # fmt: skip
     if not same_model(begun.identity, identity):
@@ -83,11 +83,12 @@ def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunS
 
     One that was looked at states the layouts that it stopped after; its command still says when to stop.
     """
-    spec = replace(spec, tags=tuple(dict.fromkeys((*begun.tags, *spec.tags))))
-    if spec.latency == latencies.MEASURED:  # a repeat must not measure: other times would make other rows
-        spec = replace(spec, latency=latencies.as_declared(begun.latency))
+    spec = spec.changed(tag=tuple(dict.fromkeys((*begun.tags, *spec.settings.tag))))
+    # A repeat must not measure: other times would make other rows.
+    if spec.settings.latency == latencies.MEASURED:
+        spec = spec.changed(latency=latencies.as_declared(begun.latency))
     return msgspec.structs.replace(
-        begun, settings=_stopped(spec, looks).settings(), tags=spec.tags, command=words(spec.stated()),
+        begun, settings=_stopped(spec, looks).record(), tags=spec.settings.tag, command=words(spec.settings),
         versions=versions(),
     )  # fmt: skip
 
@@ -100,7 +101,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
     begun = work.begun(out, RunStart)
     if begun:
-        now = {**_comparable(spec.settings()), "shard": shard}
+        now = {**_comparable(spec.record()), "shard": shard}
         stored = {**_comparable(begun.settings), "shard": begun.shard}
         work.same(out, now, stored, partial(_options, spec, shlex.join(begun.command)))
         work.same(out, _rules(versions()), _rules(begun.versions))
@@ -110,7 +111,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
 def _options(spec: Spec, command: str) -> str:
     """Return in which options a run's command differs from this one; empty for none, or no such command."""
     with suppress(UserError, ValueError):  # a stranger's run may state any command
-        before, now = difference(of_words(shlex.split(command)), spec.stated())
+        before, now = difference(of_words(shlex.split(command)), spec.settings)
         return before and f"{before}, and not with {now}"
     return ""
 
@@ -139,7 +140,7 @@ def refuse_finished(out: Path) -> None:
 def finished(spec: Spec, out: Path) -> Evaluated:
     """Return the finished run in a folder. Raises UserError if it is another run, or damaged."""
     looks = folder.read(out).manifest.world.looks if spec.source.until else None
-    return finished_with(_stopped(spec, looks).settings(), out, partial(_options, spec))
+    return finished_with(_stopped(spec, looks).record(), out, partial(_options, spec))
 
 
 def finished_with(

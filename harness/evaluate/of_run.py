@@ -23,6 +23,7 @@ from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import Run
+from harness.runs.settings import Settings
 from harness.runs.sources import PROMPTS, prompt_of
 
 DRIVER = "driver"  # the engine of what has no model and no prompt
@@ -35,12 +36,11 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
     """
     manifest = run.manifest
     ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
-    return Spec(
-        ego, source, (), manifest.seeds, tuple(helpers),
-        batch_size=manifest.batch_size, dtype=manifest.dtype,
-        temperature=manifest.temperature, sampling_seed=manifest.sampling_seed, ask="used",
-        ties=manifest.ties,
+    settings = Settings(
+        batch_size=manifest.batch_size, dtype=manifest.dtype, temperature=manifest.temperature,
+        sampling_seed=manifest.sampling_seed, ties=manifest.ties,
     )  # fmt: skip
+    return Spec(ego, source, (), manifest.seeds, tuple(helpers), settings=settings)
 
 
 def card_here(card: Card) -> Card:

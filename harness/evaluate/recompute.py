@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from msgspec import to_builtins
+from msgspec import structs, to_builtins
 from msgspec.structs import astuple
 
 from harness.backends.base import Backend, Completion, Request
@@ -103,11 +103,12 @@ def differences(
     check_prompts(run, stated)
     profile = manifest.device_profile
     ego = replace(stated.ego, card=card_here(stated.ego.card))
-    spec = replace(
-        stated, ego=ego, points=tuple(points_of(run).values()), ask=manifest.ask,
+    settings = structs.replace(
+        stated.settings, ask=manifest.ask, device_model=manifest.device_model,
         latency=latencies.as_declared(manifest.latency) if profile is None else None,
-        device_profile=profile, device_model=manifest.device_model,
     )  # fmt: skip
+    points = tuple(points_of(run).values())
+    spec = replace(stated, ego=ego, points=points, device_profile=profile, settings=settings)
     ours, otherwise = computed(run, spec, out, progress)
     wrong = [
         *contradictions(run),

@@ -2,13 +2,11 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
 from harness.backends.base import BARE
-from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError, in_range, unknown
 from harness.core.files import text_of
@@ -22,7 +20,6 @@ from harness.evaluate.looks import until
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs import devices
-from harness.runs.folder import read
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
@@ -38,14 +35,14 @@ def spec(settings: Settings, source: Source) -> Spec:
     ego, helpers = agents(settings, source.scenario)
     profile = settings.device_profile
     return Spec(
-        ego=ego, helpers=helpers, source=source, seeds=parse_seeds(settings.seeds),
+        ego=ego,
+        helpers=helpers,
+        source=source,
+        seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
-        batch_size=settings.batch_size, servers=settings.server, device=settings.device, dtype=settings.dtype,
-        temperature=settings.temperature, sampling_seed=settings.sampling_seed, latency=settings.latency,
-        device_profile=devices.load(profile) if profile else None, device_model=settings.device_model,
-        tags=tuple(dict.fromkeys(settings.tag)), ask=settings.ask,
-        ties=_usual_ties(ego) if settings.ties is None else settings.ties,
-    )  # fmt: skip
+        device_profile=devices.load(profile) if profile else None,
+        settings=settings,
+    )
 
 
 def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
@@ -113,13 +110,6 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
             settings.sums if mode == "json" else "refuse", settings.flip and mode in BARE,
         )  # fmt: skip
         return ego, tuple(Agent(helper_card, *theirs) for helper_card in helper_cards)  # type: ignore[arg-type]
-
-
-def _usual_ties(ego: Agent) -> str:
-    """Return how ties fall where nothing is stated: as in the run that is replayed, if one is."""
-    with suppress(UserError):  # what is no run is refused when it is opened
-        return read(Path(ego.card.weights or "")).manifest.ties if ego.can.own_latency else TIES[0]
-    return TIES[0]
 
 
 @contextmanager

@@ -108,7 +108,7 @@ def evaluate(
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     begun = unfinished(spec, out)
-    if not begun and spec.latency == latencies.MEASURED:
+    if not begun and spec.settings.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
         return _frozen(spec, spec.source, out, begun, progress, cache, more, opens, given, workers)
@@ -214,9 +214,7 @@ def _frozen(
         models = list[Backend]()
         identity, latency = _stated_in_worker(spec, begun, spread_over)
     else:
-        options = {"device": spec.device, "dtype": spec.dtype, "batch_size": spec.batch_size}
-        opening: Opens = opens or open_backend
-        models = open_each(spec.cards, partial(opening, **options))
+        models = open_each(spec.cards, partial(opens or open_backend, **spec.opening))
         identity, latency = together(spec.cards, models).identity(), _latency(spec, begun, models)
     begun = begin(spec, out, begun, identity, latency)
     with work.working(out, begun, "run.json") as place:
@@ -262,7 +260,7 @@ def spreadable(spec: Spec, workers: Workers) -> Workers:
     if _reproducible(spec):
         return workers
     asks_servers = all(agent.card.server or not agent.can.language_model for agent in spec.agents)
-    return min(workers, spec.batch_size) if asks_servers and isinstance(workers, int) else 1
+    return min(workers, spec.settings.batch_size) if asks_servers and isinstance(workers, int) else 1
 
 
 def _hand_over(place: Path, chunks: Sequence[Sequence[int]]) -> None:
@@ -277,13 +275,13 @@ def _begin_driving(
     spec: Spec, out: Path, begun: RunStart | None, workers: Workers, shard: str = ""
 ) -> tuple[RunStart, list[Sequence[int]]]:
     """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
-    if spec.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
+    if spec.settings.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
             f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; measure on "
             "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
     identity, latency = _stated_in_worker(spec, begun, workers)
-    return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.settings())
+    return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.record())
 
 
 def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
@@ -508,8 +506,8 @@ def _latency(spec: Spec, begun: RunStart | None, models: Sequence[Backend]) -> L
     if begun:
         return begun.latency
     if spec.device_profile:
-        return device.of_device(spec.device_profile, spec.device_model, spec.agents)
-    declared = latencies.known(spec.latency, spec.agents, models)
+        return device.of_device(spec.device_profile, spec.settings.device_model, spec.agents)
+    declared = latencies.known(spec.settings.latency, spec.agents, models)
     return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
 
 
@@ -522,7 +520,7 @@ def _trial(spec: Spec) -> Sequence[Scene]:
 
 def _open_all(spec: Spec) -> list[Backend]:
     """Return the backends of a run's agents, open in this process."""
-    return [opened(card, spec.device, spec.dtype, spec.batch_size) for card in spec.cards]
+    return [opened(card, **spec.opening) for card in spec.cards]
 
 
 def read_or_evaluate(

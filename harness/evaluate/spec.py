@@ -1,10 +1,13 @@
 """Hold and check the complete settings of an evaluation: enough to run it again."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
+from msgspec import structs
 
 from harness.backends.base import BARE
 from harness.backends.card import Card
@@ -25,7 +28,9 @@ from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.looks import Until
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
+from harness.runs import formats
 from harness.runs.devices import Device
+from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
 from harness.runs.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
@@ -33,6 +38,7 @@ from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
 
+USUAL = Settings()
 TAG_CHARACTERS = 40
 HOTTEST = 2.0
 TRIED = 8  # scenes of which one must change the ego's prompt, where messages hold objects
@@ -101,26 +107,11 @@ class Spec:
     # the agents that answer for the helpers. Helpers take them in turn, in the order in which they were
     # spawned. Empty if the ego's agent answers for the helpers, too
     helpers: tuple[Agent, ...] = ()
-    batch_size: int = 8  # the most requests that go through an engine together
-    # base URLs of the served model, which replace that of its card; any of them may answer
-    servers: tuple[str, ...] = ()
-    device: str | None = None  # the engines' device; None leaves the choice to them
-    dtype: str | None = None  # number format of the weights; None takes each card's
-    temperature: float = 0.0  # sampling temperature; 0 takes the likeliest token each time
-    sampling_seed: int = 0  # seed of the sampling; under another one, the same question gets other answers
-    # where inference times come from: `card`, `paper`, `measured`, or seconds as `declared` reads them; None
-    # for each card's, else the paper's
-    latency: str | None = None
-    # the computer that every vehicle has; it replaces `latency`: the time of an answer follows from its own
+    # the computer that every vehicle has; it replaces `--latency`: the time of an answer follows from its own
     # tokens. None for no profile
     device_profile: Device | None = None
-    # the model whose row of the profile times all answers; None for each agent's own row
-    device_model: str | None = None
-    tags: tuple[str, ...] = ()  # words by which to find the run; they change nothing in it
-    # `used` asks a helper only when a condition uses its answer; `all` asks every helper in every scene,
-    # which gives the same decisions
-    ask: str = ASKS[0]
-    ties: str = TIES[0]  # which of several likeliest actions is taken: one that is `drawn`, or the `first`
+    # all settings, from which `resolve.spec` makes this evaluation: those of what stands above are made of it
+    settings: Settings = USUAL
     budget: Budget | None = None  # what may be spent on answers; it changes nothing in the run
 
     def __post_init__(self) -> None:
@@ -130,18 +121,18 @@ class Spec:
             raise UserError(
                 f"--seeds {list(self.seeds)}: give one or more different whole numbers, such as 0:5"
             )
-        for tag in self.tags:
+        object.__setattr__(self, "settings", structs.replace(self.settings, **self._opened()))
+        for tag in self.settings.tag:
             if not (0 < len(tag) <= TAG_CHARACTERS and tag.isprintable() and tag == tag.strip()):
                 raise UserError(
                     f"--tag {printable(tag)!r}: give 1 to {TAG_CHARACTERS} printable characters, "
                     "with no space at either end"
                 )
-        if self.ask not in ASKS:
-            raise UserError(f"--ask {printable(self.ask)}: give {' or '.join(ASKS)}")
-        if self.ties not in TIES:
-            raise UserError(f"--ties {printable(self.ties)}: give {' or '.join(TIES)}")
-        if self.batch_size < 1:
-            raise UserError(f"--batch-size {self.batch_size}: give 1 or more")
+        for flag, choice, choices in (("--ask", self.settings.ask, ASKS), ("--ties", self.ties, TIES)):
+            if choice not in choices:
+                raise UserError(f"{flag} {printable(choice)}: give {' or '.join(choices)}")
+        if self.settings.batch_size < 1:
+            raise UserError(f"--batch-size {self.settings.batch_size}: give 1 or more")
         self._check_servers()
         self._check_sampling()
         for agent in self.agents:
@@ -157,11 +148,11 @@ class Spec:
                 f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for an ego "
                 "only; give other models"
             )
-        if self.latency not in (None, *NAMES):
-            times = len(declared(self.latency).helpers_s)
+        if (latency := self.settings.latency) not in (None, *NAMES):
+            times = len(declared(latency).helpers_s)
             if times and times != len(self.helpers):
                 raise UserError(
-                    f"--latency {printable(self.latency)}: {times} times for {len(self.helpers)} helper "
+                    f"--latency {printable(latency)}: {times} times for {len(self.helpers)} helper "
                     "models; give one, or one each"
                 )
         self._check_device()
@@ -170,7 +161,7 @@ class Spec:
         if until := self.source.until:
             names = [point.name for point in self.points]
             until.check(self.source.record(), self.source.numbers, names, self.seeds)
-        for flag, value in {"--device": self.device, "--dtype": self.dtype}.items():
+        for flag, value in {"--device": self.settings.device, "--dtype": self.settings.dtype}.items():
             if value is not None and not any(agent.can.has_weights for agent in self.agents):
                 engines = [
                     name for name, engine in ENGINES.usable().items() if engine.capabilities.has_weights
@@ -182,39 +173,40 @@ class Spec:
 
     def _check_device(self) -> None:
         if self.device_profile is None:
-            if self.device_model is not None:
-                shown = printable(self.device_model)
+            if self.settings.device_model is not None:
+                shown = printable(self.settings.device_model)
                 raise UserError(f"--device-model {shown} is a device's row; give --device-profile as well")
             return
-        if self.latency is not None:
+        if self.settings.latency is not None:
             raise UserError(
                 f"--device-profile {printable(self.device_profile.name)} says how long answers take, as "
-                f"--latency {printable(self.latency)} does; give one of the two"
+                f"--latency {printable(self.settings.latency)} does; give one of the two"
             )
-        rows_of(self.device_profile, self.device_model, self.agents)
+        rows_of(self.device_profile, self.settings.device_model, self.agents)
 
     def _check_servers(self) -> None:
         served = {agent.card for agent in self.agents if agent.card.server}
-        if self.servers and len(served) != 1:
+        if self.settings.server and len(served) != 1:
             models = " and ".join(sorted(printable(card.name) for card in served or {self.ego.card}))
             reason = "are asked at servers of their own" if served else "is asked at none"
             raise UserError(f"--server: {models} {reason}; leave it out, and give base_url in a card")
         try:
             for card in served:
-                card.at(self.servers)
+                card.at(self.settings.server)
         except ValueError as error:
             raise UserError(f"--server: {error}") from None
 
     def _check_sampling(self) -> None:
-        shown = f"--temperature {self.temperature:g}"
-        if not 0 <= self.temperature <= HOTTEST:
+        temperature, seed = self.settings.temperature, self.settings.sampling_seed
+        shown = f"--temperature {temperature:g}"
+        if not 0 <= temperature <= HOTTEST:
             raise UserError(f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}")
-        if self.sampling_seed < 0 or (self.sampling_seed and not self.temperature):
+        if seed < 0 or (seed and not temperature):
             raise UserError(
-                f"--sampling-seed {self.sampling_seed}: give 0 or more, with a --temperature above 0: "
+                f"--sampling-seed {seed}: give 0 or more, with a --temperature above 0: "
                 "greedy answers are not drawn"
             )
-        if self.temperature and not any(agent.samples for agent in self.agents):
+        if temperature and not any(agent.samples for agent in self.agents):
             name = printable(self.ego.card.name)
             reason = f"{name} has nothing to sample; leave it out, or give a model that writes its answers"
             if self.ego.answer in BARE:
@@ -232,14 +224,15 @@ class Spec:
             raise UserError(
                 f"--model {name}: a replay has answers to frozen scenes alone; give the model that it replays"
             )
-        shown = f"--latency {printable(self.latency)}"
-        if self.latency not in NAMES:
+        latency = self.settings.latency
+        shown = f"--latency {printable(latency)}"
+        if latency not in NAMES:
             return
-        if agent.can.own_latency and self.latency != "paper":
+        if agent.can.own_latency and latency != "paper":
             raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
-        elif self.latency == MEASURED and not agent.can.language_model:
+        elif latency == MEASURED and not agent.can.language_model:
             raise UserError(f"{shown}: {name} is no language model; use card or paper")
-        elif self.latency == "card" and agent.card.latency.inference_s is None:
+        elif latency == "card" and agent.card.latency.inference_s is None:
             raise UserError(
                 f"{shown}: the card of {name} declares no inference time; "
                 "use paper or measured, or add inference_s to the card"
@@ -342,7 +335,7 @@ class Spec:
     @property
     def cards(self) -> tuple[Card, ...]:
         """The agents' cards; the served model's has the servers that were given."""
-        return tuple(agent.card.at(self.servers) for agent in self.agents)
+        return tuple(agent.card.at(self.settings.server) for agent in self.agents)
 
     def scenario_of(self, scene: Scene) -> Scenario:
         """Return the scenario of who decides in a scene."""
@@ -368,7 +361,7 @@ class Spec:
     @property
     def asks_all(self) -> bool:
         """Whether the answers of all are asked at once; with a device profile the joules of all count."""
-        return self.ask == "all" or self.ego_alone or self.device_profile is not None
+        return self.settings.ask == "all" or self.ego_alone or self.device_profile is not None
 
     @property
     def ego_alone(self) -> bool:
@@ -379,8 +372,16 @@ class Spec:
         """Return the vehicles of a scene for which a model answers, the ego first."""
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
-    def settings(self) -> dict[str, Any]:
-        """Return, as plain values, the settings that must not change when a stopped run resumes."""
+    def changed(self, **settings: Any) -> "Spec":
+        """Return this evaluation with other settings, such as `temperature=0.5`, that open nothing."""
+        spec = replace(self, settings=structs.replace(self.settings, **settings))
+        if lost := [name for name, value in settings.items() if getattr(spec.settings, name) != value]:
+            raise ValueError(f"{lost[0]} is what is opened here: replace that")
+        return spec
+
+    def record(self) -> dict[str, Any]:
+        """Return the settings, and what they opened, as plain values: a part of a run's `run.json`."""
+        settings = msgspec.to_builtins(self.settings)
         return {
             **self.ego.settings(),
             "helpers": [agent.settings() for agent in self.helpers],
@@ -404,19 +405,15 @@ class Spec:
                 if (name := point.ask.calibration)
             },
             "seeds": list(self.seeds),
-            "ask": self.ask,
-            "ties": self.ties,
-            "batch_size": self.batch_size,
-            "dtype": self.dtype,
-            "temperature": self.temperature,
-            "sampling_seed": self.sampling_seed,
-            "latency_source": self.latency,
             "device_profile": msgspec.to_builtins(self.device_profile),
-            "device_model": self.device_model,
+            **{key: settings[name] for key, name in formats.BESIDE.items()},
         }
 
-    def stated(self) -> Settings:
-        """Return the settings that `resolve.spec` makes this evaluation of."""
+    def _opened(self) -> dict[str, Any]:
+        """Return the settings that open what is opened here; and those that depend on it if nothing is typed.
+
+        A condition with a control or an attack has a name of its own, and so has a model on another engine.
+        """
         helpers = HelperSettings()
         if self.helpers:
             thinking = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
@@ -426,18 +423,37 @@ class Spec:
                 thinking=None if thinking == self.ego.thinking else thinking,
             )  # fmt: skip
         first = self.seeds[0]
-        return Settings(
-            model=argument(self.ego.card), prompt=self.ego.prompt.version, helpers=helpers,
-            world=self.source.settings(), condition=tuple(point.name for point in self.points),
-            seeds=",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}",
-            answer=self.ego.answer, thinking=self.ego.thinking, image=self.ego.image, letters=self._letters,
-            flip=self.ego.flip, sums=self.ego.sums, batch_size=self.batch_size, server=self.servers,
-            device=self.device, dtype=self.dtype, temperature=self.temperature,
-            sampling_seed=self.sampling_seed, latency=self.latency,
-            device_profile=self.device_profile.name if self.device_profile else None,
-            device_model=self.device_model,
-            ask=self.ask, ties=self.ties, tag=self.tags,
-        )  # fmt: skip
+        return {
+            "model": argument(self.ego.card),
+            "engine": None,
+            "prompt": self.ego.prompt.version,
+            "helpers": helpers,
+            "world": self.source.settings(),
+            "condition": tuple(point.name for point in self.points),
+            "control": (),
+            "attack": (),
+            "seeds": ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}",
+            **{name: getattr(self.ego, name) for name in ("answer", "thinking", "image", "flip", "sums")},
+            "letters": self._letters,
+            "device_profile": self.device_profile.name if self.device_profile else None,
+            "ties": self.ties,
+            "tag": tuple(dict.fromkeys(self.settings.tag)),
+        }
+
+    @property
+    def ties(self) -> str:
+        """How ties fall: if nothing is stated, as in the run that is replayed, if one is."""
+        if self.settings.ties is not None:
+            return self.settings.ties
+        if self.ego.can.own_latency:
+            with suppress(UserError):  # what is no run is refused when it is opened
+                return read(Path(self.ego.card.weights or "")).manifest.ties
+        return TIES[0]
+
+    @property
+    def opening(self) -> dict[str, Any]:
+        """The options with which the models are opened."""
+        return {name: getattr(self.settings, name) for name in ("device", "dtype", "batch_size")}
 
     @property
     def _letters(self) -> str | None:

@@ -18,6 +18,14 @@ FORMAT = f"swarmdrive-run/{NUMBER}"
 READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
 
 
+# Settings that run.json states at its top as well, by their key there, for readers of its first versions. A
+# new one stands there no more.
+BESIDE: Mapping[str, str] = {
+    "ask": "ask", "ties": "ties", "batch_size": "batch_size", "dtype": "dtype", "temperature": "temperature",
+    "sampling_seed": "sampling_seed", "latency_source": "latency", "device_model": "device_model",
+}  # fmt: skip
+
+
 class Added(NamedTuple):
     """What a run without a setting or a column did."""
 

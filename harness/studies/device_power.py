@@ -17,6 +17,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
+from harness.runs.settings import Settings
 
 WINDOWS = 5  # of asking; the intervals are over them
 
@@ -84,7 +85,7 @@ def measure_agent(
 ) -> tuple[list[Power], int]:  # fmt: skip
     """Load an agent's model on a device, and `measure` it with questions of the default dataset."""
     data = load.load(load.find(DATASET), 10)
-    spec = Spec(agent, FrozenSource(data), (), (0,), batch_size=1, device=device)
+    spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))
     asked = list(requests(spec, data.scenes(data.forest.ids[:10])))
     backend = open_backend(agent.card, device=device, dtype=None, batch_size=1)
     return measure(backend, asked, meters, window_s, progress)

@@ -6,7 +6,7 @@ between repeats is the model's chance alone. All intervals are over episodes.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -45,8 +45,8 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
     """Return the runs of several repeats, each with the next sampling seed, by the name of their folders."""
-    seeds = range(spec.sampling_seed, spec.sampling_seed + repeats)
-    return {f"repeat-{n}": replace(spec, sampling_seed=seed) for n, seed in enumerate(seeds, 1)}
+    first = spec.settings.sampling_seed
+    return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
 
 
 def run_repeats(

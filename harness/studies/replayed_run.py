@@ -298,7 +298,7 @@ class ReplayedRun:
         spec, shown = self._asker.spec, printable(self.run.path)
         check_prompts(self.run, spec)
         cards = [find_own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
-        opens = partial(open_backend, dtype=spec.dtype, batch_size=spec.batch_size)
+        opens = partial(open_backend, **spec.opening)
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
         stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(identity))

@@ -55,7 +55,9 @@ def test_each_agent_is_shown_with_its_model_and_the_plans_that_were_heard(tmp_pa
     spec = live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,))
     cruise = Agent(cards.resolve("cruise"), versions.load("v4"))
     source = LiveSource(50_001, 1, "all-way-crossing:agent_share=1")
-    spec = replace(spec, source=source, points=(point,), helpers=(cruise,), latency="ego=0.1,helper=0.15")
+    spec = replace(spec, source=source, points=(point,), helpers=(cruise,)).changed(
+        latency="ego=0.1,helper=0.15"
+    )
     run(spec, tmp_path / "run")
     (tmp_path / "report.html").write_text(render(gather([tmp_path / "run"]), full=True))
     page = opened(tmp_path / "report.html", "#decisions")

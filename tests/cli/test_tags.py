@@ -59,10 +59,10 @@ def test_a_run_goes_on_under_other_tags_and_keeps_those_it_was_begun_with(
     small: Dataset, tmp_path: Path
 ) -> None:
     with pytest.raises(Killed):
-        evaluate(spec_of(small, tags=("first",)), tmp_path / "tagged", die)
+        evaluate(spec_of(small, tag=("first",)), tmp_path / "tagged", die)
     [begun] = runs(tmp_path)
     assert (begun.state, begun.tags) == ("unfinished", ("first",))
-    done = run(spec_of(small, tags=("second", "first")), tmp_path / "tagged")
+    done = run(spec_of(small, tag=("second", "first")), tmp_path / "tagged")
     assert done.manifest.tags == ("first", "second")
     plain = run(spec_of(small), tmp_path / "plain")
     assert plain.manifest.tags == ()

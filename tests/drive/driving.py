@@ -75,8 +75,8 @@ def driven(
 ) -> Driven:
     """Walk some episodes of the closed loop, every inference taking `infer_s`, or what it would in a run."""
     assert isinstance(of.source, LiveSource)
-    opened = backend or open_backend(of.ego.card, batch_size=of.batch_size)
-    latency = known(of.latency, of.agents, [opened])
+    opened = backend or open_backend(of.ego.card, batch_size=of.settings.batch_size)
+    latency = known(of.settings.latency, of.agents, [opened])
     if infer_s is not None:
         latency = Latency("card", "test", infer_s, infer_s, infer_s)
     assert latency is not None, "no test measures"

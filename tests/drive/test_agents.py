@@ -207,7 +207,8 @@ def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path:
     cruise = Agent(cards.resolve("cruise"), versions.load("v4"))
     point = named_point("single-local")
     spec = live_spec_of(prompt="v4", points=(point,), seeds=(0,))
-    spec = replace(spec, source=LiveSource(50_000, 1, ALL), helpers=(cruise,), latency="ego=0.1,helper=0.3")
+    spec = replace(spec, source=LiveSource(50_000, 1, ALL), helpers=(cruise,))
+    spec = spec.changed(latency="ego=0.1,helper=0.3")
     there = folder.read(run(spec, tmp_path / "run").out)
     egos = {World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_001)}
     table, page = there.decisions, details(render(gather([tmp_path / "run"]), full=True))

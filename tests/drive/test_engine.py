@@ -1,6 +1,5 @@
 """Live episodes: a hand-played one, what latency does, and what episodes share."""
 
-from dataclasses import replace
 from functools import cache
 from itertools import product
 
@@ -263,7 +262,7 @@ def test_a_language_model_in_float32_drives_alike_in_any_company():
     points = [ALONE, named_point("6g:consensus=ego-prompt")]
     tiny = spec("swarm-tiny:transformers", points, (0,), first_seed=FROM_LEFT, latency="paper")
     together = driven(tiny, (0, 1), infer_s=0.145)
-    alone = [driven(replace(tiny, batch_size=1), (e,), infer_s=0.145) for e in (0, 1)]
+    alone = [driven(tiny.changed(batch_size=1), (e,), infer_s=0.145) for e in (0, 1)]
     episodes = [episode for made in alone for episode in made.episodes]
     assert sorted(map(repr, together.episodes)) == sorted(map(repr, episodes))
     answers = [answer for made in alone for answer in made.answers]

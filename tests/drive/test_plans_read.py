@@ -49,7 +49,7 @@ class Polite(Scripted):
 def spec(*conditions: str, prompt: str = "v13", **options) -> Spec:
     points = tuple(map(named_point, conditions))
     made = live_spec_of("swarm-tiny-six-v2", prompt=prompt, points=(named_point("6g"),), seeds=(0,))
-    return replace(made, source=LiveSource(50_000, 2, ALL), points=points, latency="paper", **options)
+    return replace(made, source=LiveSource(50_000, 2, ALL), points=points).changed(latency="paper", **options)
 
 
 def driven(where: Spec, backend: Scripted, kept: Path | None = None) -> tuple[Steps, Asker]:

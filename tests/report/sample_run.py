@@ -35,7 +35,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     episodes = counted(grid, decisions, world.episodes())
     manifest = {
         "format": formats.FORMAT, "name": out.name, "created": "2025-01-01T00:00:00+00:00",
-        "command": "harness eval --model rule-of-thumb", "tags": [], **spec.settings(),
+        "command": "harness eval --model rule-of-thumb", "tags": [], **spec.record(),
         "model": {"name": model, "engine": "rule", "description": "brakes for what it sees"},
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
         "latency": PAPER, "identity": {"engine": "rule"},

@@ -154,11 +154,12 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise self._differs(f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version])
         card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
-        return Spec(
-            Agent(card, prompt, *how), source, resolve.points(self.condition), parse_seeds(self.seeds),
+        ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
+        settings = Settings(
             batch_size=m.batch_size, temperature=m.temperature, sampling_seed=m.sampling_seed,
             latency=self.latency, ask=m.ask, ties=self.ties,
         )  # fmt: skip
+        return Spec(ego, source, points, parse_seeds(self.seeds), settings=settings)
 
     def _differs(self, what: str, here: str, stated: str) -> UserError:
         return UserError(

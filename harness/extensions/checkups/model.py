@@ -17,6 +17,7 @@ from harness.extensions.checkups.answers import Checkup
 from harness.extensions.checkups.answers import check as ask
 from harness.extensions.checkups.read_outs import COUNT, Findings, examine, keep_findings
 from harness.prompts import versions
+from harness.runs.settings import Settings
 
 PROMPT, IMAGE_PROMPT = "v2", "v7"
 
@@ -55,7 +56,8 @@ def check(card: Card, thinking: bool, device: str | None, dtype: str | None, pro
         can = tuple(mode for mode in can if mode != "decision")
     ego = Agent(card, versions.load(PROMPT), can[0], thinking=thinking)
     sees = Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking) if card.vision else None
-    spec = Spec(ego, FrozenSource(data), (), (0,), batch_size=1, device=device, dtype=dtype)
+    settings = Settings(batch_size=1, device=device, dtype=dtype)
+    spec = Spec(ego, FrozenSource(data), (), (0,), settings=settings)
     modes = ("json",) if ego.thinking else can
     scenes = data.scenes(data.forest.ids[:1])
 

@@ -80,7 +80,7 @@ def closed_loop(
     from harness.evaluate.spec import Spec
     from harness.extensions.paper.closed_loop import panels, run_closed_loop
     from harness.prompts import versions
-    from harness.runs.settings import DriveSettings
+    from harness.runs.settings import DriveSettings, Settings
     from harness.studies.study import refuse_taken
 
     named = scenario and options.typed_scenario(scenario)
@@ -92,8 +92,7 @@ def closed_loop(
         source,
         tuple(points.values()),
         parse_seeds(seeds),
-        batch_size=batch_size,
-        latency=latency,
+        settings=Settings(batch_size=batch_size, latency=latency),
     )
     where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
     refuse_taken(where, "closed-loop")

@@ -93,9 +93,8 @@ def search(
         render_all(spec)
     opens = cache(opens)
     first = plan.tune[0]
-    options = {"device": first.device, "dtype": first.dtype, "batch_size": first.batch_size}
-    models = open_each(first.cards, partial(opens, **options))
-    latency = latencies.known(first.latency, first.agents, models)
+    models = open_each(first.cards, partial(opens, **first.opening))
+    latency = latencies.known(first.settings.latency, first.agents, models)
     assert latency  # it is not to be measured
     backend = together(first.cards, models, cache_file)
     base = chosen(plan.base)

@@ -55,7 +55,7 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     """Has a backend answer in the place of the card's."""
 
     def answer(backend: Any) -> None:
-        monkeypatch.setattr(asking, "opened", lambda *_: backend)
+        monkeypatch.setattr(asking, "opened", lambda *_, **__: backend)
 
     return answer
 

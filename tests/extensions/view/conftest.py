@@ -18,7 +18,7 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viewed") / "reports"
     points = (POINTS["single-local"], POINTS["6g"])
     for name, model in (("first", "proxy"), ("second", "cruise")):
-        evaluate(spec_of(small, model, points=points, tags=(f"tag of {name}",)), folder / name)
+        evaluate(spec_of(small, model, points=points, tag=(f"tag of {name}",)), folder / name)
     write_report(gather([folder / "first"]), folder / "first/report.html")
     (folder / "first/sweep-tau").mkdir()
     (folder / "first/sweep-tau/sweep.json").write_text('{"sources": [{"name": "proxy · v2 · json"}]}')

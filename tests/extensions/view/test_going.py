@@ -32,7 +32,7 @@ def seen(made: Path, small: Dataset, tmp_path_factory: pytest.TempPathFactory) -
     """What is seen of a real run at each answer and after it: its extent, the list, what changes in it."""
     reports = Path(shutil.copytree(made, tmp_path_factory.mktemp("going") / "reports"))
     client = visitor(reports)
-    spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tags=("slow",), batch_size=1)
+    spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tag=("slow",), batch_size=1)
     looks = []
 
     def look(done: int) -> None:

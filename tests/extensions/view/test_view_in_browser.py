@@ -35,7 +35,7 @@ def folder(small, tmp_path_factory):
     """Two runs and a page that spies."""
     folder = tmp_path_factory.mktemp("viewed") / "reports"
     for name, model in (("first", "proxy"), ("second", "cruise"), ("spy", "brake")):
-        evaluate(spec_of(small, model, points=(POINTS["6g"],), tags=(name,)), folder / name)
+        evaluate(spec_of(small, model, points=(POINTS["6g"],), tag=(name,)), folder / name)
     write_report(gather([folder / "first"]), folder / "first/report.html")
     (folder / "spy/report.html").write_text(SPY)
     return folder
@@ -194,7 +194,7 @@ def test_the_list_follows_a_run_to_its_end_without_a_new_page(page, address, fol
         assert go_on.wait(60)
 
     def go():
-        spec = spec_of(small, points=(POINTS["6g"],), tags=("goes on",), batch_size=1)
+        spec = spec_of(small, points=(POINTS["6g"],), tag=("goes on",), batch_size=1)
         evaluation(spec, folder / "third", wait_for_the_page)
         tidy(folder / "third")
 

@@ -81,7 +81,7 @@ class Questions:
 
     def begin(self, identity: str) -> work.WorkStart:
         """Return what the work begins with; `identity` is the digest of the model's."""
-        settings = {**self.spec.settings(), "twins": self.twins, "seed": self.seed, "identity": identity}
+        settings = {**self.spec.record(), "twins": self.twins, "seed": self.seed, "identity": identity}
         return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
@@ -163,7 +163,7 @@ def ask(
 
 
 def _identity(spec: Spec) -> str:
-    return digest(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size).identity())
+    return digest(opened(spec.ego.card, **spec.opening).identity())
 
 
 def _answers_file(place: Path, episode: int) -> Path:
@@ -178,7 +178,7 @@ def _asked(
     (number, scenes, kept), spec = episode, questions.spec
 
     def backend() -> Backend:
-        return cached(opened(spec.ego.card, spec.device, spec.dtype, spec.batch_size), spec.ego.card, cache)
+        return cached(opened(spec.ego.card, **spec.opening), spec.ego.card, cache)
 
     asker = Asker(spec, backend, PAPER, place and _answers_file(place, number), kept)
     twins = [twin for twin in map(TWINS.__getitem__, questions.twins) if lack(spec, twin) is None]

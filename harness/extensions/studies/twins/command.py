@@ -64,6 +64,7 @@ def command(
     from harness.extensions.studies.twins.study import twins_study, write_pairs
     from harness.prompts import versions
     from harness.report.compare.gate import gate
+    from harness.runs.settings import Settings
 
     who = options.workers_of(workers)
     for name in twin or ():
@@ -83,10 +84,8 @@ def command(
         source,
         points=(),
         seeds=(0,),
-        batch_size=batch_size,
-        device=device,
-        dtype=dtype,
-        ask="all",  # every viewer has a twin
+        # Every viewer has a twin.
+        settings=Settings(batch_size=batch_size, device=device, dtype=dtype, ask="all"),
     )
     questions = asking.Questions(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
     able = [name for name in questions.twins if asking.lack(spec, TWINS[name]) is None]
