@@ -7,62 +7,19 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
-import msgspec
 import pytest
 from former import NAME
+from relabelling import SEED, relabel
 
 from harness.cli import dataset as checking
 from harness.core.errors import UserError
-from harness.core.files import sha256_bytes
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import find, load
-from harness.dataset.schema import scene_id
 from harness.learning.layouts import stored
-from harness.studies.optimize.layouts import given
 from harness.world import scenarios
-from harness.world.state import WorldState
 
 Harness = Callable[..., tuple[int, str, str]]
-SEED = 3_000_000  # of no layout that ships
-
-
-@pytest.fixture(scope="session")
-def relabelled(once: Callable[..., Path]) -> Path:
-    """Three report layouts under tune seeds, with every digest and id in order."""
-
-    def fill(folder: Path) -> None:
-        build(scenarios.get(NAME), folder / "relabelled", 3, SEED, 1, lambda done: None)
-        relabel(folder / "relabelled", {n: n for n in range(3)})
-
-    return once("relabelled", fill) / "relabelled"
-
-
-def relabel(dataset: Path, seeds: dict[int, int]) -> None:
-    """Give a dataset's layouts other seeds, as somebody who means harm would."""
-    with ZipFile(dataset / "layouts.zip") as file:
-        entries = {each: file.read(each) for each in file.namelist()}
-    manifest = json.loads((dataset / "manifest.json").read_text())
-    for number, seed in seeds.items():
-        tree = json.loads(entries[f"{number:05d}/tree.json"])
-        tree["episode_seed"] = seed
-        for step, level in enumerate(tree["levels"]):
-            name = f"{number:05d}/{step}.jsonl"
-            records = [json.loads(line) for line in entries[name].splitlines()]
-            for point, record in zip(level, records, strict=True):
-                record["episode_seed"] = record["state"]["episode_seed"] = seed
-                state = msgspec.convert(record["state"], WorldState)
-                record["scene"] = point["scene"] = scene_id(number, state)
-            entries[name] = "".join(json.dumps(record) + "\n" for record in records).encode()
-        hashes = [sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))]
-        tree["scenes_sha256"] = hashes
-        entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
-        manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
-    manifest |= {"seed": seeds[0], "purpose": "tune"}
-    (dataset / "manifest.json").write_text(json.dumps(manifest))
-    with ZipFile(dataset / "layouts.zip", "w") as file:
-        for name, data in entries.items():
-            file.writestr(name, data)
 
 
 def splice(source: Path, dataset: Path, number: int) -> None:
@@ -83,15 +40,6 @@ def splice(source: Path, dataset: Path, number: int) -> None:
     with ZipFile(dataset / "layouts.zip", "w") as file:
         for name, data in {**rest, **theirs}.items():
             file.writestr(name, data)
-
-
-@pytest.fixture(scope="session")
-def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
-    """What the proxy answers there, helpers included."""
-    from evaluating import run, spec_of
-
-    spec = spec_of(load(relabelled), ask="all", seeds=(0,))
-    return once("run-of-relabelled", lambda folder: run(spec, folder / "run")) / "run"
 
 
 @pytest.mark.slow
@@ -145,14 +93,6 @@ def test_nothing_fits_or_learns_there(
     assert "is not what layout seed" in error
     assert not list(tmp_path.glob("*.jsonl"))
     assert not (tmp_path / "calibrations").exists()
-
-
-@pytest.mark.slow
-def test_no_prompt_is_searched_there(relabelled: Path) -> None:
-    with pytest.raises(UserError, match="is not what layout seed"):
-        given([str(relabelled)], [load(find("occluded-intersection-v2"), 1).manifest])
-    with pytest.raises(UserError, match=r"it has a layout of relabelled, where the winner is certified"):
-        given([str(relabelled)], [load(relabelled).manifest])
 
 
 @pytest.mark.slow

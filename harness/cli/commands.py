@@ -37,7 +37,6 @@ COMMANDS = {
     "prompt show": "prompt:show",
     "prompt compare": "prompt:compare",
     "prompt examples": "prompt:examples",
-    "prompt optimize": "optimize",
     "prompt release": "prompt:release",
     "prompt parse": "parse",
     "dataset build": "dataset:build",

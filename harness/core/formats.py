@@ -7,5 +7,4 @@ SUITE = "suite.json"  # marks a folder that holds a suite's runs
 # Every kind of study, and what lists call it; `<kind>.json` marks its folder. Who makes a kind adds it here.
 STUDIES = {
     "sweep": "sweep", "contents": "contents", "repeats": "repeats", "trust": "trust", "schedule": "schedule",
-    "optimize": "optimize",
 }  # fmt: skip

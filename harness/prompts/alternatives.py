@@ -1,4 +1,4 @@
-"""Alternatives that a template's author marks, one of which `harness prompt optimize` chooses.
+"""Alternatives that a template's author marks, one of which a search of wordings chooses.
 
 A mark is part of a template's text and has a name. `{% either greeting %}A{% or %}B{% endeither %}` is A or
 B; `{% order parts %}A{% or %}B{% endorder %}` is AB or BA. A mark of one name in both templates is one

@@ -14,10 +14,10 @@ from harness.backends.base import Backend, Request
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import canonical_json, sha256_bytes
 from harness.core.strangers import strangers
+from harness.extensions.learn.optimize.candidate import Candidate, chosen, rewritten, space, systems
+from harness.extensions.learn.optimize.feedback import of_course
+from harness.extensions.learn.optimize.tuning import Played, Spent, Tuning
 from harness.prompts.versions import Prompt
-from harness.studies.optimize.candidate import Candidate, chosen, rewritten, space, systems
-from harness.studies.optimize.feedback import of_course
-from harness.studies.optimize.tuning import Played, Spent, Tuning
 from harness.studies.study import Cells
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
+    from harness.extensions.learn.optimize.engines import Engine
     from harness.prompts.versions import Prompt
-    from harness.studies.optimize.engines import Engine
     from harness.world.scenario import Scenario
 
 CONDITION = "single-local"
@@ -77,10 +77,10 @@ def command(
     from harness.dataset import load, suites
     from harness.dataset.verify import read_manifest, scenario_of
     from harness.evaluate import resolve
+    from harness.extensions.learn.optimize import engines
+    from harness.extensions.learn.optimize.layouts import built, counted, given, only_for
+    from harness.extensions.learn.optimize.search import Search, choices, search
     from harness.prompts import versions as prompts
-    from harness.studies.optimize import engines
-    from harness.studies.optimize.layouts import built, counted, given, only_for
-    from harness.studies.optimize.search import Search, choices, search
 
     extras.need("harness prompt optimize", *(() if tune else ("highway_env",)))
     extras.need("--reflect", *(("gepa",) if reflect else ()))
@@ -188,8 +188,8 @@ def _check_name(name: str, goes_on: bool) -> None:
 def _reflecting(model: str, first: "Spec", place: Path, settings: Mapping[str, Any]) -> "Engine":
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
+    from harness.extensions.learn.optimize.engines import Reflecting, asked_of
     from harness.prompts.versions import ROLES
-    from harness.studies.optimize.engines import Reflecting, asked_of
 
     backend = open_backend(resolve(model), **{**first.opening, "batch_size": 1})
     roles = ROLES if first.points[0].asks and not first.ego_alone else ROLES[:1]

@@ -4,7 +4,7 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.dataset.forest import Forest
-from harness.studies.optimize.tuning import Decision, Played
+from harness.extensions.learn.optimize.tuning import Decision, Played
 from harness.world.perception.graph import truth_graph
 from harness.world.scene_graph import Conflict
 

@@ -16,12 +16,12 @@ from misbehaving import Asked, Server, completion, serving
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, find, load
+from harness.extensions.learn.optimize.candidate import chosen, rewritten, space, systems
+from harness.extensions.learn.optimize.feedback import of_course, of_decision
+from harness.extensions.learn.optimize.search import looks
+from harness.extensions.learn.optimize.tuning import TIE, Decision, Played
 from harness.prompts import versions as prompts
 from harness.prompts.alternatives import counts, resolved
-from harness.studies.optimize.candidate import chosen, rewritten, space, systems
-from harness.studies.optimize.feedback import of_course, of_decision
-from harness.studies.optimize.search import looks
-from harness.studies.optimize.tuning import TIE, Decision, Played
 
 pytestmark = pytest.mark.usefixtures("unrebuilt")
 

@@ -25,10 +25,10 @@ from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses, walk
+from harness.extensions.learn.optimize.candidate import Candidate
 from harness.prompts.versions import Prompt
 from harness.runs.records import Answer, Latency
 from harness.runs.success import Success
-from harness.studies.optimize.candidate import Candidate
 
 TIE = 1e-3  # weight of worth in a score
 

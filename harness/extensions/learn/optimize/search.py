@@ -22,15 +22,15 @@ from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.run import Opens, read_or_evaluate
 from harness.evaluate.spec import Spec
+from harness.extensions.learn.optimize.candidate import Candidate, chosen, space, write
+from harness.extensions.learn.optimize.engines import Engine
+from harness.extensions.learn.optimize.tuning import Record, Spent, Tuning, changed, tokens
 from harness.prompts.versions import ROLES, Prompt, load
 from harness.report.document import Table
 from harness.runs.folder import Run
 from harness.runs.leading import BALANCED, SUCCESS
 from harness.runs.metrics import METRICS, by_episode
 from harness.runs.success import Success, alike, mean_difference
-from harness.studies.optimize.candidate import Candidate, chosen, space, write
-from harness.studies.optimize.engines import Engine
-from harness.studies.optimize.tuning import Record, Spent, Tuning, changed, tokens
 from harness.studies.study import Study, ends
 
 HISTORY = "history.json"  # beside a version's files: where it comes from; no part of its digest

@@ -1,0 +1,66 @@
+"""Report layouts that state tune seeds, as somebody who means harm would have them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from zipfile import ZipFile
+
+import msgspec
+import pytest
+from former import NAME
+
+from harness.core.files import sha256_bytes
+from harness.dataset.build import build
+from harness.dataset.load import load
+from harness.dataset.schema import scene_id
+from harness.world import scenarios
+from harness.world.state import WorldState
+
+SEED = 3_000_000  # of no layout that ships
+
+
+@pytest.fixture(scope="session")
+def relabelled(once: Callable[..., Path]) -> Path:
+    """Three report layouts under tune seeds, with every digest and id in order."""
+
+    def fill(folder: Path) -> None:
+        build(scenarios.get(NAME), folder / "relabelled", 3, SEED, 1, lambda done: None)
+        relabel(folder / "relabelled", {n: n for n in range(3)})
+
+    return once("relabelled", fill) / "relabelled"
+
+
+@pytest.fixture(scope="session")
+def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
+    """What the proxy answers there, helpers included."""
+    from evaluating import run, spec_of
+
+    spec = spec_of(load(relabelled), ask="all", seeds=(0,))
+    return once("run-of-relabelled", lambda folder: run(spec, folder / "run")) / "run"
+
+
+def relabel(dataset: Path, seeds: dict[int, int]) -> None:
+    """Give a dataset's layouts other seeds, as somebody who means harm would."""
+    with ZipFile(dataset / "layouts.zip") as file:
+        entries = {each: file.read(each) for each in file.namelist()}
+    manifest = json.loads((dataset / "manifest.json").read_text())
+    for number, seed in seeds.items():
+        tree = json.loads(entries[f"{number:05d}/tree.json"])
+        tree["episode_seed"] = seed
+        for step, level in enumerate(tree["levels"]):
+            name = f"{number:05d}/{step}.jsonl"
+            records = [json.loads(line) for line in entries[name].splitlines()]
+            for point, record in zip(level, records, strict=True):
+                record["episode_seed"] = record["state"]["episode_seed"] = seed
+                state = msgspec.convert(record["state"], WorldState)
+                record["scene"] = point["scene"] = scene_id(number, state)
+            entries[name] = "".join(json.dumps(record) + "\n" for record in records).encode()
+        hashes = [sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))]
+        tree["scenes_sha256"] = hashes
+        entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
+        manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
+    manifest |= {"seed": seeds[0], "purpose": "tune"}
+    (dataset / "manifest.json").write_text(json.dumps(manifest))
+    with ZipFile(dataset / "layouts.zip", "w") as file:
+        for name, data in entries.items():
+            file.writestr(name, data)
