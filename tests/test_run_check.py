@@ -226,6 +226,33 @@ def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness)
     assert "otherwise than the rule here" in " ".join(out.split())
 
 
+def failed(answer: Row) -> None:
+    answer |= {"status": "no_json", "verdict": "failed", "intent": None}
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (failed, "another verdict in 1 answer than its texts say"),
+        (lambda answer: answer.update(repairs=("fence",)), "another repairs in 1 answer than its texts say"),
+        (lambda answer: answer.update(intent=(0.0, 1.0, 0.0)), "another intent in 1 answer than its texts"),
+        (lambda answer: answer.update(viewer="v99"), "1 answer to questions that nobody asked"),
+    ],
+)
+def test_what_a_run_says_of_its_answers_is_held_against_their_texts(
+    changed: Callable[[Row], None], said: str, run: Path, harness: Harness
+) -> None:
+    """The rates of parsing follow from it, and a file can state both."""
+    lines = (run / "answers.jsonl").read_text().splitlines()
+    one = json.loads(lines[-1])
+    changed(one)
+    more = [] if one["viewer"] != "v99" else lines[-1:]
+    (run / "answers.jsonl").write_text("\n".join([*lines[:-1], *more, json.dumps(one)]) + "\n")
+    code, out, _ = harness("run", "check", run)
+    assert code == 1
+    assert said in " ".join(out.split())
+
+
 def test_a_table_that_agrees_with_the_others_and_not_with_the_answers_is_found(
     run: Path, harness: Harness
 ) -> None:

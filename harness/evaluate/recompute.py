@@ -38,6 +38,7 @@ OF_ENDS = (  # what an episode's row says of how it ended
     "fault", "least_gap_m", "hard_brakings", "other_crashes", "witnesses", "danger_radio", "agents",
     "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys",
 )  # fmt: skip
+OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
 RULES = (DRIVER, "proxy")  # engines that are no models
 
 
@@ -115,6 +116,7 @@ def differences(
         *_of_manifest(run, ours, stated.ego.card),
         *_of_episodes(run, ours),
         *_of_decisions(run, ours),
+        *_of_answers(run, ours),
     ]
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
@@ -189,6 +191,24 @@ def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
     for name, wrong in differing(stated.episodes, ours.episodes):
         if current(stated) or not _empty(stated, name):
             yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than its answers make"
+
+
+def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
+    """Yield what answers.jsonl says otherwise of its texts, from which the rates of parsing follow."""
+    here = {(each.scene, each.viewer, each.heard, each.role): each for each in ours.answers}
+    asked = [(each, here.get((each.scene, each.viewer, each.heard, each.role))) for each in stated.answers]
+    for name in OF_TEXTS:
+        wrong = sum(b is not None and not _close(getattr(a, name), getattr(b, name)) for a, b in asked)
+        if wrong:
+            yield f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
+    if more := sum(b is None for _, b in asked):
+        yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
+
+
+def _close(a: object, b: object) -> bool:
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(close, a, b))
+    return close(a, b)
 
 
 def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
