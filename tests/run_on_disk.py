@@ -1,6 +1,6 @@
 """Runs on disk: one made up, and any run changed by hand. All are written by the harness's one writer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -105,8 +105,8 @@ def change(
     A row is a mapping by column, None where unknown.
     """
     read, rows, ends, said = _rows(run, decision, episode, answer)
-    whole = {**msgspec.to_builtins(read.manifest), **stated}
-    _write(run, msgspec.convert(whole, Manifest), rows, ends, said)
+    whole = restated(msgspec.to_builtins(read.manifest), stated)
+    _write(run, msgspec.convert(formats.upgraded(whole), Manifest), rows, ends, said)
 
 
 def damage(
@@ -137,7 +137,12 @@ def _rows(
 def configure(run: Path, **values: object) -> None:
     """Change what run.json says; it need not be possible."""
     stated = msgspec.json.decode((run / "run.json").read_bytes())
-    (run / "run.json").write_bytes(msgspec.json.encode({**stated, **values}))
+    (run / "run.json").write_bytes(msgspec.json.encode(restated(stated, values)))
+
+
+def restated(manifest: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
+    """What run.json says, changed; without the table of settings, which would have to say the same."""
+    return {**{name: value for name, value in manifest.items() if name != "settings"}, **changes}
 
 
 def rows_of(run: Path, condition: str | None = None) -> list[Row]:

@@ -159,6 +159,39 @@ def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) 
     assert next(iter(values)) in refused(run, "run.json")
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"temperature": 0.5}, "its settings have temperature 0.5, and beside them it is 0.0"),
+        ({"latency": "paper"}, "its settings have latency paper, and beside them it is None"),
+        ({"prompt": "v9\x1b"}, "its settings have prompt v9\\x1b, and beside them it is v2"),
+        ({"seeds": "3,7"}, "its settings have seeds 3,7, and beside them it is"),
+        ({"condition": []}, "its settings have condition [], and beside them it is"),
+        ({"world": {"kind": "closed-loop"}}, "its settings have world.kind closed-loop, and beside them it"),
+        ({"batch_size": "many"}, "its settings have batch_size many, and beside them it is 8"),
+        ({"server": 3}, "settings.server"),
+    ],
+)
+def test_settings_that_say_otherwise_than_what_stands_beside_them(
+    settings: dict[str, Any], said: str, run: Path
+) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**stated, "settings": {**stated["settings"], **settings}}))
+    assert said in refused(run, "run.json")
+
+
+@pytest.mark.parametrize("table", [None, [], "all", 3])
+def test_settings_that_are_no_table(table: Any, run: Path) -> None:
+    configure(run, settings=table)
+    assert "settings" in refused(run, "run.json")
+
+
+def test_settings_of_a_later_harness_are_read_without_what_they_have_more(run: Path) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    configure(run, settings={**stated["settings"], "later": 3})
+    assert folder.read(run).manifest.settings.temperature == 0.0
+
+
 WRONG = (None, -1, "x\x1b", [], {"a": 1})
 
 

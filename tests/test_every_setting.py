@@ -9,10 +9,26 @@ from typing import Any
 
 import msgspec
 import pytest
-from evaluating import same_decisions
+from evaluating import A_TENTH, same_decisions, spec_of
 from misbehaving import Asked, completion, serving
+from msgspec import structs
 
-from harness.runs.settings import WORLDS, Option, Settings, changed, kind_of, of_words, options
+from harness.core.errors import UserError
+from harness.core.work import working
+from harness.dataset.load import Dataset
+from harness.evaluate.lifecycle import begin, unfinished
+from harness.runs.formats import BESIDE
+from harness.runs.settings import (
+    PLAIN,
+    WORLDS,
+    Option,
+    Settings,
+    changed,
+    kind_of,
+    of_words,
+    options,
+    words,
+)
 
 Said = tuple[int, str, str]
 CARD = """engine = "openai"
@@ -121,10 +137,32 @@ def test_a_run_states_each_setting_and_repeats_it(
     assert same_decisions(Path("run"), Path("again"))
 
 
+@pytest.mark.parametrize("name", PLAIN)
+def test_a_stopped_run_resumes_with_each_setting_as_it_was(name: str, small: Dataset, tmp_path: Path) -> None:
+    """Of those that open nothing; `test_run_killed.py` changes what is opened."""
+    typed = (settings_of(run) for run in RUNS)
+    other = next(each.of(of) for of in typed for each in unusual(of) if each.name == name)
+    spec = spec_of(small)
+    before = changed(spec.settings, {name: other})
+    start = begin(spec, tmp_path / "run", None, {}, A_TENTH)
+    table = msgspec.to_builtins(before)
+    beside = {key: table[of] for key, of in BESIDE.items()}
+    record = {**start.settings, **beside, "settings": table}
+    with working(tmp_path / "run", structs.replace(start, settings=record, command=words(before))):
+        pass
+    flag = "--" + name.replace("_", "-")
+    with pytest.raises(UserError, match=f"was begun with {flag} .*, and not with (no )?{flag}"):
+        unfinished(spec, tmp_path / "run")
+
+
 def stated(run: str) -> dict[str, Settings]:
     """The settings of a run by the place that states them."""
     manifest = json.loads(Path(run, "run.json").read_text())
     *command, flag, out = shlex.split(manifest["command"])
     assert (flag, out) == ("--out", run)
     text = Path(run, "run.toml").read_text()
-    return {"run.toml": msgspec.convert(tomllib.loads(text), Settings), "command": of_words(command)}
+    return {
+        "run.json": msgspec.convert(manifest["settings"], Settings),
+        "run.toml": msgspec.convert(tomllib.loads(text), Settings),
+        "command": of_words(command),
+    }

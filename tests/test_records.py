@@ -26,6 +26,7 @@ from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart
 from harness.runs import folder, formats, records
 from harness.runs.decisions import schema
+from harness.runs.settings import PLAIN
 
 HERE = Path(__file__).parent / "records"
 COMMITS = ("356ad2b", "8cccefb", "0103f23")
@@ -226,11 +227,12 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     helpers = sum(name.startswith("helper_") for name in columns)
     with (HERE / run / "episodes.csv").open() as file:
         head = next(csv.reader(file))
-    condition = {*OperatingPoint.types()}
+    condition, manifest = {*OperatingPoint.types()}, set(records.Manifest.__struct_fields__)
     # Letters are a setting of the agent; an adapter, a price and a cost are stated where there is one.
     card = {field.name for field in fields(Card)} - {"letters", "adapter", "price"}
     lacks = {
-        "SETTINGS": set(records.Manifest.__struct_fields__) - {*stated, *formats.AGENT, "cost"},
+        "MANIFEST": manifest - {*stated, *formats.AGENT, *formats.BESIDE, "settings", "cost"},
+        "SETTINGS": PLAIN.keys() - {formats.BESIDE[key] for key in formats.BESIDE if key in stated},
         "AGENT": set(formats.AGENT) - {*stated},
         "MODEL": card - {*stated["model"]},
         "CONDITION": set.union(*(condition - {*point} for point in stated["conditions"])),

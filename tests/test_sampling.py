@@ -194,7 +194,7 @@ def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_pat
     other = run(spec.changed(sampling_seed=2), tmp_path / "other")
     texts = [[a.raw for a in read(done.out).answers] for done in (one, again, other)]
     assert texts[0] == texts[1] != texts[2]
-    assert (one.manifest.temperature, one.manifest.sampling_seed) == (1.0, 1)
+    assert (one.manifest.settings.temperature, one.manifest.settings.sampling_seed) == (1.0, 1)
     assert "--temperature 1.0 --sampling-seed 1" in one.manifest.command
 
 

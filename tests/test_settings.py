@@ -108,7 +108,7 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     assert harness("eval", "a", "--model", "replay:a", "--ties", "first", "--quiet", "--out", "c")[0] == 0
     assert harness("eval", "c", "--quiet", "--out", "of-c") == (0, "", ""), "it replays what that replayed"
     assert same_decisions(Path("c"), Path("of-c"))
-    assert read_run(Path("of-c")).manifest.ties == "first"
+    assert read_run(Path("of-c")).manifest.settings.ties == "first"
 
 
 HOSTILE = {

@@ -189,16 +189,16 @@ def test_a_run_without_the_setting_took_the_first(
     record = msgspec.json.decode((old / "run.json").read_bytes())
     assert record.pop("ties") == "first"
     (old / "run.json").write_bytes(msgspec.json.encode(record))
-    assert read(old).manifest.ties == "first"
+    assert read(old).manifest.settings.ties == "first"
     assert ReplayedRun(old).spec.ties == "first"
-    assert finished(spec, old).manifest.ties == "first"
+    assert finished(spec, old).manifest.settings.ties == "first"
     with pytest.raises(UserError, match="ties"):
         finished(spec.changed(ties="drawn"), old)
     again = tmp_path / "again"
     options = ("--dataset", small.path, "--prompt", "v2", "--condition", ALONE.name, "--seeds", "0:2")
     assert harness("eval", "--model", f"replay:{old}", *options, "--quiet", "--out", again)[0] == 0
     assert same_decisions(old, again)
-    assert read(again).manifest.ties == "first"
+    assert read(again).manifest.settings.ties == "first"
 
 
 @pytest.mark.parametrize("ties", ["drawn", "first"])

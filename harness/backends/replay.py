@@ -80,7 +80,7 @@ class Replay:
         for request in requests:
             # A run answers the first step of each of its episodes; only blind answers may be missing, and
             # those of helpers that no condition asked.
-            unasked = role == "helper" and manifest.ask == "used"
+            unasked = role == "helper" and manifest.settings.ask == "used"
             first_step = _step(request.id) == "0" and not unasked and not request.id.endswith(BLIND)
             again = request.id.endswith(AGAIN)  # a changed parser may ask for a repair that the run did not
             foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id
@@ -95,7 +95,7 @@ class Replay:
             stated = convert(agent["model"], Card, f"{shown}: its model")
             lacking = f"{shown} holds no answer for {requests[0].id}"
             card = find_own(stated, (), lacking, "write one of that name, or make the run again")
-            model = open_backend(card, dtype=manifest.dtype, batch_size=manifest.batch_size)
+            model = open_backend(card, dtype=manifest.settings.dtype, batch_size=manifest.settings.batch_size)
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 helpers = manifest.identity.get("helpers")
@@ -111,7 +111,9 @@ class Replay:
         manifest = self._run.manifest
         if request.bare:
             return request
-        return replace(request, temperature=manifest.temperature, sample=manifest.sampling_seed)
+        return replace(
+            request, temperature=manifest.settings.temperature, sample=manifest.settings.sampling_seed
+        )
 
     def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
         shown = printable(self._run.path)

@@ -19,7 +19,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
 from harness.runs.records import Latency, Looks, Manifest, Score
-from harness.runs.settings import difference, of_words, words
+from harness.runs.settings import PLAIN, difference, of_words, words
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -42,7 +42,7 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
         """Return what must be the same in all shards of a run, by the name that an error gives it."""
         versions = {f"version of {name}": v for name, v in self.versions.items() if name != "platform"}
         latency = msgspec.to_builtins(self.latency)
-        return {**_comparable(self.settings), "model": self.identity, "latency": latency, **versions}
+        return {**_comparable(self.settings), "model": self.identity, "inference times": latency, **versions}
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunS
     # A repeat must not measure: other times would make other rows.
     if spec.settings.latency == latencies.MEASURED:
         spec = spec.changed(latency=latencies.as_declared(begun.latency))
+    record = {**_stopped(spec, looks).record(), "settings": msgspec.to_builtins(spec.settings)}
     return msgspec.structs.replace(
-        begun, settings=_stopped(spec, looks).record(), tags=spec.settings.tag, command=words(spec.settings),
-        versions=versions(),
-    )  # fmt: skip
+        begun, settings=record, tags=spec.settings.tag, command=words(spec.settings), versions=versions()
+    )
 
 
 def _stopped(spec: Spec, looks: Looks | None) -> Spec:
@@ -159,12 +159,20 @@ def finished_with(
 
 
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by the names that an error gives them.
+    """Return what must be the same when a run resumes, by the names that an error gives it.
 
-    The dataset's path is left out, since its folder may move between two commands. A world that is no
-    table, as in a damaged record, is another world.
+    Of its settings these are those that open nothing. The dataset's path is left out, since its folder may
+    move between two commands. What is no table, as in a damaged record, is another world.
     """
-    of = settings.get("world")
-    table = of if isinstance(of, Mapping) else {"kind": of}
-    world = {f"{key} of the world": value for key, value in table.items() if key != "path"}
-    return {**{key: value for key, value in settings.items() if key != "world"}, **world}
+    world, plain = (_named(settings.get(name)) for name in ("world", "settings"))
+    return {
+        **{
+            key: value for key, value in settings.items() if key not in ("world", "settings", *formats.BESIDE)
+        },
+        **{key: value for key, value in plain.items() if key in PLAIN},
+        **{f"{key} of the world": value for key, value in world.items() if key != "path"},
+    }
+
+
+def _named(table: Any) -> Mapping[str, Any]:
+    return table if isinstance(table, Mapping) else {"kind": table}

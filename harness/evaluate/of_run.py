@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any, cast
 
 import msgspec
+from msgspec import structs
 
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Letters, Sums
@@ -23,7 +24,7 @@ from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import Run
-from harness.runs.settings import Settings
+from harness.runs.settings import deciding
 from harness.runs.sources import PROMPTS, prompt_of
 
 DRIVER = "driver"  # the engine of what has no model and no prompt
@@ -36,10 +37,8 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
     """
     manifest = run.manifest
     ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
-    settings = Settings(
-        batch_size=manifest.batch_size, dtype=manifest.dtype, temperature=manifest.temperature,
-        sampling_seed=manifest.sampling_seed, ties=manifest.ties,
-    )  # fmt: skip
+    settings = deciding(manifest.settings)
+    settings = structs.replace(settings, ask="used", latency=None, device_model=None)
     return Spec(ego, source, (), manifest.seeds, tuple(helpers), settings=settings)
 
 

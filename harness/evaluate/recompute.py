@@ -104,10 +104,9 @@ def differences(
     check_prompts(run, stated)
     profile = manifest.device_profile
     ego = replace(stated.ego, card=card_here(stated.ego.card))
-    settings = structs.replace(
-        stated.settings, ask=manifest.ask, device_model=manifest.device_model,
-        latency=latencies.as_declared(manifest.latency) if profile is None else None,
-    )  # fmt: skip
+    latency = latencies.as_declared(manifest.latency) if profile is None else None
+    said = manifest.settings
+    settings = structs.replace(stated.settings, ask=said.ask, device_model=said.device_model, latency=latency)
     points = tuple(points_of(run).values())
     spec = replace(stated, ego=ego, points=points, device_profile=profile, settings=settings)
     ours, otherwise = computed(run, spec, out, progress)

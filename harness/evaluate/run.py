@@ -441,6 +441,7 @@ def _gather(
     merged from, and `layouts` those that its own are a part of.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
+    typed = {**settings["settings"], "tag": begun.tags}
     works = [place, *(shard / WORK for shard in folders)]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -469,6 +470,7 @@ def _gather(
         manifest = msgspec.convert({
             "format": FORMAT, "name": out.name, "created": begun.created,
             "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
+            "settings": typed,
             "latency": msgspec.to_builtins(begun.latency),
             "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": begun.identity,
             "cached_answers": sum(answer.cached for answer in answers),

@@ -407,6 +407,7 @@ class Spec:
             "seeds": list(self.seeds),
             "device_profile": msgspec.to_builtins(self.device_profile),
             **{key: settings[name] for key, name in formats.BESIDE.items()},
+            "settings": settings,
         }
 
     def _opened(self) -> dict[str, Any]:
@@ -447,7 +448,7 @@ class Spec:
             return self.settings.ties
         if self.ego.can.own_latency:
             with suppress(UserError):  # what is no run is refused when it is opened
-                return read(Path(self.ego.card.weights or "")).manifest.ties
+                return read(Path(self.ego.card.weights or "")).manifest.settings.ties or TIES[0]
         return TIES[0]
 
     @property

@@ -138,10 +138,10 @@ def of_run(run: Run) -> Iterator[str]:
     if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
     yield from contradictions.unchecked(run)
-    if run.manifest.temperature:
+    if run.manifest.settings.temperature:
         yield (
-            f"Answers were sampled at temperature {run.manifest.temperature:g} with sampling seed "
-            f"{run.manifest.sampling_seed}: another seed gives other answers."
+            f"Answers were sampled at temperature {run.manifest.settings.temperature:g} with sampling seed "
+            f"{run.manifest.settings.sampling_seed}: another seed gives other answers."
         )
     for role, (whose, _) in _FAILED.items():
         if run.manifest.sums == "divide" and (score := run.score(ALL, f"divided_rate_{role}")):

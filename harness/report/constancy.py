@@ -63,7 +63,7 @@ def ignores_input(run: Run) -> Iterator[str]:
 
 
 def _like(run: Run, common: Commonest) -> str:
-    taken = common.actions[:1] if run.manifest.ties == "first" else common.actions
+    taken = common.actions[:1] if run.manifest.settings.ties == "first" else common.actions
     if len(taken) == len(run.actions):
         return "the driver `uniform`, which needs no model"
     if len(taken) > 1:

@@ -7,6 +7,7 @@ the old name. `tests/test_records.py` reads kept runs of earlier commits and fai
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from harness.core.errors import UserError, printable
@@ -18,12 +19,15 @@ FORMAT = f"swarmdrive-run/{NUMBER}"
 READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
 
 
-# Settings that run.json states at its top as well, by their key there, for readers of its first versions. A
-# new one stands there no more.
+# Settings that run.json states beside the table `settings`, too, by their key there: readers of its first
+# versions have no table. A new setting is not one of them.
 BESIDE: Mapping[str, str] = {
     "ask": "ask", "ties": "ties", "batch_size": "batch_size", "dtype": "dtype", "temperature": "temperature",
     "sampling_seed": "sampling_seed", "latency_source": "latency", "device_model": "device_model",
 }  # fmt: skip
+
+# Settings that a user types in several ways: by a name, a path or a URL.
+TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
 
 
 class Added(NamedTuple):
@@ -34,15 +38,19 @@ class Added(NamedTuple):
     why: str  # what was added, and why older runs have that value
 
 
-SETTINGS: Mapping[str, Added] = {
+# Of run.json beside its settings.
+MANIFEST: Mapping[str, Added] = {
     "channels": Added("2026-11-23", {}, "channel profiles became files; older runs used those that ship"),
     "networks": Added("2026-11-23", {}, "a cloud behind a measured network"),
     "schedules": Added("2026-11-23", {}, "learnt schedules, by the digest of their file"),
     "calibrations": Added("2026-11-27", {}, "corrected probabilities, by the digest of their file"),
     "helpers": Added("2026-11-23", (), "agents of their own for helpers; the ego's answered for all"),
+    "device_profile": Added("2026-11-23", None, "on-board computers that time answers by their tokens"),
+}
+# Of its settings that open nothing; the command alone stated servers and a device.
+SETTINGS: Mapping[str, Added] = {
     "temperature": Added("2026-11-23", 0.0, "sampling; all answers were greedy"),
     "sampling_seed": Added("2026-11-23", 0, "sampling"),
-    "device_profile": Added("2026-11-23", None, "on-board computers that time answers by their tokens"),
     "device_model": Added("2026-11-23", None, "the row of such a computer"),
     "ask": Added("2026-11-26", "all", "asking only helpers whose answer counts; all were asked"),
     "ties": Added("2026-11-26", "first", "drawing between the likeliest actions; the first was taken"),
@@ -148,7 +156,8 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
     What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is named
     without the settings that were typed after its name, which are among its parameters.
     """
-    settings = _agent(_with(SETTINGS, stated))
+    older = {key: SETTINGS[name].absent for key, name in BESIDE.items() if name in SETTINGS}
+    settings = _agent(_with(MANIFEST, {**older, **stated}))
     if isinstance(model := settings.get("identity"), dict):
         settings["identity"] = identity(model)
     for name, upgrade in (("helpers", _agent), ("conditions", _condition)):
@@ -161,7 +170,60 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
             world = settings["world"]
             driven = {**world["scenario"], "name": scenarios.split(name)[0]}
             settings["world"] = {**world, "scenario": driven}
+    settings["settings"] = _table(settings)
     return settings
+
+
+def _table(stated: Mapping[str, Any]) -> Any:
+    """Return the table of settings; of an older run, which has none, it is made of what stands beside it.
+
+    Raises ValueError if it says otherwise than what stands beside it.
+    """
+    beside = {name: stated[key] for key, name in BESIDE.items() if key in stated}
+    with suppress(KeyError, TypeError, AttributeError, IndexError):  # which the reader finds, and names
+        beside |= _opened(stated)
+    table = stated.get("settings", beside)
+    if not isinstance(table, Mapping):
+        return table  # for the reader to refuse
+    said = _flat(table)
+    for name, there in _flat(beside).items():
+        if name not in TYPED and said.get(name, there) != there:
+            both = f"{printable(said[name], 60)}, and beside them it is {printable(there, 60)}"
+            raise ValueError(f"its settings have {name} {both}")
+    return _with(SETTINGS, table)
+
+
+def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that opened what a run states, each as it is called there."""
+    seeds, device, world, helpers = (stated[name] for name in ("seeds", "device_profile", "world", "helpers"))
+    scenes = {"kind": world["kind"], "dataset": world.get("path"), **world.get("selection", {})}
+    if "scenario" in world:
+        scenes |= {"scenario": world["scenario"]["name"], "first_seed": world["first_seed"]}
+    return {
+        **{name: stated[name] for name in ("answer", "thinking", "image", "flip", "sums")},
+        "model": stated["model"]["name"],
+        "prompt": stated["prompt"]["version"],
+        "seeds": ",".join(map(str, seeds)) if len(seeds) > 1 else f"{seeds[0]}:{seeds[0] + 1}",
+        "condition": [point["name"] for point in stated["conditions"]],
+        "device_profile": device["name"] if device else None,
+        "world": scenes,
+        "helpers": {
+            "model": ",".join(helper["model"]["name"] for helper in helpers),
+            "prompt": helpers[0]["prompt"]["version"],
+            "answer": helpers[0]["answer"],
+        } if helpers else {},
+    }  # fmt: skip
+
+
+def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table's values by name; of a table in it by both names."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{name}.{inner}": of for inner, of in value.items()}
+        else:
+            flat[name] = list(value) if isinstance(value, tuple) else value
+    return flat
 
 
 def versions(stated: Mapping[str, str]) -> dict[str, str]:

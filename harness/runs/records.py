@@ -11,6 +11,7 @@ from harness.core.config import Seconds, convert
 from harness.core.errors import UserError
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
+from harness.runs.settings import Settings
 from harness.world import scenarios
 from harness.world.parameters import DIALS
 
@@ -482,6 +483,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     latency_source: str | None
     device_profile: Device | None
     device_model: str | None
+    settings: Settings
     latency: Latency
     answer_times: dict[str, Times] = field(default_factory=dict)
     identity: dict[str, Any]

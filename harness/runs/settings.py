@@ -24,15 +24,21 @@ CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
 
 
-def option(text: str, panel: str = "", only: str = "", listed: bool = False) -> Meta:
+# What of a setting is the same when a stopped run resumes: itself, what it opens (a run states that), or
+# nothing.
+ITSELF, OPENED, NOTHING = "itself", "opened", "nothing"
+
+
+def option(text: str, panel: str = "", only: str = "", listed: bool = False, same: str = ITSELF) -> Meta:
     """Describe a setting: its help, its panel (by default the first), the world that alone has it.
 
-    One that is `listed` is a text of several names with commas, and may be typed once for each.
+    One that is `listed` is a text of several names with commas, and may be typed once for each. `same` says
+    what of it must be the same when a stopped run resumes.
     """
-    return Meta(extra={"help": text, "panel": panel, "only": only, "listed": listed})
+    return Meta(extra={"help": text, "panel": panel, "only": only, "listed": listed, "same": same})
 
 
-class HelperSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HelperSettings(Struct, frozen=True, kw_only=True):
     """Who answers for the helpers, and how, where that is not the ego's model, prompt and mode."""
 
     model: Annotated[
@@ -74,9 +80,7 @@ UntilDecided = Annotated[
 ]
 
 
-class FrozenSettings(
-    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="frozen"
-):
+class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="frozen"):
     """The frozen episodes that are evaluated."""
 
     dataset: Annotated[
@@ -104,9 +108,7 @@ class FrozenSettings(
     until_decided: UntilDecided = None
 
 
-class DriveSettings(
-    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag="closed-loop"
-):
+class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="closed-loop"):
     """The episodes that are driven in closed loop."""
 
     scenario: Annotated[
@@ -135,7 +137,7 @@ class DriveSettings(
     until_decided: UntilDecided = None
 
 
-class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Settings(Struct, frozen=True, kw_only=True):
     """All that decides an evaluation, as plain values; a run's `run.toml` is this record.
 
     What is not checked here is checked where it is used: `resolve.spec` makes live objects of it.
@@ -146,7 +148,8 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         option(
             "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
             "hub id, the URL of a server such as http://127.0.0.1:8080/v1, or replay:RUN, which scores the "
-            "stored answers of a run again."
+            "stored answers of a run again.",
+            same=OPENED,
         ),
     ] = "proxy"
     engine: Annotated[
@@ -155,23 +158,31 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "Engine to run the model on, such as llama-cpp, if its card names several. Default: its main "
             "one.",
             ENGINE,
+            same=OPENED,
         ),
     ] = None
     prompt: Annotated[
         str | None,
-        option("Prompt version; `harness prompt list` shows them. Default: the scenario's usual one."),
+        option(
+            "Prompt version; `harness prompt list` shows them. Default: the scenario's usual one.",
+            same=OPENED,
+        ),
     ] = None
     helpers: HelperSettings = HelperSettings()
     world: FrozenSettings | DriveSettings = FrozenSettings()
     seeds: Annotated[
         str,
-        option("Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed."),
+        option(
+            "Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed.",
+            same=OPENED,
+        ),
     ] = "0:5"
     condition: Annotated[
         tuple[str, ...],
         option(
             "Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
-            "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points."
+            "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points.",
+            same=OPENED,
         ),
     ] = ()
     control: Annotated[
@@ -182,6 +193,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "nothing. Repeatable.",
             CONDITIONS,
             "frozen",
+            same=OPENED,
         ),
     ] = ()
     attack: Annotated[
@@ -191,6 +203,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` lists them. "
             "Repeatable.",
             CONDITIONS,
+            same=OPENED,
         ),
     ] = ()
     answer: Annotated[
@@ -198,16 +211,18 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         option(
             "How the model answers. json: free text with a JSON object. constrained: decoding allows only "
             "what fits the schema. readout: the intent is read from the probabilities of one letter per "
-            "action. decision: the same of a typed question, which decision models answer."
+            "action. decision: the same of a typed question, which decision models answer.",
+            same=OPENED,
         ),
     ] = "json"
-    thinking: Annotated[bool, option("Ask the model to think before it answers.")] = False
+    thinking: Annotated[bool, option("Ask the model to think before it answers.", same=OPENED)] = False
     image: Annotated[
         str,
         option(
             "Which picture an image prompt shows: own (the viewer's), blank, another (another scene's), or "
             "none (text only).",
             ANSWERS,
+            same=OPENED,
         ),
     ] = "own"
     letters: Annotated[
@@ -217,6 +232,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "orders of the list as there are actions, so that none is preferred. Default: the card's, or "
             "cyclic.",
             ANSWERS,
+            same=OPENED,
         ),
     ] = None
     flip: Annotated[
@@ -225,6 +241,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "Ask each readout or decision once more with the list of actions reversed, and count how often "
             "the likeliest action changes. It changes no decision.",
             ANSWERS,
+            same=OPENED,
         ),
     ] = False
     sums: Annotated[
@@ -233,6 +250,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "What becomes of an answer in json whose only fault is that its numbers do not sum to 1. "
             "refuse: it failed. divide: they are divided by their sum, and the summary counts it as divided.",
             ANSWERS,
+            same=OPENED,
         ),
     ] = "refuse"
     batch_size: Annotated[
@@ -247,6 +265,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. Repeat it "
             "to spread the requests over several servers.",
             ENGINE,
+            same=NOTHING,
         ),
     ] = ()
     device: Annotated[
@@ -255,6 +274,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU if there "
             "is one.",
             ENGINE,
+            same=NOTHING,
         ),
     ] = None
     dtype: Annotated[
@@ -282,6 +302,7 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "Computer in every vehicle, such as agx-orin (`harness model device list`). It times each answer "
             "by its tokens; use it instead of --latency.",
             LATENCY,
+            same=OPENED,
         ),
     ] = None
     device_model: Annotated[
@@ -310,7 +331,9 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             CONDITIONS,
         ),
     ] = None
-    tag: Annotated[tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT)] = ()
+    tag: Annotated[
+        tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT, same=NOTHING)
+    ] = ()
 
 
 class Option(NamedTuple):
@@ -323,6 +346,7 @@ class Option(NamedTuple):
     help: str
     panel: str
     listed: bool  # whether it may be typed several times, which are joined by commas
+    same: str  # what of it is the same when a stopped run resumes
 
     @property
     def flag(self) -> str:
@@ -365,10 +389,8 @@ def _options(
         if meta.extra["only"] in ("", only):
             name = f"helper_{field.name}" if table == "helpers" else field.name
             path = (table, field.name) if table else (field.name,)
-            extra = meta.extra
-            yield Option(
-                path, name, _kind(plain), field.default, extra["help"], extra["panel"], extra["listed"]
-            )
+            said = [meta.extra[key] for key in ("help", "panel", "listed", "same")]
+            yield Option(path, name, _kind(plain), field.default, *said)
 
 
 def _kind(plain: Any) -> Any:
@@ -386,6 +408,11 @@ WORLDS: dict[str, type[FrozenSettings] | type[DriveSettings]] = {
     "frozen": FrozenSettings, "closed-loop": DriveSettings,
 }  # fmt: skip
 HELP = {each.name: each.help for world in WORLDS.values() for each in options(world)}
+# The settings that open nothing, and are the same when a stopped run resumes.
+PLAIN = dict.fromkeys(
+    each.name for world in WORLDS.values() for each in options(world)
+    if len(each.path) == 1 and each.same == ITSELF
+)  # fmt: skip
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
@@ -398,6 +425,12 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
     return convert(tables, Settings, "settings")
 
 
+def deciding(settings: Settings) -> Settings:
+    """Return settings without those that may differ in one run; whoever goes on with it says them."""
+    free = {each.name: each.default for each in options(type(settings.world)) if each.same == NOTHING}
+    return structs.replace(settings, **free)
+
+
 def words(settings: Settings) -> tuple[str, ...]:
     """Return the words of a command with these settings, without `--out`; defaults are left out."""
     stated = ((each, each.of(settings)) for each in options(type(settings.world)))
@@ -408,13 +441,13 @@ def words(settings: Settings) -> tuple[str, ...]:
 def difference(before: Settings, now: Settings) -> tuple[str, str]:
     """Return the options that differ, as they are typed before and now; empty between two commands.
 
-    Tags, servers and a device may differ in one run.
+    Those that may differ in one run are left out.
     """
     if type(before.world) is not type(now.world):
         return "", ""
     differing = [
         each for each in options(type(now.world))
-        if each.of(before) != each.of(now) and each.name not in ("tag", "server", "device")
+        if each.of(before) != each.of(now) and each.same != NOTHING
     ]  # fmt: skip
     typed = (
         " ".join(" ".join(each.words(each.of(settings))) or f"no {each.flag}" for each in differing)

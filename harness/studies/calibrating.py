@@ -75,7 +75,7 @@ def calibrate(
     manifest = run.manifest
     if not isinstance(manifest.world, FrozenScenes):
         raise UserError(f"{name} was driven, and no tree says what follows; give a run of `harness eval`")
-    if manifest.helpers or manifest.temperature:
+    if manifest.helpers or manifest.settings.temperature:
         reason = "its helpers have a model of their own" if manifest.helpers else "its answers are sampled"
         raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
     data = dataset_of(run, dataset).of_episodes(run.grid.episodes)

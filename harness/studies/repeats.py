@@ -252,7 +252,7 @@ def repeats_study(repeats: Repeats) -> Study:
         [
             f"{k} repeats × {amount(len(first.seeds), 'channel seed')} of "
             f"{amount(len(repeats.runs[0].grid.episodes), 'episode')} at temperature "
-            f"{first.temperature:g}. Each repeat is a whole run with its own "
+            f"{first.settings.temperature:g}. Each repeat is a whole run with its own "
             "sampling seed, and with the same episodes and channel seeds, so they differ only in the "
             "random draws of the model's answers. 95 % intervals are over episodes. All figures are in "
             "repeats.csv."
@@ -260,13 +260,13 @@ def repeats_study(repeats: Repeats) -> Study:
         list(_tables(repeats)), {"repeats": pd.DataFrame(rows)},
         {
             "sources": [{"name": first.variant.model}], "runs": [run.path.name for run in repeats.runs],
-            "temperature": first.temperature,
-            "sampling_seeds": [run.manifest.sampling_seed for run in repeats.runs],
+            "temperature": first.settings.temperature,
+            "sampling_seeds": [run.manifest.settings.sampling_seed for run in repeats.runs],
             "dataset": source, "conditions": list(repeats.conditions), "versions": versions(),
         },
         {
             "repeats": str(repeats.path), "runs": [str(run.path) for run in repeats.runs],
-            "temperature": first.temperature, "figures": rows,
+            "temperature": first.settings.temperature, "figures": rows,
         },
         caveats=merged(
             {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
@@ -367,10 +367,10 @@ def _flip_sentence(repeats: Repeats) -> str:
     flips, once = repeats.estimate(c, FLIPS), repeats.estimate(c, SUCCESS)
     everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
-        f"Asked again at temperature {m.temperature:g}, {m.variant} decides differently in {shown(flips)} % "
-        f"of decisions under {c} (n = {flips.n} decision points). {shown(once)} % of its episodes succeed, "
-        f"{shown(everywhere)} % in all {k} repeats and {shown(anywhere)} % in at least one "
-        f"(n = {once.n} episodes)."
+        f"Asked again at temperature {m.settings.temperature:g}, {m.variant} decides differently in "
+        f"{shown(flips)} % of decisions under {c} (n = {flips.n} decision points). "
+        f"{shown(once)} % of its episodes succeed, {shown(everywhere)} % in all {k} repeats and "
+        f"{shown(anywhere)} % in at least one (n = {once.n} episodes)."
     )
 
 

@@ -180,7 +180,7 @@ def test_a_repeat_is_a_run_with_its_own_sampling_seed(
     small: Dataset, tmp_path: Path, wanderer: Wanderer
 ) -> None:
     of = repeated(hot(small, sampling_seed=4), tmp_path / "repeats", 2)
-    assert [run.manifest.sampling_seed for run in of.runs] == [4, 5]
+    assert [run.manifest.settings.sampling_seed for run in of.runs] == [4, 5]
     assert [run.path.name for run in of.runs] == ["repeat-1", "repeat-2"]
     assert all("--temperature 0.7 --sampling-seed" in run.manifest.command for run in of.runs)
 

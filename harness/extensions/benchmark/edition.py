@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from harness.backends.card import Card
 from harness.core.config import convert, toml
@@ -29,7 +29,7 @@ from harness.runs.folder import Run
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
-from harness.runs.settings import FrozenSettings, Settings, parse_seeds
+from harness.runs.settings import FrozenSettings, Settings, deciding, parse_seeds
 from harness.runs.success import Pairs, is_gain, mean_difference
 
 KIND = "editions"
@@ -138,10 +138,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         conditions = tuple(str(condition["name"]) for condition in m.conditions)
         for what, own, wanted in (
             ("conditions", conditions, self.condition), ("seeds", m.seeds, parse_seeds(self.seeds)),
-            ("latency", m.latency_source, self.latency), ("ties", m.ties, self.ties),
+            ("latency", m.settings.latency, self.latency), ("ties", m.settings.ties, self.ties),
             ("device profile", m.device_profile and m.device_profile.name, None),
             ("sums", m.sums, "refuse"), ("image", m.image, "own"), ("flip", m.flip, False),
-            ("temperature", m.temperature, 0.0), ("sampling seed", m.sampling_seed, 0),
+            ("temperature", m.settings.temperature, 0.0), ("sampling seed", m.settings.sampling_seed, 0),
         ):  # fmt: skip
             if own != wanted:
                 yield f"its {what}: {printable(own)}, not {printable(wanted)}"
@@ -155,10 +155,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
-        settings = Settings(
-            batch_size=m.batch_size, temperature=m.temperature, sampling_seed=m.sampling_seed,
-            latency=self.latency, ask=m.ask, ties=self.ties,
-        )  # fmt: skip
+        own = deciding(m.settings)
+        settings = structs.replace(own, latency=self.latency, ties=self.ties, device_model=None)
         return Spec(ego, source, points, parse_seeds(self.seeds), settings=settings)
 
     def _differs(self, what: str, here: str, stated: str) -> UserError:
@@ -170,7 +168,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def _agent(m: Manifest) -> dict[str, Any]:
     """Return who answered, and how; prompts may differ by family."""
-    stated = {**m.agent(0), "temperature": m.temperature}
+    stated = {**m.agent(0), "temperature": m.settings.temperature}
     return {key: value for key, value in stated.items() if key != "prompt"}
 
 

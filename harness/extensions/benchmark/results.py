@@ -30,6 +30,7 @@ from harness.core.files import (
 from harness.runs.folder import Run, csv_text
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
+from harness.runs.settings import FrozenSettings, deciding
 
 FORMAT = "swarmdrive-results/1"
 CONTENTS = "results.json"
@@ -84,7 +85,11 @@ def _files(
     for name, run in runs.items():
         world = run.manifest.world
         assert isinstance(world, FrozenScenes)
-        manifest = replace(run.manifest, name=name, command="", tags=(), world=replace(world, path=name))
+        scenes = FrozenSettings(dataset=name, limit=world.limit)
+        settings = replace(deciding(run.manifest.settings), world=scenes)
+        manifest = replace(
+            run.manifest, name=name, command="", tags=(), world=replace(world, path=name), settings=settings
+        )
         yield f"{name}/run.json", msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
         for file in ("answers.jsonl", "episodes.csv"):
             yield f"{name}/{file}", bytes_of(run.path / file, "rows")

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import evaluating
 import numpy as np
 import pytest
-from run_on_disk import Row, made_up
+from run_on_disk import Row, made_up, restated
 
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
@@ -176,7 +176,8 @@ def drop(files: dict[str, bytes]) -> None:
 
 def with_run(**changes: object) -> Change:
     def change(files: dict[str, bytes]) -> None:
-        files["small/run.json"] = json.dumps(json.loads(files["small/run.json"]) | changes).encode()
+        stated = restated(json.loads(files["small/run.json"]), changes)
+        files["small/run.json"] = json.dumps(stated).encode()
 
     return change
 
