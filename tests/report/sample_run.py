@@ -5,6 +5,7 @@ from itertools import chain
 
 import msgspec
 from evaluating import all_scenes, says, spec_of
+from run_on_disk import restated
 
 from harness.backends.base import Completion
 from harness.core.versions import FIGURES
@@ -44,7 +45,7 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     }  # fmt: skip
     folder.write(
         out,
-        msgspec.convert(formats.upgraded(msgspec.to_builtins({**manifest, **stated})), Manifest),
+        msgspec.convert(formats.upgraded(msgspec.to_builtins(restated(manifest, stated))), Manifest),
         decisions,
         episodes,
         [folder.lines(folder.ordered(answers, decisions))],

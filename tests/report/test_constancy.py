@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from run_on_disk import configure
 
 from harness.dataset.load import Dataset
 from harness.report.caveats import causes
@@ -49,8 +50,7 @@ def test_who_holds_every_action_for_equally_likely_drives_as_uniform(small: Data
     [sentence] = said(small, tmp_path / "run", "uniform", "llama-cpp")
     assert "SLOWER, IDLE, FASTER are equally likely in" in sentence
     assert sentence.endswith("Without messages it drives as the driver `uniform`, which needs no model.")
-    record = json.loads((tmp_path / "run/run.json").read_text())
-    (tmp_path / "run/run.json").write_text(json.dumps({**record, "ties": "first"}))
+    configure(tmp_path / "run", ties="first")
     [sentence] = ignores_input(folder.read(tmp_path / "run"))
     assert sentence.endswith("drives as the driver `brake`, which needs no model.")
 
