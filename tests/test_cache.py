@@ -400,7 +400,7 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    from harness.training import gguf_export
+    from harness.backends import gguf_export
 
     folder = tiny_qwen3.build(tmp_path / "tiny", context_tokens=2048)
     gguf_export.export(folder, tmp_path / "tiny.gguf", "F32")

@@ -15,9 +15,9 @@ pytest.importorskip("transformers", reason="needs the transformers extra")
 import tiny_qwen3
 from gguf import GGUFReader, TokenType
 
+from harness.backends.gguf_export import export
 from harness.backends.tokens import tokenizer
 from harness.core.errors import UserError
-from harness.training.gguf_export import export
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

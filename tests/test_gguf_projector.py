@@ -15,8 +15,8 @@ import tiny_vl
 from gguf import GGUFReader
 from test_gguf_export import edit, remove, save_weights, tensors, weights_of
 
+from harness.backends.gguf_export import export, projector_of
 from harness.core.errors import UserError
-from harness.training.gguf_export import export, projector_of
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

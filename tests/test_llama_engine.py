@@ -24,6 +24,7 @@ from test_transformers_engine import COMMIT, REQUESTS, ask, open_tiny, said
 from harness.backends import registry
 from harness.backends.base import Request
 from harness.backends.card import Card, Latency
+from harness.backends.gguf_export import export
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.llama_cpp.engine import LlamaEngine, LlamaSession, open_here
@@ -36,7 +37,6 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
 from harness.prompts import readout
-from harness.training.gguf_export import export
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

@@ -26,6 +26,7 @@ from test_eyes import drawn
 
 from harness.backends.base import Request
 from harness.backends.card import Card, Latency
+from harness.backends.gguf_export import export, projector_of
 from harness.backends.llama_cpp.engine import LlamaEngine, open_here
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.llama_cpp.projector import Projector
@@ -36,7 +37,6 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.core.image import Image
-from harness.training.gguf_export import export, projector_of
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

@@ -96,7 +96,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("torch", reason="needs the transformers extra")
     import tiny_qwen3
 
-    from harness.training import gguf_export
+    from harness.backends import gguf_export
 
     folder = tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=4096)
     gguf_export.export(folder, folder / "tiny-f32.gguf", "F32")

@@ -39,7 +39,7 @@ def gguf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from safetensors.torch import load_file, save_file
     from tokenizers import Tokenizer
 
-    from harness.training.gguf_export import export
+    from harness.backends.gguf_export import export
 
     folder = tiny_qwen3.build(tmp_path_factory.mktemp("served") / "tiny", context_tokens=2048)
     ids = Tokenizer.from_file(str(folder / "tokenizer.json"))

@@ -86,7 +86,7 @@ def card(request: pytest.FixtureRequest, tiny: Path) -> Card:
     if request.param == "transformers":
         return resolve(str(tiny))
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    from harness.training.gguf_export import export
+    from harness.backends.gguf_export import export
 
     export(tiny, tiny.parent / "tiny.gguf", "F32")
     return resolve(str(tiny.parent / "tiny.gguf"))

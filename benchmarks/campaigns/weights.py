@@ -12,7 +12,7 @@ from pathlib import Path
 
 from judging import TESTS, Tally, dataset, typed, workshop
 
-from harness.training.gguf_export import export
+from harness.backends.gguf_export import export
 
 sys.path.append(str(TESTS))
 import tiny_qwen3

@@ -10,6 +10,7 @@ import torch
 import transformers
 
 from harness.backends.card import Card
+from harness.backends.gguf_export import export
 from harness.backends.registry import locate
 from harness.core import work
 from harness.core.errors import UserError, printable
@@ -18,7 +19,6 @@ from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.prompts.versions import Prompt
 from harness.training import published
-from harness.training.gguf_export import export
 from harness.training.lessons import draw
 from harness.training.model import WEIGHTS, save_tokenizer
 from harness.training.student import Progress, Student

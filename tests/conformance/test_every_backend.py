@@ -13,12 +13,12 @@ from misbehaving import Asked, completion, read_out, serving
 
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Backend, Completion, Request
+from harness.backends.gguf_export import export
 from harness.backends.openai.constraint import broken
 from harness.backends.registry import BUILT_IN, capabilities, missing, open_backend
 from harness.core.files import digest
 from harness.dataset.load import load
 from harness.evaluate.asking import requests
-from harness.training.gguf_export import export
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 

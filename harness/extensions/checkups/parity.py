@@ -15,6 +15,7 @@ import numpy as np
 
 from harness.backends.base import Backend, Request
 from harness.backends.card import Card
+from harness.backends.gguf_export import export, projector_of
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp import backend as llama_backend
 from harness.backends.llama_cpp.backend import LlamaBackend
@@ -23,7 +24,6 @@ from harness.backends.transformers.engine import TransformersEngine
 from harness.core.arrays import Floats
 from harness.core.errors import Unanswered, UserError, printable
 from harness.parsing.parse import parse
-from harness.training.gguf_export import export, projector_of
 
 LEAST_TEXTS, MOST_READOUT = 0.98, 0.02
 # Other formats are measured, and have no limit. Of a picture llama.cpp rounds pixels, the weights of their

@@ -19,11 +19,11 @@ from evaluating import scenes_of, spec_of
 from typer.testing import CliRunner
 
 from harness.backends import cards
+from harness.backends.gguf_export import export
 from harness.cli import app
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import requests
 from harness.extensions.checkups.parity import PASSES, Finding, compare
-from harness.training.gguf_export import export
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.backends.cards import PROJECTOR
+from harness.backends.saved_qwen3 import Saved, numbers, read, rope
 from harness.core.errors import UserError, printable
 from harness.core.files import replacing
-from harness.training.saved_qwen3 import Saved, numbers, read, rope
 
 Dtype = Literal["F16", "F32"]
 _ENDS = {"embed_tokens": "token_embd", "norm": "output_norm"}
