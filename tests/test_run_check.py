@@ -182,6 +182,12 @@ def called(run: Path) -> None:
     configure(run, world={**world, "name": "hard"})
 
 
+def latency(run: Path, **stated: object) -> None:
+    """State other times, or another source of them."""
+    before = json.loads((run / "run.json").read_text())["latency"]
+    configure(run, latency={**before, **stated})
+
+
 def sooner(run: Path) -> None:
     """State that a latency is the card's."""
     stated = json.loads((run / "run.json").read_text())
@@ -206,6 +212,16 @@ OF_THE_RUN = {
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
     "a radio's name": (renamed, "run.json has other settings of v2x than that name says"),
     "which layouts": (picked, "episodes.csv has other episodes than run.json says that were selected"),
+    "the paper's latency": (
+        lambda run: latency(run, source="paper", ego_s=0.02),
+        "run.json has another latency than the paper, which it names as the source",
+    ),
+    "a latency of helpers": (
+        lambda run: latency(run, helper_s=0.02), "run.json has another latency of the helpers than of",
+    ),
+    "a latency of fusion": (
+        lambda run: latency(run, fusion_s=0.02), "run.json has another latency of a fusion call than of the",
+    ),
     "a latency's source": (sooner, "run.json has another latency than its model's card"),
     "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
 }  # fmt: skip

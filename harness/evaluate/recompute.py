@@ -181,6 +181,14 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
     latency = stated.manifest.latency
     if latency.source == "card" and card.latency.inference_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
+    if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
+        yield "run.json has another latency than the paper, which it names as the source"
+    if latency.source in ("card", "paper"):
+        others = {"a fusion call": latency.fusion_s}
+        if not stated.manifest.helpers:
+            others["the helpers"] = latency.helper_s
+        for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
+            yield f"run.json has another latency of {whose} than of the ego, whose source it names"
     if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
         yield "run.json says of a driver that it sees other than it does"
 
