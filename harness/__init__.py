@@ -9,9 +9,9 @@ from harness.core.errors import UserError
 
 if TYPE_CHECKING:
     from harness.api import compare, environment, load, ls, run, sweep
-    from harness.core.extensions import Extension
+    from harness.core.extensions import Extension, Setting
 
-__all__ = ["Extension", "UserError", "compare", "environment", "load", "ls", "run", "sweep"]
+__all__ = ["Extension", "Setting", "UserError", "compare", "environment", "load", "ls", "run", "sweep"]
 __version__ = "0.3.0"
 
 
@@ -20,10 +20,10 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "Extension":
+    if name in ("Extension", "Setting"):
         from harness.core import extensions
 
-        return extensions.Extension
+        return getattr(extensions, name)
     if name in __all__:  # loaded at first use, since pandas and the report take time
         from harness import api
 

@@ -30,6 +30,7 @@ def folder(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
     assert dir(harness) == [
         "Extension",
+        "Setting",
         "UserError",
         "__version__",
         "compare",
@@ -42,7 +43,7 @@ def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(
-        AttributeError, match="no attribute 'evaluation'; it has Extension, UserError, compare"
+        AttributeError, match="no attribute 'evaluation'; it has Extension, Setting, UserError, compare"
     ):
         _ = harness.evaluation
 

@@ -59,16 +59,27 @@ def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: P
     pip = [sys.executable, "-m", "pip", "install", *options, "--target", str(site)]
     subprocess.run([*pip, str(of_the_page(tmp_path / "package"))], check=True)
     asked = ("--model", "proxy", "--condition", "6g", "--seeds", "0:2", "--dataset", str(two_path))
-    assert in_process(site, tmp_path, "eval", *asked, "--quiet", "--out", "reports/run") == (0, "", "")
+    typed = ("--doubt-above", "0.25", "--quiet", "--out", "reports/run")
+    assert in_process(site, tmp_path, "eval", *asked, *typed) == (0, "", "")
+    stated = tomllib.loads((tmp_path / "reports" / "run" / "run.toml").read_text())
+    assert stated["extensions"] == {"doubt_above": 0.25}
+    manifest = json.loads((tmp_path / "reports" / "run" / "run.json").read_text())
+    assert manifest["settings"]["extensions"] == {"doubt_above": 0.25}
+    assert "--doubt-above 0.25" in manifest["command"]
     page = (tmp_path / "reports" / "run" / "report.html").read_text()
     assert "<h2>Doubt</h2>" in page
     assert page.count("Decisions in doubt") == 2  # its head, and the name of its region
+    assert "decisions have a normalised entropy above 0.25." in page
+    again = in_process(site, tmp_path, "eval", "reports/run", "--quiet", "--out", "reports/again")
+    assert again == (0, "", "")
+    other = tmp_path / "reports" / "again" / "run.json"
+    assert json.loads(other.read_text())["settings"]["extensions"] == {"doubt_above": 0.25}
     assert "doubt_rate" in (tmp_path / "reports" / "run" / "summary.csv").read_text()
     code, out, err = in_process(site, tmp_path, "study", "doubt", "reports/run", "--out", "reports/doubt")
     assert (code, err) == (0, "")
     assert out.startswith("Doubt of run\n1 of 1 conditions have the metric.\n")
     listed = json.loads(in_process(site, tmp_path, "run", "ls", "--json")[1])
-    assert {one["name"]: one["kind"] for one in listed} == {"run": "eval", "doubt": "doubt"}
+    assert {one["name"]: one["kind"] for one in listed} == {"run": "eval", "again": "eval", "doubt": "doubt"}
     assert "\n  doubt " in in_process(site, tmp_path, "study", "--help")[1]
 
 
@@ -79,7 +90,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Installed:
     def put(**extensions: str) -> None:
         entries = "".join(f"{name} = of_others:{name.upper()}\n" for name in extensions)
         made = "".join(f"{name.upper()} = {text}\n" for name, text in extensions.items())
-        source = f"from harness import Extension\n{made}"
+        source = f"from harness import Extension, Setting\n{made}"
         register(tmp_path / "site", f"[{known.GROUP}]\n{entries}", of_others=source)
         monkeypatch.syspath_prepend(tmp_path / "site")
         monkeypatch.delitem(sys.modules, "of_others", raising=False)
@@ -97,6 +108,9 @@ ODD = {
     'Extension(name="odd", commands={"study  x": "x:y"})': "nobody can type 'study  x' of its commands",
     'Extension(name="odd", studies={"../x": "x"})': "extension odd: nobody can type '../x' of its studies",
     'Extension(name="odd", spellings={"old": ""})': "extension odd: nobody can type '' of its spellings",
+    'Extension(name="odd", settings={"level": 3})': "extension odd: its settings are no table of Setting",
+    'Extension(name="odd", settings={"a": Setting(int, "x", "")})': "its settings are no table of Setting",
+    'Extension(name="odd", settings={"A b": Setting(int, 1, "")})': "its settings are no table of Setting",
     "1 / 0": "plug-in 'odd' (swarmdrive.extensions): of_others:ODD does not load (division by zero)",
     "Extension": "is of type type and no Extension",
     "exit()": "ends the program (SystemExit",
@@ -183,6 +197,20 @@ def test_a_command_of_a_package_lies_in_any_module_and_its_failures_are_one_line
     assert (code, err) == (0, "")
     assert "its package does not work" in out
     assert "Help it." in out
+
+
+def test_a_file_sets_what_an_installed_extension_has_and_to_its_kind(
+    installed: Installed, harness: Typed
+) -> None:
+    installed(odd='Extension(name="odd", settings={"level": Setting(float, 1.0, "h")})')
+    for text, said in {
+        "level = 'x'": "settings stated.toml: level = 'x'; allowed: float",
+        "none = 2": "settings stated.toml: none is a setting of an extension that is not installed; install",
+    }.items():
+        Path("stated.toml").write_text(f"[extensions]\n{text}\n")
+        code, out, err = harness("eval", "stated.toml")
+        assert (code, out) == (2, "")
+        assert said in err
 
 
 def test_another_package_takes_no_name_of_what_ships(installed: Installed, harness: Typed) -> None:

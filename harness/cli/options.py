@@ -201,7 +201,7 @@ def takes(
         settings = [
             _parameter(each._replace(help=help.get(each.name, each.help)))
             for each in stated.options(world)
-            if each.name not in without
+            if each.name not in (*without, *inspect.signature(command).parameters)
         ]
         names = [each.name for each in settings]
         listed = {each.name for each in stated.options(world) if each.listed}

@@ -26,6 +26,15 @@ TYPED = ("commands", "groups", "studies", "spellings", "short")  # tables of wha
 Texts = Mapping[str, str]
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a run that an extension adds: an option of `harness eval` and `harness drive`."""
+
+    kind: type  # str, int, float or bool
+    default: str | int | float | bool
+    help: str  # a sentence for people
+
+
 @dataclass(frozen=True, kw_only=True)
 class Extension:
     """What a package adds. A place is `module:name`, imported when it is first used."""
@@ -40,6 +49,8 @@ class Extension:
     short: Texts = field(default_factory=dict)  # what is short for one of its commands, for good
     # kinds of study that it writes, and what lists call them; `<kind>.json` marks such a folder
     studies: Texts = field(default_factory=dict)
+    # settings of a run by the name of their option, with `_`; a run's `settings.extensions` has their values
+    settings: Mapping[str, Setting] = field(default_factory=dict)
     # plug-ins by kind, such as `rules` or `metrics`, and by name; the value is a place
     adds: Mapping[str, Texts] = field(default_factory=dict)
 
@@ -60,7 +71,7 @@ def owner(command: str) -> str | None:
     return None
 
 
-def joined(core: Texts, kind: str) -> Texts:
+def joined(core: Texts, kind: str) -> Mapping[str, Any]:
     """Return a table of the core, such as its commands, with what extensions add to it.
 
     What is there already is not replaced; a line on stderr says so, once.
@@ -129,6 +140,10 @@ def _checked(name: str, extension: Extension) -> Extension:
         raise UserError(f"{what} calls itself {printable(extension.name)}; give both the same name")
     for table in fields(Extension)[2:]:
         value = getattr(extension, table.name)
+        if table.name == "settings":
+            if not (isinstance(value, Mapping) and all(map(_is_setting, value, value.values()))):
+                raise UserError(f"{what}: its settings are no table of Setting; repair its package")
+            continue
         tables = [*value.values()] if table.name == "adds" and isinstance(value, Mapping) else [value]
         if not all(map(_is_texts, tables)):
             raise UserError(f"{what}: its {table.name} are no table of texts; repair its package")
@@ -147,9 +162,22 @@ def _is_texts(table: Any) -> bool:
     return isinstance(table, Mapping) and all(isinstance(text, str) for text in (*table, *table.values()))
 
 
+def _is_setting(name: Any, setting: Any) -> bool:
+    """Return whether this is a setting that can be typed, with a default of its kind."""
+    return (
+        isinstance(name, str)
+        and name.isidentifier()
+        and name.islower()
+        and isinstance(setting, Setting)
+        and setting.kind in (str, int, float, bool)
+        and type(setting.default) is setting.kind
+        and isinstance(setting.help, str)
+    )
+
+
 @cache
-def _joined(core: tuple[tuple[str, str], ...], kind: str, path: tuple[str, ...]) -> Texts:
-    table = dict(core)
+def _joined(core: tuple[tuple[str, Any], ...], kind: str, path: tuple[str, ...]) -> Mapping[str, Any]:
+    table: dict[str, Any] = dict(core)
     for extension in extensions().values():
         for name, value in getattr(extension, kind).items():
             if name in table or (kind == "commands" and taken(name, table)):

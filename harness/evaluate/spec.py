@@ -33,7 +33,7 @@ from harness.runs.devices import Device
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
-from harness.runs.settings import DriveSettings, FrozenSettings, HelperSettings, Settings
+from harness.runs.settings import DriveSettings, FrozenSettings, HelperSettings, Settings, of_extensions
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
@@ -438,6 +438,8 @@ class Spec:
             "letters": self._letters,
             "device_profile": self.device_profile.name if self.device_profile else None,
             "ties": self.ties,
+            "extensions": {name: its.default for name, its in of_extensions().items()}
+            | self.settings.extensions,
             "tag": tuple(dict.fromkeys(self.settings.tag)),
         }
 

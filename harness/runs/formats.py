@@ -54,6 +54,7 @@ SETTINGS: Mapping[str, Added] = {
     "device_model": Added("2026-11-23", None, "the row of such a computer"),
     "ask": Added("2026-11-26", "all", "asking only helpers whose answer counts; all were asked"),
     "ties": Added("2026-11-26", "first", "drawing between the likeliest actions; the first was taken"),
+    "extensions": Added("2026-11-29", {}, "settings of extensions; there were none"),
 }
 # Of the ego's agent, in run.json itself, and of each of `helpers`.
 AGENT: Mapping[str, Added] = {

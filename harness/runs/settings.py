@@ -12,13 +12,16 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 
 from msgspec import Meta, Struct, structs, to_builtins
 
+from harness.core import extensions
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable
+from harness.core.extensions import Setting
 from harness.core.resources import DATASET, names
 
 FILE = "run.toml"
 COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
 MOST_SEEDS = 1000
+EXTENSIONS = "extensions"  # the table of settings that extensions add
 
 CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
@@ -334,6 +337,7 @@ class Settings(Struct, frozen=True, kw_only=True):
     tag: Annotated[
         tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT, same=NOTHING)
     ] = ()
+    extensions: dict[str, str | int | float | bool] = {}  # what extensions add, by the name of the option
 
 
 class Option(NamedTuple):
@@ -358,6 +362,8 @@ class Option(NamedTuple):
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
+        if self.path[0] == EXTENSIONS:
+            return settings.extensions.get(self.name, self.default)
         for name in self.path:
             settings = getattr(settings, name)
         return settings
@@ -371,10 +377,25 @@ class Option(NamedTuple):
 
 
 def options(world: type[Struct]) -> list[Option]:
-    """Return the options of the command that walks a world, in the order of the fields."""
-    return [
-        *_options(Settings, str(world.__struct_config__.tag), {"helpers": HelperSettings, "world": world})
+    """Return the options of the command that walks a world, in the order of the fields; extensions' last."""
+    core = core_options(world)
+    added = [
+        Option((EXTENSIONS, name), name, its.kind, its.default, its.help, "Extensions", False, ITSELF)
+        for name, its in of_extensions().items()
     ]
+    return core + added
+
+
+def core_options(world: type[Struct]) -> list[Option]:
+    """Return the options of the core alone."""
+    tables: dict[str, type[Struct]] = {"helpers": HelperSettings, "world": world}
+    return [*_options(Settings, str(world.__struct_config__.tag), tables)]
+
+
+def of_extensions() -> dict[str, Setting]:
+    """Return the settings that extensions add, by name; one of the core's names is left out, with a line."""
+    joined = extensions.joined(HELP, "settings")
+    return {name: setting for name, setting in joined.items() if name not in HELP}
 
 
 def _options(
@@ -384,6 +405,8 @@ def _options(
     for field in structs.fields(kind):
         if field.name in tables:
             yield from _options(tables[field.name], only, {}, field.name)
+            continue
+        if field.name == EXTENSIONS:
             continue
         plain, meta = get_args(hints[field.name])
         if meta.extra["only"] in ("", only):
@@ -407,12 +430,12 @@ def kind_of(settings: Settings) -> str:
 WORLDS: dict[str, type[FrozenSettings] | type[DriveSettings]] = {
     "frozen": FrozenSettings, "closed-loop": DriveSettings,
 }  # fmt: skip
-HELP = {each.name: each.help for world in WORLDS.values() for each in options(world)}
+HELP = {each.name: each.help for world in WORLDS.values() for each in core_options(world)}
 # The settings that open nothing, and are the same when a stopped run resumes.
 PLAIN = dict.fromkeys(
-    each.name for world in WORLDS.values() for each in options(world)
+    each.name for world in WORLDS.values() for each in core_options(world)
     if len(each.path) == 1 and each.same == ITSELF
-)  # fmt: skip
+) | {EXTENSIONS: None}  # fmt: skip
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
@@ -481,7 +504,9 @@ def text_of(settings: Settings) -> str:
     beside = [word for own in _only_typed(settings).values() for word in own]
     again = _again(settings, Path(FILE), beside)
     lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
-    tables: dict[str, list[str]] = {"": [], "helpers": [], "world": [f"kind = {_toml(kind_of(settings))}"]}
+    tables: dict[str, list[str]] = {
+        "": [], "helpers": [], "world": [f"kind = {_toml(kind_of(settings))}"], EXTENSIONS: [],
+    }  # fmt: skip
     for each in options(type(settings.world)):
         if (value := each.of(settings)) not in (None, ()):
             *table, key = each.path
@@ -537,6 +562,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     settings = changed(_as_driven(convert(tables, Settings, where), file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
+    _check_extensions(settings, where)
     own = {name: words for name, words in _only_typed(settings).items() if name not in given}
     if own:
         flag, value, *_ = beside = [word for words in own.values() for word in words]
@@ -547,6 +573,20 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         )
         raise UserError(f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`")
     return settings
+
+
+def _check_extensions(settings: Settings, where: str) -> None:
+    """Raise UserError if a file sets what no extension has, or to another kind of value."""
+    known = of_extensions()
+    for name, value in settings.extensions.items():
+        if name not in known:
+            raise UserError(
+                f"{where}: {printable(name)} is a setting of an extension that is not installed; install "
+                "that, or leave the setting out"
+            )
+        kind = known[name].kind
+        if type(value) is not kind and not (kind is float and type(value) is int):
+            raise UserError(f"{where}: {name} = {printable(repr(value))}; allowed: {kind.__name__}")
 
 
 def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str, Any]:
