@@ -196,6 +196,7 @@ def test_a_run_stops_when_it_differs_from_another(small: Dataset, tmp_path: Path
     assert "by an interval of every look" in said
 
 
+@pytest.mark.slow
 def test_a_driven_run_is_held_against_one_of_the_same_scenes(tmp_path: Path) -> None:
     spec = live_spec_of("constant", 2, points=(POINTS["single-local"],), seeds=(0,))
     run(spec, tmp_path / "base")
