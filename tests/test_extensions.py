@@ -11,12 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from evaluating import A_TENTH, spec_of
 from packaged import register
 from reference import DOCS, blocks
 
 from harness.cli.commands import COMMANDS
 from harness.core import extensions as known
+from harness.core.errors import UserError
 from harness.core.extensions import Extension
+from harness.core.work import working
+from harness.dataset.load import Dataset
+from harness.evaluate.lifecycle import begin, unfinished
 from harness.runs.metrics import METRICS, entry
 
 ROOT = Path(__file__).parents[1]
@@ -305,3 +310,17 @@ def test_a_command_that_is_gone_says_what_it_was_part_of(core: Path, tmp_path: P
 def test_the_core_names_no_command_of_an_extension() -> None:
     assert not set(COMMANDS) & set(ENTRIES[known.COMMANDS])
     assert isinstance(Extension(name="x"), Extension)
+
+
+def test_a_stopped_run_resumes_with_an_extensions_setting_as_it_was(
+    installed: Installed, small: Dataset, tmp_path: Path
+) -> None:
+    installed(odd='Extension(name="odd", settings={"level": Setting(int, 1, "h")})')
+    spec = spec_of(small)
+    start = begin(spec, tmp_path / "run", None, {}, A_TENTH)
+    assert start.settings["settings"]["extensions"] == {"level": 1}
+    with working(tmp_path / "run", start):
+        pass
+    assert unfinished(spec, tmp_path / "run") is not None
+    with pytest.raises(UserError, match="was begun with --level 1, and not with --level 2"):
+        unfinished(spec.changed(extensions={"level": 2}), tmp_path / "run")

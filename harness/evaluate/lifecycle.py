@@ -19,7 +19,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
 from harness.runs.records import Latency, Looks, Manifest, Score
-from harness.runs.settings import PLAIN, difference, of_words, words
+from harness.runs.settings import EXTENSIONS, PLAIN, difference, of_words, words
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -170,6 +170,7 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
             key: value for key, value in settings.items() if key not in ("world", "settings", *formats.BESIDE)
         },
         **{key: value for key, value in plain.items() if key in PLAIN},
+        **_named(plain.get(EXTENSIONS)),
         **{f"{key} of the world": value for key, value in world.items() if key != "path"},
     }
 

@@ -435,7 +435,7 @@ HELP = {each.name: each.help for world in WORLDS.values() for each in core_optio
 PLAIN = dict.fromkeys(
     each.name for world in WORLDS.values() for each in core_options(world)
     if len(each.path) == 1 and each.same == ITSELF
-) | {EXTENSIONS: None}  # fmt: skip
+)  # fmt: skip
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
