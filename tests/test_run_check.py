@@ -343,6 +343,14 @@ def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
 
 
 @pytest.mark.slow
+def test_a_latency_of_a_driven_run_is_held_against_its_source(drive: Path, harness: Harness) -> None:
+    latency(drive, source="paper", ego_s=0.02)
+    code, out, _ = harness("run", "check", drive)
+    assert code == 1
+    assert "another latency than the paper, which it names as the source" in " ".join(out.split())
+
+
+@pytest.mark.slow
 def test_a_driven_run_that_cannot_be_driven_again_says_so(
     drive: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:

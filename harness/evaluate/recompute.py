@@ -158,6 +158,7 @@ def driven_otherwise(run: Run) -> Iterator[str]:
     """
     from harness.evaluate.replay import driven_again, played
 
+    yield from _of_latency(run)
     for stated in drawn(run):
         here = driven_again(played(run, stated.episode, stated.condition, stated.seed))
         for name, _ in differing([stated], [here]):
@@ -181,16 +182,22 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
     latency = stated.manifest.latency
     if latency.source == "card" and card.latency.inference_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
+    yield from _of_latency(stated)
+    if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
+        yield "run.json says of a driver that it sees other than it does"
+
+
+def _of_latency(run: Run) -> Iterator[str]:
+    """Yield what a run's latencies are otherwise than the source that it names for them."""
+    latency = run.manifest.latency
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}
-        if not stated.manifest.helpers:
+        if not run.manifest.helpers:
             others["the helpers"] = latency.helper_s
         for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
             yield f"run.json has another latency of {whose} than of the ego, whose source it names"
-    if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
-        yield "run.json says of a driver that it sees other than it does"
 
 
 def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
