@@ -8,8 +8,10 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from evaluating import A_TENTH, spec_of
 from packaged import register
@@ -22,6 +24,8 @@ from harness.core.extensions import Extension
 from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import begin, unfinished
+from harness.report import sections
+from harness.runs import metrics
 from harness.runs.metrics import METRICS, entry
 
 ROOT = Path(__file__).parents[1]
@@ -177,6 +181,16 @@ def test_what_a_package_prints_as_it_loads_is_no_output_of_a_command(
     code, out, err = harness("model", "list", "--json")
     assert (code, err) == (0, "hello\n")
     assert json.loads(out)
+
+
+def test_what_sections_and_metrics_print_is_no_output_of_a_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sections, "SECTIONS", {"loud": lambda run: print("from a section")})
+    assert sections._written("loud", None) is None
+    loud = replace(METRICS["success_rate"], name="loud")
+    assert list(metrics._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [0.0, 0.0]
+    assert capsys.readouterr() == ("", "from a section\nfrom a metric\n")
 
 
 def test_a_panel_may_name_what_is_not_there(installed: Installed, harness: Typed) -> None:

@@ -4,7 +4,9 @@ An extension adds one by `adds={"sections": {"name": "module:function"}}`. The f
 and returns a `Section`, or None where it has nothing to say of that run.
 """
 
+import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 
 from markupsafe import Markup
 
@@ -30,7 +32,7 @@ def sections(runs: Runs) -> list[tuple[str, Markup]]:
 
 def _written(name: str, run: Run) -> tuple[str, Markup] | None:
     try:
-        with strangers(f"section {printable(name)}"):
+        with strangers(f"section {printable(name)}"), redirect_stdout(sys.stderr):
             section = SECTIONS[name](run)
             return None if section is None else (section.title, _content(section))
     except Exception as error:  # a package's code

@@ -6,6 +6,7 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, Protocol, get_args
@@ -514,7 +515,7 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
         return values()
     what = f"metric {printable(metric.name)} of a package"
     try:
-        with strangers(what):
+        with strangers(what), redirect_stdout(sys.stderr):
             found = values()
         if found.shape != (n,):
             raise ValueError(f"it has values of shape {found.shape}, not ({n},)")
