@@ -10,7 +10,7 @@ from typing import Any
 import verifiers.v1 as vf
 
 import harness
-from harness.learning.asking import READ_BY, earned, intent
+from harness.extensions.learn.rewards.asking import READ_BY, earned, intent
 
 __all__ = ["SwarmdriveTrees"]
 

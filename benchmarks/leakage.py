@@ -29,7 +29,7 @@ from harness.core.arrays import Floats
 from harness.core.seeds import FIRST
 from harness.dataset.freeze import record_of
 from harness.dataset.load import Dataset, find, load
-from harness.learning.layouts import trees
+from harness.extensions.learn.rewards.layouts import trees
 from harness.runs.records import Score
 from harness.world.scenario import Scenario
 from harness.world.scene_numbers import numbers

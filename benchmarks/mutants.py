@@ -45,7 +45,6 @@ ROOMS = (
     "serving",
     "report",
     "studies",
-    "learning",
     "cli",
 )
 FIRST = 40  # tests that are tried before the others which run the line

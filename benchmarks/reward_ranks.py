@@ -27,7 +27,7 @@ from harness.core.arrays import Floats
 from harness.dataset.load import Dataset
 from harness.evaluate import latency, resolve
 from harness.evaluate.asking import Asker
-from harness.learning.values import balanced
+from harness.extensions.learn.rewards.values import balanced
 from harness.runs import settings
 from harness.world import drivers
 

@@ -9,9 +9,9 @@ def main() -> None:
 
 
 def _program() -> None:
-    from harness import cli
+    from harness.cli import main
 
-    cli.main()
+    main()
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from evaluating import A_TENTH, spec_of
 from packaged import register
 from reference import DOCS, blocks
 
+import harness as package
 from harness.cli.commands import COMMANDS
 from harness.core import extensions as known
 from harness.core.errors import UserError
@@ -254,12 +255,29 @@ def test_what_extensions_add_is_found_like_what_the_core_has(
     assert "success_again" in METRICS
 
 
+def test_a_package_adds_a_name_for_python_and_replaces_none(
+    installed: Installed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known.PYTHON, "_loaded", {})
+    names = dict.fromkeys(("answer", "load"), "of_others:ANSWER")
+    installed(odd=f'Extension(name="odd", adds={{"python": {names}}})')
+    source = Path(sys.path[0]) / "of_others.py"
+    source.write_text(f"{source.read_text()}\nANSWER = 42\n")
+    assert package.answer == 42
+    assert package.load.__module__ == "harness.api"
+    assert "answer" in dir(package)
+
+
 @pytest.mark.parametrize("name", ENTRIES[known.GROUP])
 def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     """They say what a command or study was part of where its folder is gone."""
     extension = known.extensions()[name]
     assert ENTRIES[known.GROUP][name] == f"{known.OURS}{name}:EXTENSION"
-    for group, names in ((known.COMMANDS, extension.commands), (known.STUDIES, extension.studies)):
+    for group, names in (
+        (known.COMMANDS, extension.commands),
+        (known.STUDIES, extension.studies),
+        (known.NAMES, extension.adds.get("python", {})),
+    ):
         named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{known.OURS}{name}"}
         assert named == set(names)
 
@@ -319,6 +337,24 @@ def test_a_command_that_is_gone_says_what_it_was_part_of(core: Path, tmp_path: P
     assert err.startswith(
         f"harness: `harness {command}` is part of the extension {extension}, which is not installed in "
     )
+
+
+@pytest.mark.parametrize("name", ENTRIES[known.NAMES])
+def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
+    core: Path, tmp_path: Path, name: str
+) -> None:
+    code = (
+        f"import harness\nprint(dir(harness))\ntry:\n    harness.{name}\n"
+        "except harness.UserError as error:\n    print(error)\nassert not hasattr(harness, 'absent')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(core)}, check=True,
+    )  # fmt: skip
+    names, said = done.stdout.splitlines()
+    assert f"'{name}'" not in names
+    extension = ENTRIES[known.NAMES][name].rpartition(".")[2]
+    assert said == f"`harness.{name}` is part of the extension {extension}, which is not installed"
 
 
 def test_the_core_names_no_command_of_an_extension() -> None:

@@ -17,7 +17,7 @@ from harness.dataset.card import hub_size
 from harness.dataset.columns import COLUMNS
 from harness.dataset.load import Dataset
 from harness.dataset.publish import publish
-from harness.learning.asking import Asking
+from harness.evaluate.chats import Asking
 from harness.world.scenario import Scenario
 
 Harness = Callable[..., tuple[int, str, str]]

@@ -16,7 +16,6 @@ from harness.core.errors import UserError
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import find, load
-from harness.learning.layouts import stored
 from harness.world import scenarios
 
 Harness = Callable[..., tuple[int, str, str]]
@@ -93,12 +92,6 @@ def test_nothing_fits_or_learns_there(
     assert "is not what layout seed" in error
     assert not list(tmp_path.glob("*.jsonl"))
     assert not (tmp_path / "calibrations").exists()
-
-
-@pytest.mark.slow
-def test_an_environment_of_rewards_refuses_them(relabelled: Path) -> None:
-    with pytest.raises(UserError, match="is not what layout seed"):
-        stored(str(relabelled))
 
 
 @pytest.mark.slow

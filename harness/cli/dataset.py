@@ -170,7 +170,7 @@ def export(
     """
     from harness.dataset import load, suites
     from harness.dataset.publish import Chat, publish
-    from harness.learning.asking import Asking
+    from harness.evaluate.chats import Asking
 
     def ask(scenario: "Scenario") -> "tuple[str, Chat]":
         asking = Asking.of(scenario, prompt, "json")

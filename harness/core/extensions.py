@@ -17,8 +17,9 @@ from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins, entries, is_ours
 
 GROUP = "swarmdrive.extensions"
-# In the metadata: by command, and by kind of study, the package of the extension that has it.
-COMMANDS, STUDIES = "swarmdrive.commands", "swarmdrive.studies"
+# In the metadata: by command, kind of study and name from Python, the package of the extension that has it.
+COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdrive.names"
+PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 OURS = "harness.extensions."
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
@@ -68,6 +69,19 @@ def owner(command: str) -> str | None:
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
             return str(entry.value).rpartition(".")[2]
+    return None
+
+
+def from_python(name: str) -> Any:
+    """Return what extensions add to `import harness` by a name; None if there is no such name.
+
+    Raises UserError if its extension is not installed, or does not work.
+    """
+    if name in PYTHON:
+        return PYTHON[name]
+    if gone := entries(NAMES).get(name):
+        extension = str(gone.value).rpartition(".")[2]
+        raise UserError(f"`harness.{name}` is part of the extension {extension}, which is not installed")
     return None
 
 

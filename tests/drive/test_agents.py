@@ -22,7 +22,6 @@ from harness.evaluate.asking import EGO, requests
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import scenes_of
 from harness.evaluate.run import evaluate
-from harness.learning.trips import Roads
 from harness.prompts import versions
 from harness.report.decisions import failures
 from harness.report.page import render
@@ -355,8 +354,6 @@ def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> No
     with pytest.raises(UserError, match="agent_share is 1, and a dataset has one ego that decides; leave it"):
         build(scenario, tmp_path / "set", 2, 100, 1, lambda done: None)
     assert not (tmp_path / "set").exists()
-    with pytest.raises(UserError, match="agent_share is 1, and an environment to learn in has one ego"):
-        Roads(scenario, (100,))
 
 
 @pytest.mark.parametrize("agents", ["1e-9", "2", "nan", "-1", "half", ""])

@@ -1,4 +1,4 @@
-"""Teach models and tune prompts: a search over a prompt's wordings on tune layouts."""
+"""Teach models and tune prompts: a search over a prompt's wordings, and rewards from trees."""
 
 from harness.core.extensions import Extension
 
@@ -8,4 +8,5 @@ EXTENSION = Extension(
     name="learn",
     commands={"prompt optimize": f"{_HERE}.optimize.command:command"},
     studies={"optimize": "optimize"},
+    adds={"python": {"environment": f"{_HERE}.rewards.python_api:environment"}},
 )

@@ -7,6 +7,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.dataset.load import find, load
 from harness.extensions.learn.optimize.layouts import given
+from harness.extensions.learn.rewards.layouts import stored
 
 
 @pytest.mark.slow
@@ -15,3 +16,9 @@ def test_no_prompt_is_searched_there(relabelled: Path) -> None:
         given([str(relabelled)], [load(find("occluded-intersection-v2"), 1).manifest])
     with pytest.raises(UserError, match=r"it has a layout of relabelled, where the winner is certified"):
         given([str(relabelled)], [load(relabelled).manifest])
+
+
+@pytest.mark.slow
+def test_an_environment_of_rewards_refuses_them(relabelled: Path) -> None:
+    with pytest.raises(UserError, match="is not what layout seed"):
+        stored(str(relabelled))

@@ -14,7 +14,7 @@ import harness as package
 from harness import UserError
 from harness.core.seeds import FIRST
 from harness.dataset.load import Dataset
-from harness.learning.values import BEST, Values, optimal
+from harness.extensions.learn.rewards.values import BEST, Values, optimal
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the sim extra")
 
@@ -41,6 +41,10 @@ def after(data: Dataset, point: int, action: int, driver: str) -> bool:
 def edge_tree(data: Dataset, edge: int) -> int:
     [at] = np.unique(data.forest.tree[(data.forest.edge == edge).any(axis=1)])
     return int(at)
+
+
+def test_it_is_one_of_the_names_for_python() -> None:
+    assert "environment" in dir(package)
 
 
 @pytest.mark.parametrize("driver", ["cruise", "local-view", "full-view"])
@@ -190,7 +194,7 @@ def test_driving_is_the_walk_through_the_tree(make: Make, small: Dataset) -> Non
 @pytest.mark.slow
 def test_trees_are_built_once_and_say_what_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     env = package.environment("parking-exit", layouts=1, quiet=True)
-    monkeypatch.setattr("harness.learning.layouts.build", None)
+    monkeypatch.setattr("harness.extensions.learn.rewards.layouts.build", None)
     again = package.environment("parking-exit", layouts=1, quiet=True)
     assert np.array_equal(env.values.table, again.values.table)
     learnt = json.loads(json.dumps(env.learnt()))
@@ -333,7 +337,7 @@ def test_references_are_what_a_constant_and_those_without_a_model_earn(make: Mak
 def test_a_constant_that_nobody_measured_is_the_best_of_the_trees(
     make: Make, small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.learning.trips.constant", lambda scenario: None)
+    monkeypatch.setattr("harness.extensions.learn.rewards.trips.constant", lambda scenario: None)
     forest = small.forest
     balanced = [
         np.mean(

@@ -12,8 +12,8 @@ from harness.core.errors import UserError, unknown
 from harness.core.seeds import LAST_SEED, purpose
 from harness.dataset.freeze import edges, record_of
 from harness.dataset.load import Dataset, Scene
-from harness.learning.layouts import refuse, whole
-from harness.learning.values import BEST, Values, balanced, best_constant, drawn
+from harness.extensions.learn.rewards.layouts import refuse, whole
+from harness.extensions.learn.rewards.values import BEST, Values, balanced, best_constant, drawn
 from harness.world.drivers import (
     CONSTANT,
     DRIVERS,

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.filterwarnings("default")
 STATED = '{{"action_distribution":{{"SLOWER":{},"IDLE":{},"FASTER":{}}}}}'
 
 
-@pytest.mark.exhaustive  # the rewards themselves: `test_learning_environment.py`
+@pytest.mark.exhaustive  # the rewards themselves: `test_rewards.py`
 def test_grpo_takes_steps_on_exact_rewards(small_path: Path, tmp_path: Path) -> None:
     trl = pytest.importorskip("trl", reason="needs the trl extra")
     datasets = pytest.importorskip("datasets", reason="needs the trl extra")
@@ -25,7 +25,7 @@ def test_grpo_takes_steps_on_exact_rewards(small_path: Path, tmp_path: Path) -> 
         rewards.extend(env.expected_advantage(*args, **columns))
         return rewards[-len(columns["values"]) :]
 
-    model = str(Path(__file__).parent.parent / "models/swarm-tiny")
+    model = str(Path(__file__).parents[3] / "models/swarm-tiny")
     trainer = trl.GRPOTrainer(
         model=model,
         processing_class=AutoTokenizer.from_pretrained(model),

@@ -17,9 +17,10 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import digest
 from harness.core.seeds import purpose
-from harness.learning import asking
-from harness.learning.trips import Roads, Trees, Trip
-from harness.learning.values import Values, optimal
+from harness.evaluate.chats import Asking
+from harness.extensions.learn.rewards import asking
+from harness.extensions.learn.rewards.trips import Roads, Trees, Trip
+from harness.extensions.learn.rewards.values import Values, optimal
 from harness.world.scene_numbers import numbers
 
 Observation = Literal["text", "arrays"]
@@ -46,7 +47,7 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     expected_advantage = staticmethod(asking.expected_advantage)
 
     def __init__(
-        self, source: Trees | Roads, ask: asking.Asking, *, observation: Observation = "text",
+        self, source: Trees | Roads, ask: Asking, *, observation: Observation = "text",
         viewer: str | None = None, reward: Reward = "regret", distributions: bool = False,
     ) -> None:  # fmt: skip
         for name, given, allowed in (("observation", observation, Observation), ("reward", reward, Reward)):

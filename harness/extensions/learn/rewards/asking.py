@@ -1,63 +1,29 @@
 """What a viewer is asked, and what its answer is worth: texts in, rewards out."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
 from harness.core import noise
 from harness.core.arrays import Ints
-from harness.core.errors import UserError, printable, unknown
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.agent import in_mode
-from harness.learning.values import Values, optimal
+from harness.evaluate.chats import Asking
+from harness.extensions.learn.rewards.values import Values, optimal
 from harness.parsing.parse import parse
 from harness.prompts import readout
-from harness.prompts.versions import Prompt, load, unfit
-from harness.world.scenario import Scenario
-from harness.world.scene_graph import SceneGraph
 
-Form = Literal["json", "readout"]
 ANY = "any"  # the viewer is drawn among all
 
 
-@dataclass(frozen=True)
-class Asking:
-    """How viewers are asked: alone, without messages of others."""
-
-    scenario: Scenario
-    prompt: Prompt
-    answer: Form = "json"  # `json`, or `readout`: one letter
-
-    def __post_init__(self) -> None:
-        version = printable(self.prompt.version)
-        if self.answer not in get_args(Form):
-            raise unknown("answer", str(self.answer), get_args(Form))
-        if self.prompt.image:
-            raise UserError(f"prompt {version} shows pictures, and here are texts alone; give another")
-        if reason := unfit(self.prompt, self.scenario):
-            raise UserError(f"prompt {version} {reason}; give another, such as {self.scenario.prompt}")
-
-    @classmethod
-    def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Ask by a prompt version, the scenario's own for None. Raises UserError if that cannot be."""
-        return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
-
-    def chat(self, graph: SceneGraph) -> list[dict[str, str]]:
-        """Return the chat messages about a viewer's scene graph."""
-        actions, words = self.scenario.actions, self.scenario.prompt_words
-        sent = self.prompt.render(graph, actions, (), words, letter=self.answer == "readout")
-        return [{**m} for m in in_mode(self.answer, self.prompt, sent, graph, actions, words)]
-
-    def read_by(self, role: str) -> dict[str, Any]:
-        """Return how answers in a role are read: arguments of `intent`, as plain values."""
-        shape = self.prompt.shape(role, self.scenario.actions)
-        return {
-            "answer": self.answer, "role": role, "actions": list(shape.actions), "form": shape.form,
-            "extension": shape.extension, "reasons_first": role in self.prompt.reasons_first,
-        }  # fmt: skip
+def read_by(asking: Asking, role: str) -> dict[str, Any]:
+    """Return how answers in a role are read: arguments of `intent`, as plain values."""
+    shape = asking.prompt.shape(role, asking.scenario.actions)
+    return {
+        "answer": asking.answer, "role": role, "actions": list(shape.actions), "form": shape.form,
+        "extension": shape.extension, "reasons_first": role in asking.prompt.reasons_first,
+    }  # fmt: skip
 
 
 def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
@@ -84,7 +50,7 @@ def rows(
             "values": values.table[n].tolist(), "optimal": optimal(values.table[n]).tolist(),
             "constant": constant, "scenario": data.scenario.name, "layout_seed": seed,
             "purpose": purpose(seed, 1), "danger": forest.dangers[forest.tree[n]] is not None,
-            **asking.read_by(graph.role),
+            **read_by(asking, graph.role),
         }  # fmt: skip
 
 
@@ -117,13 +83,13 @@ def stated(p: Sequence[float], values: Sequence[float]) -> float:
     return float(np.dot(p, values))
 
 
-def earned(text: str, values: Sequence[float], constant: int, worth: Worth = driven, **read_by: Any) -> float:
+def earned(text: str, values: Sequence[float], constant: int, worth: Worth = driven, **how: Any) -> float:
     """Return what an answer is worth, less the action that is always taken.
 
     An answer that cannot be read drives nobody: it is worth 0. `values` has the worth of each action, (A,);
     `constant` is the index of the other.
     """
-    p = intent(text, **read_by)
+    p = intent(text, **how)
     return (0.0 if p is None else worth(p, values)) - float(values[constant])
 
 
@@ -164,8 +130,8 @@ def _rewards(
 ) -> list[float]:  # fmt: skip
     rewards = []
     for n, completion in enumerate(completions):
-        read_by = {name: columns[name][n] for name in READ_BY}
-        rewards.append(earned(_text(completion), values[n], constant[n], worth, **read_by))
+        how = {name: columns[name][n] for name in READ_BY}
+        rewards.append(earned(_text(completion), values[n], constant[n], worth, **how))
     return rewards
 
 

@@ -12,6 +12,8 @@ pytest.importorskip("gymnasium", reason="needs the sim extra")
 import harness
 from harness import UserError
 from harness.dataset.load import find, load
+from harness.extensions.learn.rewards.trips import Roads
+from harness.world import scenarios
 
 
 @pytest.mark.parametrize(
@@ -46,3 +48,9 @@ def test_report_layouts_are_refused_whatever_their_manifest_calls_them(tmp_path:
     assert load(folder).manifest.purpose == "train"
     with pytest.raises(UserError, match="numbers are reported of layout seeds from 200000 on"):
         harness.environment(dataset=folder)
+
+
+def test_a_scenario_of_several_agents_is_refused() -> None:
+    scenario = scenarios.get("all-way-crossing:agent_share=1")
+    with pytest.raises(UserError, match="agent_share is 1, and an environment to learn in has one ego"):
+        Roads(scenario, (100,))

@@ -1,0 +1,41 @@
+"""The chat that asks a viewer outside of a run: alone, without messages of others."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from harness.core.errors import UserError, printable, unknown
+from harness.evaluate.agent import in_mode
+from harness.prompts.versions import Prompt, load, unfit
+from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
+
+Form = Literal["json", "readout"]
+
+
+@dataclass(frozen=True)
+class Asking:
+    """How viewers are asked: alone, without messages of others."""
+
+    scenario: Scenario
+    prompt: Prompt
+    answer: Form = "json"  # `json`, or `readout`: one letter
+
+    def __post_init__(self) -> None:
+        version = printable(self.prompt.version)
+        if self.answer not in get_args(Form):
+            raise unknown("answer", str(self.answer), get_args(Form))
+        if self.prompt.image:
+            raise UserError(f"prompt {version} shows pictures, and here are texts alone; give another")
+        if reason := unfit(self.prompt, self.scenario):
+            raise UserError(f"prompt {version} {reason}; give another, such as {self.scenario.prompt}")
+
+    @classmethod
+    def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
+        """Ask by a prompt version, the scenario's own for None. Raises UserError if that cannot be."""
+        return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
+
+    def chat(self, graph: SceneGraph) -> list[dict[str, str]]:
+        """Return the chat messages about a viewer's scene graph."""
+        actions, words = self.scenario.actions, self.scenario.prompt_words
+        sent = self.prompt.render(graph, actions, (), words, letter=self.answer == "readout")
+        return [{**m} for m in in_mode(self.answer, self.prompt, sent, graph, actions, words)]
