@@ -374,3 +374,50 @@ def test_a_stopped_run_resumes_with_an_extensions_setting_as_it_was(
     assert unfinished(spec, tmp_path / "run") is not None
     with pytest.raises(UserError, match="was begun with --level 1, and not with --level 2"):
         unfinished(spec.changed(extensions={"level": 2}), tmp_path / "run")
+
+
+def test_a_command_of_a_package_that_fails_is_one_line(installed: Installed, harness: Typed) -> None:
+    installed(odd='Extension(name="odd", commands={"oddly": "of_others:fail", "leave": "of_others:leave"})')
+    source = Path(sys.path[0]) / "of_others.py"
+    fail = "def fail():\n    raise ValueError('bad\\x1b[31m')\n"
+    leave = "def leave():\n    raise typer.Exit(4)\n"
+    source.write_text(f"{source.read_text()}\nimport typer\n{fail}{leave}")
+    code, out, err = harness("oddly")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "command oddly (of_others:fail) fails (bad\\x1b[31m); repair or uninstall its package" in err
+    assert harness("leave") == (4, "", "")
+
+
+def test_metadata_that_cannot_be_read_are_one_line(
+    tmp_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register(tmp_path / "site", f"[{known.GROUP}]\nbad\n")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    code, _, err = harness("study", "--help")
+    assert code == 0
+    assert "the entry points of package by-hand cannot be read" in err
+    assert known.extensions()
+
+
+def test_a_plug_in_of_an_extension_with_the_name_of_a_built_in_one_is_left_out(
+    installed: Installed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed(odd='Extension(name="odd", adds={"metrics": {"success_rate": "of_others:X"}})')
+    assert METRICS["success_rate"] is METRICS.built_in["success_rate"]
+    assert len(METRICS) >= len(METRICS.built_in)
+    assert (
+        "'success_rate' (swarmdrive.metrics) of an extension is taken; it is left out"
+        in capsys.readouterr().err
+    )
+
+
+def test_a_package_that_takes_long_to_load_is_named(
+    installed: Installed, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.core.plugins.SAID_S", 0.05)
+    installed(odd="__import__('time').sleep(0.2)")
+    assert "odd" not in known.extensions()
+    assert (
+        "waiting for plug-in 'odd' (swarmdrive.extensions): of_others:ODD, which loads"
+        in capsys.readouterr().err
+    )

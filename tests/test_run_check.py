@@ -350,6 +350,15 @@ def test_a_latency_of_a_driven_run_is_held_against_its_source(drive: Path, harne
     assert "another latency than the paper, which it names as the source" in " ".join(out.split())
 
 
+def test_a_latency_of_a_card_that_only_the_run_states_is_named(run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    times = {"source": "card", "ego_s": 0.02, "helper_s": 0.02, "fusion_s": 0.02}
+    card = {**stated["model"], "latency": {**stated["model"]["latency"], "inference_s": 0.02}}
+    configure(run, model=card, latency={**stated["latency"], **times})
+    words = " ".join(harness("run", "check", run)[1].split())
+    assert "of 0.02 s is that of a card in run.json; the card proxy that is here states 0.145 s" in words
+
+
 @pytest.mark.slow
 def test_a_driven_run_that_cannot_be_driven_again_says_so(
     drive: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch

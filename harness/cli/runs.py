@@ -91,12 +91,12 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
-    from harness.evaluate.recompute import AGAIN, differences, driven_otherwise
+    from harness.evaluate.recompute import AGAIN, differences, driven_otherwise, of_card
     from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import dataset_of, read
 
     run = read(path)
-    open_points = list(unchecked(run))
+    open_points = [*unchecked(run), *of_card(run)]
     if run.world == "frozen":
         reading = bar(f"reading {printable(path.name, 30)}", quiet=silent, grows=True)
         with tempfile.TemporaryDirectory(prefix="harness-") as folder, reading as progress:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import partial, wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_origin
@@ -12,7 +12,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD, commands, groups, panels, short, spellings
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 from harness.core.extensions import owner, taken
 from harness.core.strangers import ended, ends_the_program, worded
 
@@ -63,9 +63,28 @@ def _below(path: str, table: Mapping[str, str]) -> dict[str, str]:
 def _command(path: str, place: str) -> Any:
     module, _, function = place.partition(":")
     app = Typer(add_completion=False, rich_markup_mode=None)
-    with worded(f"command {path} ({printable(place)})", built_in=place.startswith("harness.")):
-        app.command(path.split()[-1], cls=Command)(getattr(import_module(module), function or "command"))
+    what, built_in = f"command {path} ({printable(place)})", place.startswith("harness.")
+    with worded(what, built_in):
+        called = getattr(import_module(module), function or "command")
+        app.command(path.split()[-1], cls=Command)(called if built_in else _of_package(called, what))
         return get_command(app)
+
+
+def _of_package(called: Callable[..., Any], what: str) -> Callable[..., Any]:
+    """Return a package's command, whose errors are one line; it may end with an exit code as commands do."""
+
+    @wraps(called)
+    def calling(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return called(*args, **kwargs)
+        except (UserError, OSError):
+            raise
+        except Exception as error:
+            if type(error).__module__.partition(".")[0] in ("click", "typer"):
+                raise
+            raise UserError(f"{what} fails ({one_line(error)}); repair or uninstall its package") from error
+
+    return calling
 
 
 class Command(TyperCommand):

@@ -15,6 +15,7 @@ from typing import Any
 from harness.core import formats
 from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins, entries, is_ours
+from harness.core.strangers import worded
 
 GROUP = "swarmdrive.extensions"
 # In the metadata: by command, kind of study and name from Python, the package of the extension that has it.
@@ -127,7 +128,8 @@ def _extensions(path: tuple[str, ...]) -> Mapping[str, Extension]:
         if is_ours(declared[name]) and not _is_here(declared[name]):
             continue
         try:
-            working[name] = _checked(name, loaded[name])
+            with worded(f"extension {printable(name)}"):
+                working[name] = _checked(name, loaded[name])
         except UserError as error:
             print(f"harness: {error}; all else works", file=sys.stderr)
     return working
@@ -143,17 +145,22 @@ def _is_here(entry: Any) -> bool:
 
 
 def _checked(name: str, extension: Extension) -> Extension:
-    """Return an extension. Raises UserError if it is of another interface, or no such record."""
+    """Return a copy of an extension, of plain tables.
+
+    Raises UserError if it is of another interface, or no such record.
+    """
     what = f"extension {printable(name)}"
     if extension.interface != INTERFACE:
         raise UserError(
-            f"{what} is for version {printable(extension.interface)} of `Extension`, and this is version "
-            f"{INTERFACE}; install a version of its package for this harness"
+            f"{what} is for version {printable(repr(extension.interface))} of `Extension`, and this is "
+            f"version {INTERFACE}; install a version of its package for this harness"
         )
     if extension.name != name:
         raise UserError(f"{what} calls itself {printable(extension.name)}; give both the same name")
+    copied: dict[str, Any] = {}
     for table in fields(Extension)[2:]:
         value = getattr(extension, table.name)
+        value = copied[table.name] = dict(value) if isinstance(value, Mapping) else value
         if table.name == "settings":
             if not (isinstance(value, Mapping) and all(map(_is_setting, value, value.values()))):
                 raise UserError(f"{what}: its settings are no table of Setting; repair its package")
@@ -162,14 +169,14 @@ def _checked(name: str, extension: Extension) -> Extension:
         if not all(map(_is_texts, tables)):
             raise UserError(f"{what}: its {table.name} are no table of texts; repair its package")
     for kind in TYPED:
-        names = getattr(extension, kind)
+        names = copied[kind]
         replacements = names.values() if kind in ("spellings", "short") else ()
         for words in (*names, *replacements):
             if not WORDS.fullmatch(words):
                 raise UserError(
                     f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its package"
                 )
-    return extension
+    return Extension(name=name, **copied)
 
 
 def _is_texts(table: Any) -> bool:

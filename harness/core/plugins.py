@@ -4,16 +4,18 @@ import os
 import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from pathlib import Path
+from threading import Timer
 from typing import Any, Generic, TypeVar
 
 from harness.core import resources
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, one_line, printable
 from harness.core.strangers import strangers
 
 T = TypeVar("T")
+SAID_S = 3.0  # after which a line says which package a command waits for
 
 
 def entries(group: str) -> Mapping[str, Any]:
@@ -23,10 +25,8 @@ def entries(group: str) -> Mapping[str, Any]:
 
 @cache  # a look at all packages takes milliseconds
 def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
-    from importlib.metadata import entry_points  # imported here because it is slow
-
     by_name: dict[str, Any] = {}
-    for entry in sorted(entry_points(group=group), key=lambda entry: (not is_ours(entry), entry)):
+    for entry in sorted(_declared(group), key=lambda entry: (not is_ours(entry), entry)):
         first = by_name.setdefault(entry.name, entry)
         if first.value != entry.value:
             name, *places = map(printable, (entry.name, first.value, entry.value))
@@ -37,9 +37,47 @@ def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
     return by_name
 
 
+def _declared(group: str) -> list[Any]:
+    """Return the entry points of a group. Of a package whose metadata cannot be read a line says so."""
+    from importlib.metadata import distributions, entry_points  # imported here because it is slow
+
+    try:
+        return list(entry_points(group=group))
+    except Exception:  # whatever the metadata of a package hold
+        declared: list[Any] = []
+    for distribution in distributions():
+        try:
+            declared += distribution.entry_points.select(group=group)
+        except Exception as error:
+            what = f"the entry points of package {printable(distribution.name)} cannot be read"
+            print(f"harness: {what} ({one_line(error)}); it is left out", file=sys.stderr)
+    return declared
+
+
 def is_ours(entry: Any) -> bool:
     """Return whether an entry point is of this distribution, whose names nobody else's replace."""
     return str(entry.value).startswith("harness.")
+
+
+@cache
+def _say(line: str) -> None:
+    """Print a line on stderr, once."""
+    print(f"harness: {line}", file=sys.stderr)
+
+
+@contextmanager
+def _waiting(what: str, entry: Any) -> Iterator[None]:
+    """Say what a command waits for if a package takes long to load: nothing can stop that."""
+    if is_ours(entry):
+        yield
+        return
+    timer = Timer(SAID_S, _say, [f"waiting for {what}, which loads"])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class Plugins(Mapping[str, T], Generic[T]):
@@ -72,14 +110,18 @@ class Plugins(Mapping[str, T], Generic[T]):
     def _entries(self) -> Mapping[str, Any]:
         from harness.core.extensions import added
 
-        return {**added(self.group), **entries(self.group)}
+        by_extensions = added(self.group)
+        for name in by_extensions.keys() & self.built_in.keys():
+            _say(f"{printable(name)!r} ({self.group}) of an extension is taken; it is left out")
+        return {**by_extensions, **entries(self.group)}
 
     def _load(self, name: str) -> T:
         entry = self._entries()[name]
         what = f"plug-in {printable(name)!r} ({self.group}): {printable(entry.value)}"
         repair = "repair or uninstall the package that registers it"
         try:
-            with strangers(what), redirect_stdout(sys.stderr):  # a program may read what a command prints
+            # A program may read what a command prints.
+            with _waiting(what, entry), strangers(what), redirect_stdout(sys.stderr):
                 plugin: T = entry.load()
                 # A class has the methods of its instances, so it would pass the check of the protocol.
                 fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)

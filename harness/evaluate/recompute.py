@@ -11,6 +11,7 @@ from typing import Any
 from msgspec import structs, to_builtins
 from msgspec.structs import astuple
 
+from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
@@ -185,6 +186,19 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
     yield from _of_latency(stated)
     if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
         yield "run.json says of a driver that it sees other than it does"
+
+
+def of_card(run: Run) -> Iterator[str]:
+    """Yield a sentence where a run names its card as the source of a latency that the card here has not."""
+    latency, name = run.manifest.latency, run.manifest.model["name"]
+    if latency.source != "card" or name not in cards.names():
+        return
+    here_s = cards.load(name).latency.inference_s
+    if here_s != latency.ego_s:
+        yield (
+            f"Its latency of {latency.ego_s:g} s is that of a card in run.json; the card {printable(name)} "
+            f"that is here states {'none' if here_s is None else f'{here_s:g} s'}."
+        )
 
 
 def _of_latency(run: Run) -> Iterator[str]:
