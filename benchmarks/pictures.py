@@ -25,8 +25,8 @@ from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
+from harness.extensions.learn.training.model import new_model, save_tokenizer, train_tokenizer
 from harness.prompts import versions
-from harness.training.model import new_model, save_tokenizer, train_tokenizer
 from harness.world.perception import camera
 
 SMALLEST = "--decisions 1"

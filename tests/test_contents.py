@@ -40,7 +40,6 @@ from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
 from harness.radio.messages import Counts, size
 from harness.runs import folder
-from harness.training.pairs import pairs
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.shared import NOBODY, Heard, merged, stated
@@ -369,12 +368,13 @@ def test_a_shuffled_run_is_read_as_it_was_asked(small: Dataset, tmp_path: Path) 
     """A pair for training has the objects of the other layout; energy of them is not counted."""
     point = OBJECTS.changed(messages="shuffled")
     stored = folder.read(run(spec_of(small, points=(point,)), tmp_path / "run").out)
+    counted = count(spec_of(small, points=(point,), ask="used"), small, None)
+    assert counted["requests_by_role"]["fusion"] == 2 * 7 * counted["scenes"], "of two seeds"
     asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    pairs = pytest.importorskip("harness.extensions.learn.training.pairs").pairs
     shuffled = [pair for pair in pairs(stored) if "&from:" in pair["viewer"]]
     assert shuffled
     assert {digest(pair["prompt"]) for pair in shuffled} <= asked
-    counted = count(spec_of(small, points=(point,), ask="used"), small, None)
-    assert counted["requests_by_role"]["fusion"] == 2 * 7 * counted["scenes"], "of two seeds"
 
 
 def test_bits_grow_with_what_is_listed(small: Dataset) -> None:
@@ -491,6 +491,7 @@ def test_whoever_reads_a_run_sees_what_the_ego_was_asked(pair: Dataset, tmp_path
         shared += any("objects" in key for key in answer.heard)
     assert shared > 10
     asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    pairs = pytest.importorskip("harness.extensions.learn.training.pairs").pairs
     assert {digest(pair["prompt"]) for pair in pairs(stored)} <= asked
 
 

@@ -212,7 +212,7 @@ EXCEPT = {
     "backends/counters.py": "counters of the kernel, below /sys",
     "backends/packages.py": "an archive that the reader has opened",
     "runs/results.py": "an archive that the reader has opened",
-    "training/model.py": "safetensors maps weights that training has just written",
+    "extensions/learn/training/model.py": "safetensors maps weights that training has just written",
     "report/library.py": "the charting library of an installed package",
     "cli/init.py": "the project that ships",
     "core/process.py": "the null device",

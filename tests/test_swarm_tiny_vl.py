@@ -20,8 +20,6 @@ from harness.backends.registry import open_backend
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
-from harness.training.answers import cells
-from harness.training.train import Sample, hidden_states
 from harness.world.perception.camera import Sight
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
@@ -56,15 +54,18 @@ def test_its_picture_tokens_see(shipped: Dataset) -> None:
     model, tokenizer = backend.engine.model, backend.chat.tokenizer.hub
     filled = model.config.image_token_id
     digits = model.get_input_embeddings().weight[tokenizer.convert_tokens_to_ids(list("0123456789"))]
+    answers, train = (
+        pytest.importorskip(f"harness.extensions.learn.training.{n}") for n in ("answers", "train")
+    )
     read, shown = [], []
     for question in asked(shipped, "own"):
         assert isinstance(question.image, Sight)
         ids = np.array([filled if token < 0 else token for token in backend.tokens(question)], dtype=np.int32)
-        sample = Sample(ids, 1, "", len(ids), None, image=question.image)
+        sample = train.Sample(ids, 1, "", len(ids), None, image=question.image)
         with torch.inference_mode():
-            [hidden] = hidden_states(model, [sample])
+            [hidden] = train.hidden_states(model, [sample])
             read.append((hidden[torch.from_numpy(ids[1:] == filled)] @ digits.T).argmax(1).numpy())
-        shown.append(cells(question.image))
+        shown.append(answers.cells(question.image))
     told, true = np.concatenate(read), np.concatenate(shown)
     somebody = true > 0
     assert somebody.sum() > 8 * SCENES

@@ -80,7 +80,6 @@ def test_typing_a_command_again_draws_no_other_layouts(
     [
         "model calibrate {run} --dataset {data} --out calibrations/mine.toml",
         "study schedule compare {other} --tune {run} --out schedules",
-        "run export {run} --sft pairs.jsonl",
     ],
 )
 def test_nothing_fits_or_learns_there(
@@ -90,7 +89,6 @@ def test_nothing_fits_or_learns_there(
     code, out, error = harness(*typed.format(run=run, other=other, data=relabelled).split())
     assert (code, error.count("\n")) == (2, 1), (out, error)
     assert "is not what layout seed" in error
-    assert not list(tmp_path.glob("*.jsonl"))
     assert not (tmp_path / "calibrations").exists()
 
 

@@ -1,7 +1,7 @@
 """`harness run export`: a run's data for other programs; extensions add formats."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,50 +12,78 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.runs.exports import EXPORTS, Export
+from harness.runs.exports import EXPORTS, Export, Option, options_of
 
-MARGIN = 0.1  # by how much an answer is worth less than the one that is preferred to it
 # Words of the command's own options.
 TAKEN = {
-    "added", "as_csv", "as_jsonl", "csv", "dataset", "dpo", "help", "jsonl", "junit", "margin", "out",
-    "report_seeds_too", "run", "sft",
+    "added", "as_csv", "as_jsonl", "csv", "dataset", "help", "jsonl", "junit", "out", "run", "values",
 }  # fmt: skip
-NONE: Mapping[str, Path | None] = MappingProxyType({})  # of formats, where no extension adds one
+NONE: Mapping[str, Any] = MappingProxyType({})  # of formats and their options, where no extension adds one
 
 
 def _formats() -> dict[str, Export]:
     """Return the formats that extensions add, by option, but those whose name is taken or no option's."""
-    return {
-        f"--{name}": format
-        for name, format in EXPORTS.usable().items()
-        if (word := name.replace("-", "_")).isidentifier() and word not in TAKEN
-    }
+    return {f"--{name}": format for name, format in EXPORTS.usable().items() if _is_free(name, ())}
+
+
+def _options(formats: Mapping[str, Export]) -> dict[str, Option]:
+    """Return the further options of formats by option; of two with one name the first."""
+    options: dict[str, Option] = {}
+    for format in formats.values():
+        for name, option in options_of(format).items():
+            if _is_free(name, formats):
+                options.setdefault(f"--{name}", option)
+    return options
+
+
+def _is_free(name: str, formats: Container[str]) -> bool:
+    return _word(name).isidentifier() and _word(name) not in TAKEN and f"--{name}" not in formats
+
+
+def _word(flag: str) -> str:
+    return flag.removeprefix("--").replace("-", "_")
 
 
 def _with_formats(command: Any) -> Any:
-    """Give a command the option of each format that extensions add; it gets what is typed as `added`."""
+    """Give a command the options that extensions add.
+
+    It gets what is typed for a format's file as `added`, and for a further option as `values`, by option.
+    """
     formats = _formats()
-    named = {flag: flag.removeprefix("--").replace("-", "_") for flag in formats}
+    options = _options(formats)
 
-    def typed(**values: Any) -> Any:
-        added = {flag: values.pop(name) for flag, name in named.items()}
-        return command(**values, added=added)
+    def typed(**given: Any) -> Any:
+        added = {flag: given.pop(_word(flag)) for flag in formats}
+        values = {flag: given.pop(_word(flag)) for flag in options}
+        return command(**given, added=added, values=values)
 
+    instead = {
+        "added": [_file(flag, format) for flag, format in formats.items()],
+        "values": [_value(flag, option) for flag, option in options.items()],
+    }
     parameters = []
     for each in inspect.signature(command).parameters.values():
-        if each.name == "sft":
-            parameters += [_option(named[flag], format) for flag, format in formats.items()]
-        if each.name != "added":
-            parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        parameters += instead.get(each.name, [each.replace(kind=inspect.Parameter.KEYWORD_ONLY)])
     typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     typed.__annotations__ = {each.name: each.annotation for each in parameters}
     typed.__doc__, typed.__name__ = command.__doc__, command.__name__
     return typed
 
 
-def _option(name: str, format: Export) -> inspect.Parameter:
-    default = typer.Option(None, help=format.help)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Path | None)
+def _file(flag: str, format: Export) -> inspect.Parameter:
+    return _parameter(flag, typer.Option(None, help=format.help), Path | None)
+
+
+def _value(flag: str, option: Option) -> inspect.Parameter:
+    if option.kind is bool:
+        return _parameter(flag, typer.Option(False, flag, help=option.help), bool)
+    return _parameter(flag, typer.Option(None, help=option.help, show_default=False), option.kind | None)
+
+
+def _parameter(flag: str, default: Any, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(
+        _word(flag), inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
 @_with_formats
@@ -74,44 +102,30 @@ def command(
     junit: Path | None = typer.Option(
         None, help="Write a JUnit XML file: one test case per episode and condition."
     ),
-    sft: Path | None = typer.Option(
-        None,
-        help="Write chats to fine-tune on as JSON Lines; their answers are those that the decision trees "
-        "show to be right.",
-    ),
-    dpo: Path | None = typer.Option(
-        None,
-        help="Write the same chats with the model's own answers as the rejected ones, where these are worse.",
-    ),
-    margin: float | None = typer.Option(
-        None,
-        help="With --dpo: how much less an answer must be worth, above 0 to 1. Default: 0.1.",
-        show_default=False,
-    ),
-    dataset: options.RunsDataset = None,
-    report_seeds_too: bool = typer.Option(
-        False,
-        "--report-seeds-too",
-        help="With --sft and --dpo: also allow layouts with report seeds (200000 and above).",
-    ),
     added: Mapping[str, Path | None] = NONE,
+    values: Mapping[str, Any] = NONE,
+    dataset: options.RunsDataset = None,
 ) -> None:
     """Write a run's data for spreadsheets and other programs. Give exactly one format."""
     from harness.runs import export
     from harness.runs.contradictions import refuse
     from harness.runs.folder import read
 
-    files = {"--junit": junit, **added, "--sft": sft, "--dpo": dpo}
+    files = {"--junit": junit, **added}
     asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
     [option, *surplus] = [name for name, given in asked.items() if given] or [""]
     if surplus or not option:
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
-    if report_seeds_too and not (sft or dpo):
-        raise UserError("--report-seeds-too only goes with --sft and --dpo; give one, or leave it out")
-    if margin is not None and not (dpo and 0 < margin <= 1):
-        raise UserError(f"--margin {margin:g}: it goes with --dpo, and is above 0 and at most 1")
-    if dataset and option not in (*added, "--sft", "--dpo"):
-        raise UserError(f"--dataset only goes with {', '.join((*added, '--sft'))} and --dpo; leave it out")
+    formats = _formats()
+    further = _options(formats)
+    typed = {flag: value for flag, value in values.items() if value is not None and value is not False}
+    for flag, value in typed.items():
+        if why := further[flag].refusal(value, option):
+            raise UserError(why)
+    if dataset and option not in added:
+        *most, last = added or ("formats that extensions add",)
+        goes_with = f"{', '.join(most)} and {last}" if most else last
+        raise UserError(f"--dataset only goes with {goes_with}; leave it out")
     if out and option in files:
         raise UserError(
             f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
@@ -137,17 +151,13 @@ def command(
             written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
         elif junit:
             written = [export.junit(source, junit)]
-        elif lessons := sft or dpo:
-            from harness.training import pairs
-
-            least = (margin or MARGIN) if dpo else None
-            with bar("writing chats"):
-                written = [pairs.write(source, lessons, report_seeds_too, dataset, least)]
         elif file := added.get(option):
-            format = _formats()[option]
+            format = formats[option]
             extras.need(option, *(module for module in extras.OPTIONAL if module in format.needs))
+            own = {f"--{name}": each for name, each in options_of(format).items()}
+            rest = {_word(flag): value for flag, value in typed.items() if own.get(flag) is further[flag]}
             with bar(format.doing):
-                written = [format.write(source, file, dataset)]
+                written = [format.write(source, file, dataset, **rest)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
         remedy = "name another file" if target else "choose another folder with --out"

@@ -7,13 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from harness.cli import options, pictures
-from harness.cli.progress import bar
-from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json
-from harness.core import extras, resources
+from harness.core import resources
 from harness.core.errors import UserError, printable
-from harness.core.files import write_whole
-from harness.core.seeds import FIRST
 
 if TYPE_CHECKING:
     from harness.prompts.difference import TextChange
@@ -119,39 +115,6 @@ def show(
                     typer.echo(wrote[v])
             for line in message["content"].split("\n"):
                 typer.echo(printable(line, len(line) * 10))
-
-
-def examples(
-    version: Version,
-    scenario: str = typer.Option(..., help="Scenario to take the examples from."),
-    count: int = typer.Option(2, help="Number of examples for each role, each from a layout of its own."),
-    first_seed: int = typer.Option(
-        FIRST["train"], help="Layout seed of the first example; train seeds are 100000 to 199999."
-    ),
-) -> None:
-    """Add examples to a draft: earlier turns of the chat.
-
-    They are answered as the decision trees show to be right.
-    """
-    from harness.prompts import versions as prompts
-    from harness.prompts.examples import EXAMPLES, text_of
-
-    extras.need("harness prompt examples", "highway_env")
-    draft, played = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
-    file = resources.find("prompts", version) / EXAMPLES
-    if draft.released:
-        raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
-    if draft.examples:
-        raise UserError(f"{printable(file)} is there already; delete it to draw others")
-    if reason := prompts.unfit(draft, played):
-        raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
-    from harness.training import prompt_examples
-    from harness.world import scenarios
-
-    with bar("drawing layouts", count) as progress:
-        drawn = prompt_examples.examples(draft, played, count, first_seed, progress)
-    write_whole(file, text_of(drawn))
-    typer.echo(f"wrote {printable(file)} of {printable(scenarios.title(played))}: {drawn}")
 
 
 def compare(

@@ -1,13 +1,26 @@
 """Formats of other programs that extensions add to `harness run export`, each an option of its own.
 
-An extension adds one by `adds={"exports": {"name": "module:OBJECT"}}`; `--name FILE` writes it.
+An extension adds one by `adds={"exports": {"name": "module:OBJECT"}}`; `--name FILE` writes it. Its attribute
+`options`, if it has one, is a table of further options by name.
 """
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import Any, Protocol, runtime_checkable
 
 from harness.core.plugins import Plugins
 from harness.runs.folder import Run
+
+
+@dataclass(frozen=True)
+class Option:
+    """A further option of a format; several formats that have it hold the same object."""
+
+    kind: type  # what is typed: `bool` for a switch, or `float`
+    help: str
+    refusal: Callable[[Any, str], str | None]  # why a value is refused beside the option that names a file
 
 
 @runtime_checkable
@@ -18,9 +31,18 @@ class Export(Protocol):
     doing: str  # what is said while it writes
     needs: tuple[str, ...]  # modules of extras without which it cannot write: `harness.core.extras.OPTIONAL`
 
-    def write(self, run: Run, file: Path, dataset: Path | None) -> Path:
-        """Write a file and return it; `dataset` is the folder of the run's, if it is stated."""
+    def write(self, run: Run, file: Path, dataset: Path | None, **options: Any) -> Path:
+        """Write a file and return it; `dataset` is the folder of the run's, if it is stated.
+
+        What was typed of its further options is there by name, with `_` for `-`.
+        """
         ...
 
 
 EXPORTS: Plugins[Export] = Plugins("swarmdrive.exports", Export, {})
+
+
+def options_of(format: Export) -> Mapping[str, Option]:
+    """Return the further options of a format by name."""
+    options: Mapping[str, Option] = getattr(format, "options", MappingProxyType({}))
+    return options

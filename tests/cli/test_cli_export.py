@@ -130,20 +130,13 @@ def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--csv, --jsonl, --junit, --inspect, --sft, --dpo: give exactly one of them"),
-        (("--csv", "--jsonl"), "--csv, --jsonl, --junit, --inspect, --sft, --dpo: give exactly one of them"),
+        ((), ": give exactly one of them"),
+        (("--csv", "--jsonl"), "--csv, --jsonl, --junit"),
         (("--csv", "--junit", "a.xml"), "give exactly one of them"),
         (
             ("--junit", "a.xml", "--out", "there"),
             "--out only goes with --csv and --jsonl; --junit names its own",
         ),
-        (
-            ("--junit", "a.xml", "--report-seeds-too"),
-            "--report-seeds-too only goes with --sft and --dpo; give one, or leave it",
-        ),
-        (("--csv", "--margin", "0.5"), "--margin 0.5: it goes with --dpo, and is above 0 and at most 1"),
-        (("--dpo", "a.jsonl", "--margin", "0"), "--margin 0: it goes with --dpo, and is above 0 and at most"),
-        (("--dpo", "a.jsonl", "--margin", "nan"), "--margin nan: it goes with --dpo, and is above 0"),
         (("--junit", "run/run.json/a.xml"), "--junit run/run.json/a.xml cannot be written ("),
         (("--junit", "."), "--junit . cannot be written (Is a directory); name another file"),
         (("--junit", "run"), "--junit run cannot be written (Is a directory); name another file"),

@@ -1,4 +1,4 @@
-"""Teach models and tune prompts: a search over a prompt's wordings, and rewards from trees."""
+"""Teach models and tune prompts: what trees show to be right, distilling, rewards, a search of wordings."""
 
 from harness.core.extensions import Extension
 
@@ -6,7 +6,15 @@ _HERE = "harness.extensions.learn"
 
 EXTENSION = Extension(
     name="learn",
-    commands={"prompt optimize": f"{_HERE}.optimize.command:command"},
+    commands={
+        "model distill": f"{_HERE}.training.commands:distill",
+        "prompt examples": f"{_HERE}.training.commands:examples",
+        "prompt optimize": f"{_HERE}.optimize.command:command",
+    },
+    spellings={"distill": "model distill"},
     studies={"optimize": "optimize"},
-    adds={"python": {"environment": f"{_HERE}.rewards.python_api:environment"}},
+    adds={
+        "exports": {"sft": f"{_HERE}.training.exports:SFT", "dpo": f"{_HERE}.training.exports:DPO"},
+        "python": {"environment": f"{_HERE}.rewards.python_api:environment"},
+    },
 )

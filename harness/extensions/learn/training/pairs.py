@@ -1,8 +1,8 @@
 """A run's questions with the answers that they should have had, as chats for fine-tuning.
 
 A line a question, in TRL's conversational form: a prompt, and its completion or a chosen and a rejected one.
-The answer states the soft label of `harness.training.lessons`, with the outcomes of the dataset's decision
-trees: the best action has most of it. Chats are messages, since a chat template is the model's own.
+The answer states the soft label of `lessons.py`, with the outcomes of the dataset's decision trees: the best
+action has most of it. Chats are messages, since a chat template is the model's own.
 """
 
 from collections.abc import Collection, Iterator
@@ -20,13 +20,13 @@ from harness.dataset import rebuilt
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
+from harness.extensions.learn.training.answers import answer
+from harness.extensions.learn.training.lessons import Lessons, label
+from harness.extensions.learn.training.questions import question
 from harness.prompts import readout
 from harness.runs.folder import Run, check_scenes, dataset_of
 from harness.runs.records import BLIND, Answer, FrozenScenes
 from harness.runs.sources import prompt_of
-from harness.training.answers import answer
-from harness.training.lessons import Lessons, label
-from harness.training.questions import question
 
 ROUNDING = 1e-9  # of probabilities that sum to 1
 

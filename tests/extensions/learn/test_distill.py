@@ -26,17 +26,24 @@ from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import load
 from harness.evaluate.agent import Agent, in_mode
+from harness.extensions.learn.training import lessons
+from harness.extensions.learn.training.answers import answer, message
+from harness.extensions.learn.training.distill import Curriculum, distill
+from harness.extensions.learn.training.lessons import Lessons, draw, label
+from harness.extensions.learn.training.model import chat
+from harness.extensions.learn.training.muon import Muon, orthogonal
+from harness.extensions.learn.training.questions import (
+    Question,
+    alone,
+    excerpts,
+    kl_nats,
+    references,
+    with_messages,
+)
+from harness.extensions.learn.training.train import STAGES, Plan, Sample, _batches
 from harness.parsing.parse import parse
 from harness.prompts import readout
 from harness.prompts import versions as prompts
-from harness.training import lessons
-from harness.training.answers import answer, message
-from harness.training.distill import Curriculum, distill
-from harness.training.lessons import Lessons, draw, label
-from harness.training.model import chat
-from harness.training.muon import Muon, orthogonal
-from harness.training.questions import Question, alone, excerpts, kl_nats, references, with_messages
-from harness.training.train import STAGES, Plan, Sample, _batches
 from harness.world.drivers import choose, constant
 from harness.world.reference import drive, finish
 from harness.world.world import World
@@ -124,7 +131,7 @@ def student(once: Any) -> Path:
     def fill(out: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(lessons, "decision_points", drawn_by(once))
-            patch.setattr("harness.training.train.LOG_STEPS", 2)
+            patch.setattr("harness.extensions.learn.training.train.LOG_STEPS", 2)
             distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
 
     return once("student", fill)
@@ -305,8 +312,8 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, as
 def test_a_killed_run_goes_on_to_the_same_model(
     student: Path, drawn_before: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
-    monkeypatch.setattr("harness.training.train.LOG_STEPS", 2)
+    monkeypatch.setattr("harness.extensions.learn.training.train.KEEP_S", 0.0)
+    monkeypatch.setattr("harness.extensions.learn.training.train.LOG_STEPS", 2)
     out = tmp_path / "student"
     for kill in (("alone", 8), ("answers", 8)):
 

@@ -17,12 +17,12 @@ from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes, sha256_file, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers
+from harness.extensions.learn.training import published
+from harness.extensions.learn.training.lessons import draw
+from harness.extensions.learn.training.model import WEIGHTS, save_tokenizer
+from harness.extensions.learn.training.student import Progress, Student
+from harness.extensions.learn.training.train import STAGES, Plan
 from harness.prompts.versions import Prompt
-from harness.training import published
-from harness.training.lessons import draw
-from harness.training.model import WEIGHTS, save_tokenizer
-from harness.training.student import Progress, Student
-from harness.training.train import STAGES, Plan
 from harness.world import scenarios
 from harness.world.scenario import Scenario
 

@@ -23,12 +23,10 @@ from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
-from harness.prompts import readout
-from harness.prompts import versions as prompts
-from harness.training.answers import cells, sights
-from harness.training.distill import Curriculum, distill
-from harness.training.lessons import Lessons, draw
-from harness.training.model import (
+from harness.extensions.learn.training.answers import cells, sights
+from harness.extensions.learn.training.distill import Curriculum, distill
+from harness.extensions.learn.training.lessons import Lessons, draw
+from harness.extensions.learn.training.model import (
     END,
     MARKS,
     VISION,
@@ -38,9 +36,11 @@ from harness.training.model import (
     take_over,
     train_tokenizer,
 )
-from harness.training.questions import Question, alone
-from harness.training.student import Student
-from harness.training.train import Plan
+from harness.extensions.learn.training.questions import Question, alone
+from harness.extensions.learn.training.student import Student
+from harness.extensions.learn.training.train import Plan
+from harness.prompts import readout
+from harness.prompts import versions as prompts
 from harness.world.perception.camera import Sight
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
@@ -60,7 +60,7 @@ CAMERA = {"sensors": ("camera", "lidar"), "indicator": "off"}
 @pytest.fixture(scope="module", autouse=True)
 def _drawn_once(once: Any) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.training.lessons.decision_points", drawn_by(once))
+        patch.setattr("harness.extensions.learn.training.lessons.decision_points", drawn_by(once))
         yield
 
 

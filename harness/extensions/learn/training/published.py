@@ -18,7 +18,7 @@ from harness.backends.transformers.engine import checkpoint, load
 from harness.backends.weights import find_gguf, hub_commit, is_gguf
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
-from harness.training import low_rank
+from harness.extensions.learn.training import low_rank
 
 WEIGHTS = "model.safetensors"
 OBJECTIVES = {  # by name, what a letter's probability is fitted to

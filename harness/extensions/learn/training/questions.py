@@ -11,10 +11,10 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.dataset.load import Scene
 from harness.evaluate.agent import in_mode
+from harness.extensions.learn.training.answers import message
+from harness.extensions.learn.training.lessons import TEACHER, Lessons
+from harness.extensions.learn.training.model import VISION
 from harness.prompts.versions import Prompt
-from harness.training.answers import message
-from harness.training.lessons import TEACHER, Lessons
-from harness.training.model import VISION
 from harness.world.drivers import CONSTANT, UNIFORM, choices, constant
 from harness.world.perception.camera import Sight
 from harness.world.scenario import Scenario

@@ -13,12 +13,12 @@ from run_on_disk import Row, answers_of, change, configure, damage, made_up, row
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset, find, load
+from harness.extensions.learn.training.lessons import label
+from harness.extensions.learn.training.pairs import pairs, preferences
 from harness.parsing.parse import parse
 from harness.parsing.status import Status
 from harness.prompts import versions as prompts
 from harness.runs.folder import read
-from harness.training.lessons import label
-from harness.training.pairs import pairs, preferences
 
 pytestmark = pytest.mark.usefixtures("unrebuilt")
 
@@ -296,3 +296,29 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
         ),
     )  # fmt: skip
     assert trainer.train().global_step == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--junit, --inspect, --sft, --dpo: give exactly one of them"),
+        (
+            ("--junit", "a.xml", "--report-seeds-too"),
+            "--report-seeds-too only goes with --sft and --dpo; give one, or leave it out",
+        ),
+        (("--csv", "--margin", "0.5"), "--margin 0.5: it goes with --dpo, and is above 0 and at most 1"),
+        (("--sft", "a.jsonl", "--margin", "0.5"), "--margin 0.5: it goes with --dpo, and is above 0"),
+        (("--dpo", "a.jsonl", "--margin", "0"), "--margin 0: it goes with --dpo, and is above 0 and at most"),
+        (("--dpo", "a.jsonl", "--margin", "nan"), "--margin nan: it goes with --dpo, and is above 0"),
+        (
+            ("--csv", "--dataset", "there"),
+            "--dataset only goes with --inspect, --sft and --dpo; leave it out",
+        ),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_line(
+    options: tuple[str, ...], said: str, proxy_run: Path, harness: Harness
+) -> None:
+    code, out, err = harness("run", "export", proxy_run, *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err

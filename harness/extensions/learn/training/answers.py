@@ -8,9 +8,9 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 from harness.core.files import canonical_json
 from harness.core.rounding import rounded
+from harness.extensions.learn.training.model import VISION
 from harness.prompts.answer_schema import plainest
 from harness.prompts.versions import Prompt
-from harness.training.model import VISION
 from harness.world.perception.camera import Sight
 from harness.world.scene_graph import Conflict, SceneGraph
 

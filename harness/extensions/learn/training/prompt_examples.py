@@ -8,10 +8,10 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.seeds import FIRST, purposes
+from harness.extensions.learn.training.answers import answer
+from harness.extensions.learn.training.lessons import Point, decision_points
 from harness.prompts.examples import Example, Examples
 from harness.prompts.versions import ROLES, Prompt
-from harness.training.answers import answer
-from harness.training.lessons import Point, decision_points
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 

@@ -1,4 +1,4 @@
-"""`harness model distill`: train a small language model in some scenarios."""
+"""`harness model distill` trains a small language model; `harness prompt examples` shows answers to any."""
 
 import time
 from pathlib import Path
@@ -8,9 +8,11 @@ import typer
 
 from harness.cli import options
 from harness.cli.progress import bar
+from harness.cli.prompt import Version
 from harness.cli.scenario import ready_to_drive
-from harness.core import extras
+from harness.core import extras, resources
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
 
 if TYPE_CHECKING:
@@ -26,7 +28,7 @@ REPORT = 0.3
 OBJECTIVES = ("imitation", "values")
 
 
-def command(
+def distill(
     scenario: list[str] = typer.Argument(
         help="Scenarios to learn; `harness dataset scenario list` shows them."
     ),
@@ -101,10 +103,10 @@ def command(
 
     from harness.backends.card import Card
     from harness.backends.transformers.engine import choose_device
-    from harness.training.distill import Curriculum
-    from harness.training.distill import distill as run
-    from harness.training.published import Adapt
-    from harness.training.train import STAGES, Objective, Plan
+    from harness.extensions.learn.training.distill import Curriculum
+    from harness.extensions.learn.training.distill import distill as run
+    from harness.extensions.learn.training.published import Adapt
+    from harness.extensions.learn.training.train import STAGES, Objective, Plan
     from harness.world import scenarios
 
     how = Adapt(*adapt) if isinstance(start, Card) else None
@@ -138,6 +140,39 @@ def command(
     typer.echo(
         f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"
     )
+
+
+def examples(
+    version: Version,
+    scenario: str = typer.Option(..., help="Scenario to take the examples from."),
+    count: int = typer.Option(2, help="Number of examples for each role, each from a layout of its own."),
+    first_seed: int = typer.Option(
+        FIRST["train"], help="Layout seed of the first example; train seeds are 100000 to 199999."
+    ),
+) -> None:
+    """Add examples to a draft: earlier turns of the chat.
+
+    They are answered as the decision trees show to be right.
+    """
+    from harness.prompts import versions as prompts
+    from harness.prompts.examples import EXAMPLES, text_of
+
+    extras.need("harness prompt examples", "highway_env")
+    draft, played = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
+    file = resources.find("prompts", version) / EXAMPLES
+    if draft.released:
+        raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
+    if draft.examples:
+        raise UserError(f"{printable(file)} is there already; delete it to draw others")
+    if reason := prompts.unfit(draft, played):
+        raise UserError(f"prompt {version} {reason}; give another --scenario, or another version")
+    from harness.extensions.learn.training import prompt_examples
+    from harness.world import scenarios
+
+    with bar("drawing layouts", count) as progress:
+        drawn = prompt_examples.examples(draft, played, count, first_seed, progress)
+    write_whole(file, text_of(drawn))
+    typer.echo(f"wrote {printable(file)} of {printable(scenarios.title(played))}: {drawn}")
 
 
 def _counts(text: str, least: int) -> list[int]:

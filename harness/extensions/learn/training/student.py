@@ -14,12 +14,18 @@ from harness.backends.tokens import token_ids, whole
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
-from harness.prompts import readout
-from harness.training.answers import CLASSES, answer, evidence, sights
-from harness.training.lessons import Lessons
-from harness.training.model import END, chat, new_model, read_tokenizer, take_over, train_tokenizer
-from harness.training.published import Published
-from harness.training.questions import (
+from harness.extensions.learn.training.answers import CLASSES, answer, evidence, sights
+from harness.extensions.learn.training.lessons import Lessons
+from harness.extensions.learn.training.model import (
+    END,
+    chat,
+    new_model,
+    read_tokenizer,
+    take_over,
+    train_tokenizer,
+)
+from harness.extensions.learn.training.published import Published
+from harness.extensions.learn.training.questions import (
     Question,
     alone,
     excerpts,
@@ -29,7 +35,17 @@ from harness.training.questions import (
     value,
     with_messages,
 )
-from harness.training.train import Curve, Plan, Sample, learnt, read_out, restore, run_stage, save
+from harness.extensions.learn.training.train import (
+    Curve,
+    Plan,
+    Sample,
+    learnt,
+    read_out,
+    restore,
+    run_stage,
+    save,
+)
+from harness.prompts import readout
 
 REHEARSED = 0.5  # read-outs that are rehearsed beside the texts, a share of these
 BARE = 0.25  # texts without free text, as constrained answers are; a share of all that can be

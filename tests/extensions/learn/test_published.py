@@ -29,12 +29,12 @@ from harness.cli import app
 from harness.core.errors import UserError
 from harness.dataset.load import Scene
 from harness.dataset.schema import Danger
+from harness.extensions.learn.training import lessons, low_rank
+from harness.extensions.learn.training.distill import Curriculum, distill
+from harness.extensions.learn.training.published import Adapt, Published
+from harness.extensions.learn.training.questions import value
+from harness.extensions.learn.training.train import Plan, fitting
 from harness.prompts import versions as prompts
-from harness.training import lessons, low_rank
-from harness.training.distill import Curriculum, distill
-from harness.training.published import Adapt, Published
-from harness.training.questions import value
-from harness.training.train import Plan, fitting
 from harness.world.reference import drive, finish
 from harness.world.world import World
 
@@ -60,8 +60,8 @@ def silent(*_: object) -> None:
 @pytest.fixture(autouse=True)
 def _quick(once: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(lessons, "decision_points", drawn_by(once))
-    monkeypatch.setattr("harness.training.train.LOG_STEPS", 2)
-    monkeypatch.setattr("harness.training.student.WATCHED", 8)
+    monkeypatch.setattr("harness.extensions.learn.training.train.LOG_STEPS", 2)
+    monkeypatch.setattr("harness.extensions.learn.training.student.WATCHED", 8)
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "cache"))
 
 
@@ -70,8 +70,8 @@ def taught(once: Any) -> Path:
     def fill(out: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(lessons, "decision_points", drawn_by(once))
-            patch.setattr("harness.training.train.LOG_STEPS", 2)
-            patch.setattr("harness.training.student.WATCHED", 8)
+            patch.setattr("harness.extensions.learn.training.train.LOG_STEPS", 2)
+            patch.setattr("harness.extensions.learn.training.student.WATCHED", 8)
             distill(CURRICULUM, PLAN, out, silent, silent, "cpu")
 
     return once("pupil", fill)
@@ -246,7 +246,7 @@ def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
 def test_a_killed_teaching_goes_on_to_the_same_adapter(
     taught: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.training.train.KEEP_S", 0.0)
+    monkeypatch.setattr("harness.extensions.learn.training.train.KEEP_S", 0.0)
     out = tmp_path / "pupil"
     for kill in (("alone", 8), ("answers", 4)):
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from harness.core.files import canonical_json, sha256_bytes
-from harness.training import lessons
+from harness.extensions.learn.training import lessons
 from harness.world.scenario import Scenario
 
 SEED = 100_001  # of the first layout; it and the next have a point at the start, and several at a level

@@ -10,7 +10,7 @@
 
 All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
 numbers in it has to come from somewhere. For the same reason each token of a picture says what it shows
-(`harness.training.answers.cells`), in every stage. A batch shares its system message, which is computed once.
+(`answers.cells`), in every stage. A batch shares its system message, which is computed once.
 """
 
 import math
@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
 from harness.core.files import replacing
-from harness.training.answers import cells
-from harness.training.model import image_processor
-from harness.training.muon import Muon
-from harness.training.published import Adapt
+from harness.extensions.learn.training.answers import cells
+from harness.extensions.learn.training.model import image_processor
+from harness.extensions.learn.training.muon import Muon
+from harness.extensions.learn.training.published import Adapt
 from harness.world.perception.camera import Sight
 
 Objective = Literal["imitation", "values"]
