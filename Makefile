@@ -14,7 +14,7 @@ SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP)
 REAL_PROMPT ?= v10
 REAL_LIMIT ?= 5
 
-.PHONY: eval real results quick test exhaustive check light browser docs bench clean
+.PHONY: eval real results quick test exhaustive core check light browser docs bench clean
 
 eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
 	$(BIN)/harness eval --model proxy
@@ -39,10 +39,18 @@ quick: .venv/dev ## nine tests of ten in a minute: all that are neither slow nor
 test: check browser ## every check, and every test that is not exhaustive
 	$(PYTEST) -m "not exhaustive" --cpu-limit 6
 
-# The last share has the tests where no engine is installed, too.
+# The last share has the tests where no engine is installed, too, and the one before the core's without extensions.
 exhaustive: .venv/dev browser ## the tests that `make test` leaves out; SHARE=K runs the K-th tenth of them, from 0 to 9
 	$(PYTEST) -m exhaustive --cpu-limit 6 $(if $(SHARE),--share $(SHARE))
+	$(if $(filter-out 8,$(SHARE)),,$(MAKE) --no-print-directory core)
 	$(if $(filter-out 9,$(SHARE)),,$(MAKE) --no-print-directory light)
+
+core: .venv/dev ## the core's own quick tests, in a copy without harness/extensions
+	rm -rf build/core && mkdir -p build/core
+	git ls-files -z | tar --create --null --files-from=- | tar --extract --directory build/core
+	rm -rf build/core/harness/extensions build/core/tests/extensions
+	cd build/core && PYTHONPATH=$(CURDIR)/build/core $(CURDIR)/$(PYTEST) -m "not slow and not exhaustive" \
+	  --hypothesis-profile quick
 
 light: .venv-light/test ## the tests without torch, llama.cpp and a browser, or ONLY some: what needs one is skipped
 	.venv-light/bin/python -m pytest -n 2 --dist worksteal -m "not exhaustive" $(ONLY)
