@@ -42,7 +42,7 @@ ROOMS = (
     "runs",
     "backends",
     "evaluate",
-    "serving",
+    "extensions",
     "report",
     "studies",
     "cli",

@@ -91,7 +91,7 @@ def serving(model: str, *options: str) -> Iterator[str]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         try:
-            yield process.stdout.readline().split()[0]
+            yield process.stdout.readline().split()[0].rstrip(",")
         finally:
             process.kill()
 

@@ -23,6 +23,8 @@ from hypothesis import settings
 from shares import SHARES, share_of
 
 from harness import cli
+from harness.cli import shell
+from harness.core import extensions
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
@@ -185,10 +187,27 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     """Skip a test that needs an extension, where the folder of all of them is deleted."""
     report = yield
     if report.failed and not EXTENSIONS.is_dir():
-        said = "\n".join([report.longreprtext, *(text for _, text in report.sections)])
+        said = "\n".join([report.longreprtext, *(text for _, text in report.sections), *GONE])
         if gone := re.search(r"part of the extension \w+, which is not", said):
             report.outcome, report.longrepr = "skipped", (str(item.path), 0, gone[0])
+    if report.when == "teardown":
+        GONE.clear()
     return report
+
+
+GONE = list[str]()  # what this test typed of extensions that are not here
+
+
+def owner_noted(command: str) -> str | None:
+    """Note that a command of an extension was typed."""
+    extension = extensions.owner(command)
+    if extension:
+        GONE.append(f"{command} is part of the extension {extension}, which is not installed")
+    return extension
+
+
+if not EXTENSIONS.is_dir():
+    shell.__dict__["owner"] = owner_noted
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

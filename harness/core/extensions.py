@@ -112,11 +112,11 @@ def added(group: str) -> Mapping[str, Any]:
     if group == GROUP:
         return {}
     kind = group.rpartition(".")[2]
-    return {
-        name: EntryPoint(name, place, group)
-        for each in extensions().values()
-        for name, place in each.adds.get(kind, {}).items()
-    }
+    by_name: dict[str, Any] = {}
+    for extension in extensions().values():  # those that ship come first
+        for name, place in extension.adds.get(kind, {}).items():
+            by_name.setdefault(name, EntryPoint(name, place, group))
+    return by_name
 
 
 @cache

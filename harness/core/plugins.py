@@ -113,7 +113,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         by_extensions = added(self.group)
         for name in by_extensions.keys() & self.built_in.keys():
             _say(f"{printable(name)!r} ({self.group}) of an extension is taken; it is left out")
-        return {**by_extensions, **entries(self.group)}
+        return {**entries(self.group), **by_extensions}
 
     def _load(self, name: str) -> T:
         entry = self._entries()[name]
