@@ -108,7 +108,7 @@ def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[.
     ("typed", "meant"),
     [
         ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", "`harness study sweep`"),
-        ("study fidelty", "`harness study fidelity`"), ("models", "`harness model`"),
+        ("study swep", "`harness study sweep`"), ("models", "`harness model`"),
         ("chanel", "`harness radio`"),
     ],
 )  # fmt: skip
