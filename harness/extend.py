@@ -11,6 +11,7 @@ from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
 from harness.core.figures import PERCENT, Unit
+from harness.core.plugins import Plugins
 from harness.evaluate.hooks import Hook
 from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical
 from harness.radio.constant import link_up
@@ -55,6 +56,7 @@ __all__ = [
     "Path",
     "PathKey",
     "Physical",
+    "Plugins",
     "Pool",
     "Registration",
     "Request",

@@ -22,6 +22,7 @@ from harness.cli.commands import COMMANDS
 from harness.core import extensions as known
 from harness.core.errors import UserError
 from harness.core.extensions import Extension
+from harness.core.plugins import Plugins
 from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import begin, unfinished
@@ -266,6 +267,19 @@ def test_a_package_adds_a_name_for_python_and_replaces_none(
     assert package.answer == 42
     assert package.load.__module__ == "harness.api"
     assert "answer" in dir(package)
+
+
+def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(installed: Installed) -> None:
+    installed(
+        odd='Extension(name="odd", adds={"tastes": {"sweet": "of_others:SWEET"}})',
+        other='Extension(name="other", adds={"tastes": {"sour": "of_others:ODD"}})',
+        sweet="'sugar'",
+    )
+    tastes = Plugins("swarmdrive.tastes", str, {})
+    assert sorted(tastes) == ["sour", "sweet"]
+    assert tastes["sweet"] == "sugar"
+    with pytest.raises(UserError, match="is of type Extension and no str"):
+        tastes["sour"]
 
 
 @pytest.mark.parametrize("name", ENTRIES[known.GROUP])
