@@ -252,7 +252,7 @@ def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_th
     stated = json.loads((run / "run.json").read_text())
     compared = 0
     for at in places(stated):
-        if closed_loop and at[0] != "world":
+        if at[0] == "settings" or (closed_loop and at[0] != "world"):  # the table has tests of its own
             continue
         fresh = True
         for changed in wrong_values(stated, at):

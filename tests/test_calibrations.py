@@ -67,7 +67,7 @@ def test_a_prior_is_the_mean_answer_and_needs_no_tree() -> None:
 
 
 @pytest.fixture
-def tuned(proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path) -> Path:
+def tuned(proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path, unrebuilt: None) -> Path:
     """A project with a calibration of the proxy."""
     (tmp_path / MARKER).touch()
     for level in ("L0", "L1"):

@@ -91,11 +91,12 @@ def test_gymnasium_finds_nothing_wrong(options: dict[str, Any], make: Make) -> N
     check_env(make(**options), skip_render_check=True)
 
 
+@pytest.mark.exhaustive
 def test_several_go_side_by_side(make: Make) -> None:
-    several = gymnasium.vector.SyncVectorEnv([lambda: make(observation="arrays")] * 3)
+    several = gymnasium.vector.SyncVectorEnv([lambda: make(observation="arrays")] * 2)
     seen, info = several.reset(seed=1)
-    assert seen["numbers"].shape == seen["known"].shape == (3, len(several.envs[0].numbers))
-    _, rewards, *_ = several.step([0, 1, 2])
+    assert seen["numbers"].shape == seen["known"].shape == (2, len(several.envs[0].numbers))
+    _, rewards, *_ = several.step([0, 2])
     assert rewards.tolist() == [values[action] - max(values) for action, values in enumerate(info["values"])]
 
 
