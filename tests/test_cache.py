@@ -197,6 +197,46 @@ def test_neither_prompt_nor_model_can_be_read_in_the_file(file: Path) -> None:
     assert b"secret-host" not in data
 
 
+# Members that no engine gives; of the last two, one is too deep and one no object.
+FORGED = [
+    '{"text": 5}', '{"text": null}', '{"finish_reason": "error"}', '{"error": "x"}',
+    '{"slow_s": -5.0}', '{"slow_s": 1e9}', '{"slow_s": "a"}', '{"completion_tokens": -9}',
+    f'{{"prompt_tokens": {10**400}}}', '{"label_mass": NaN}', '{"batch_size": "x"}', "[" * 10**5, "5",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("forged", FORGED, ids=lambda text: text[:25])
+def test_an_answer_that_no_engine_gives_is_asked_again(
+    forged: str, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Cached(Talker(), file).complete([BASE])
+    with sqlite3.connect(file) as opened:
+        [(good,)] = opened.execute("SELECT answer FROM completions")
+        if forged.startswith("{"):
+            forged = json.dumps({**json.loads(good), **json.loads(forged)})
+        opened.execute("UPDATE completions SET answer = ?", [forged])
+    opened.close()
+    assert [c.cached for c in Cached(Talker(), file).complete([BASE])] == [False]
+    assert "an answer is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["VIEW", "TRIGGER"])
+def test_a_file_that_computes_is_left_alone(
+    kind: str, file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Cached(Talker(), file).complete([BASE])
+    endless = "WITH RECURSIVE r(key, answer) AS (SELECT '', '' UNION ALL SELECT * FROM r) SELECT * FROM r"
+    with sqlite3.connect(file) as opened:
+        opened.executescript(
+            f"DROP TABLE completions; CREATE VIEW completions AS {endless}"
+            if kind == "VIEW"
+            else "CREATE TRIGGER t BEFORE INSERT ON completions BEGIN SELECT 1; END"
+        )
+    opened.close()
+    assert [c.cached for c in Cached(Talker(), file).complete([BASE])] == [False]
+    assert "a view or a trigger" in capsys.readouterr().err
+
+
 # -- the file is no more than a help ------------------------------------------------------------------------
 
 

@@ -21,6 +21,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import msgspec
+
 from harness.backends.base import (
     Backend,
     Completion,
@@ -35,6 +37,7 @@ from harness.backends.base import (
 from harness.backends.card import Card
 from harness.backends.registry import capabilities
 from harness.core import kept
+from harness.core.config import LONGEST_S
 from harness.core.errors import printable
 from harness.core.files import digest
 
@@ -58,6 +61,7 @@ NOT_IN_KEY = {
 # Fields of a completion that describe one request's handling and not the answer.
 _NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached", "server")
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
+_MOST = 10**9  # tokens of one answer, of any engine
 _EXACT = ("float32", "F32")  # number formats in which a batch changes no answer
 _WAIT_S = 30.0  # longest wait for another process that is writing
 # Environment variable: addresses of servers that serve the same, with commas; * stands for any text.
@@ -104,7 +108,7 @@ class CompletionFile:
                 rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", chunk)
         try:
             return {key: _completion(json.loads(answer)) for key, answer in rows}
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
             raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
 
     def add(self, completions: Mapping[str, Completion]) -> None:
@@ -123,6 +127,8 @@ class CompletionFile:
             file.execute("PRAGMA journal_mode = WAL")
             file.execute("PRAGMA synchronous = NORMAL")
             file.execute(_TABLE)
+            if file.execute("SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchone():
+                raise sqlite3.DatabaseError("it has a view or a trigger, which may never end")
             yield file
 
 
@@ -133,7 +139,17 @@ def _say_once(line: str, identity: str) -> None:
 
 
 def _completion(kept: dict[str, Any]) -> Completion:
-    return Completion(request_id="", seconds=None, cached=True, **kept)
+    """Return a stored completion. Raises ValueError or TypeError unless an engine can have given it."""
+    done = msgspec.convert({**kept, "request_id": "", "seconds": None, "cached": True}, Completion)
+    counts = (done.prompt_tokens, done.completion_tokens, done.batch_size, done.label_mass, done.letter_share)
+    if not (
+        kept.keys() <= set(_KEPT)
+        and all(0 <= count <= _MOST for count in counts if count is not None)
+        and 0 <= done.slow_s <= LONGEST_S
+        and done.finish_reason != "error"
+    ):
+        raise ValueError("no engine gives such a one")
+    return done
 
 
 def _sources(servers: Sequence[str]) -> dict[str, str]:
