@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import msgspec
@@ -39,8 +40,11 @@ def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
     return once("run-of-relabelled", lambda folder: run(spec, folder / "run")) / "run"
 
 
-def relabel(dataset: Path, seeds: dict[int, int]) -> None:
-    """Give a dataset's layouts other seeds, as somebody who means harm would."""
+def relabel(
+    dataset: Path, seeds: dict[int, int], of_tree: Callable[[Any], None] | None = None,
+    of_scenes: Callable[[Any], None] | None = None,
+) -> None:  # fmt: skip
+    """Give a dataset's layouts other seeds, and change trees and scenes, as somebody who means harm would."""
     with ZipFile(dataset / "layouts.zip") as file:
         entries = {each: file.read(each) for each in file.namelist()}
     manifest = json.loads((dataset / "manifest.json").read_text())
@@ -51,12 +55,16 @@ def relabel(dataset: Path, seeds: dict[int, int]) -> None:
             name = f"{number:05d}/{step}.jsonl"
             records = [json.loads(line) for line in entries[name].splitlines()]
             for point, record in zip(level, records, strict=True):
+                if of_scenes:
+                    of_scenes(record)
                 record["episode_seed"] = record["state"]["episode_seed"] = seed
                 state = msgspec.convert(record["state"], WorldState)
                 record["scene"] = point["scene"] = scene_id(number, state)
             entries[name] = "".join(json.dumps(record) + "\n" for record in records).encode()
         hashes = [sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))]
         tree["scenes_sha256"] = hashes
+        if of_tree:
+            of_tree(tree)
         entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
         manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
     manifest |= {"seed": seeds[0], "purpose": "tune"}

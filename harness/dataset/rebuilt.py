@@ -13,13 +13,14 @@ import random
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 
-from msgspec import to_builtins
+from msgspec import UNSET, to_builtins
+from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load, released
-from harness.dataset.schema import Branching, Edge, scene_id
+from harness.dataset.schema import Branching, Record, Tree, scene_id
 from harness.dataset.verify import read_manifest
 
 BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the whole tree
@@ -91,19 +92,33 @@ def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     wrong = list[int]()
     for number, frozen in zip(numbers, freeze(dataset.scenario, seeds), strict=True):
         tree = dataset.trees.read(number)
-        dataset.scenes([point.scene for level in tree.levels for point in level])  # checks their content
-        if _courses(frozen.branchings) != _courses(tree.levels):
+        # Their content is checked, too
+        there = dataset.scenes([point.scene for level in tree.levels for point in level])
+        built = [record for level in frozen.scenes for record in level]
+        if (
+            tree.danger != built[0].danger
+            or _courses(frozen.branchings, tree) != _courses(tree.levels, tree)
+            or any(_seen(ours) != _seen(scene.record) for ours, scene in zip(built, there, strict=True))
+        ):
             wrong.append(number)
     return wrong
 
 
-def _courses(levels: Sequence[Sequence[Branching]]) -> list[list[object]]:
-    """Return the decision points of a layout by step, where each action leads, and how each course ends."""
-    return [[(point.scene, list(map(_course, point.edges))) for point in level] for level in levels]
+def _courses(levels: Sequence[Sequence[Branching]], stated: Tree) -> list[list[object]]:
+    """Return the decision points of a layout by step, what drivers do there, and where each action leads.
+
+    Without what an older dataset, as its tree is stated, does not have of an edge.
+    """
+    later = {"ttc_s": UNSET, "pet_s": UNSET} if stated.levels[0][0].edges[0].ttc_s is UNSET else {}
+    return [
+        [(point.scene, point.drivers, [replace(edge, **later) for edge in point.edges]) for point in of]
+        for of in levels
+    ]
 
 
-def _course(edge: Edge) -> tuple[list[str], int | None, str | None]:
-    return edge.actions, edge.to, edge.end.result if edge.end else None
+def _seen(record: Record) -> tuple[object, ...]:
+    """Return what a scene states beside its state, whose digest is in its id."""
+    return record.danger, record.graphs, record.distance_m, record.range_m
 
 
 def _reported(scenario: str) -> Iterator[Dataset]:
