@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,12 @@ import typer
 from packaged import register
 
 from harness.backends.base import Completion, Request
+from harness.coordination.attacks import ATTACKS, Attack, Turn
 from harness.coordination.consensus import Pool, linear_pool
+from harness.coordination.intents import Intents
 from harness.coordination.rules import RULES
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import Formula
 from harness.core import parallel
 from harness.core.errors import UserError
 from harness.core.process import Stop
@@ -169,6 +174,44 @@ def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
     assert said.endswith("repair or uninstall the package that registers it\n")
     monkeypatch.setitem(RULES._loaded, "mine", Pool(linear_pool))
     assert harness(*typed, "--out", "run")[0] == 0
+
+
+class Failing(Attack):
+    """Returns what has no value for each action."""
+
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return replace(sent, helpers=sent.helpers[..., 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("worth", "says"),
+    [
+        (lambda known: 1 / 0, "schedule mine fails (ZeroDivisionError: division by zero at "),
+        (lambda known: known.may_ask[..., :2] * 1.0, "schedule mine fails (ValueError: worths of shape ("),
+    ],
+)
+def test_a_schedule_that_fails_is_one_line(
+    worth: Callable[..., Any], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCHEDULES._loaded, "mine", Formula(worth, 0.1))
+    monkeypatch.setattr(type(SCHEDULES), "__iter__", lambda self: iter(self._loaded))
+    typed = ("eval", "--dataset", two_path, "--condition", "6g:schedule=mine", "--limit", "1", "--quiet")
+    code, out, said = harness(*typed, "--out", "run")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert said.startswith(f"harness: {says}")
+
+
+@pytest.mark.slow
+def test_an_attack_that_fails_is_one_line(
+    two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "mine", Failing())
+    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
+    typed = ("eval", "--dataset", two_path, "--attack", "mine", "--limit", "1", "--quiet")
+    code, out, said = harness(*typed, "--out", "run")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert said.startswith("harness: attack Failing fails (ValueError: intents of shape (")
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ from harness.coordination.trigger import entropy_nats, normalised_entropy, trigg
 from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
+from harness.core.strangers import worded
 from harness.radio.channel import Channel, Draws, Links
 from harness.radio.roadside import Consulted, by_unit
 from harness.radio.wrapped import heard_s
@@ -162,7 +163,7 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
 
 def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
     """Return who is asked by the point's schedule, `(..., H)`."""
-    worth = SCHEDULES[point.ask.schedule].worth(_with_schedule_needs(point, known, intents, draws))
+    worth = _worth(point, _with_schedule_needs(point, known, intents, draws))
     return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
 
 
@@ -196,7 +197,16 @@ def _ask_helpers(
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Return what asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
-    return SCHEDULES[point.ask.schedule].worth(known_of(point, intents, draws))
+    return _worth(point, known_of(point, intents, draws))
+
+
+def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
+    name, wanted = point.ask.schedule, known.may_ask.shape
+    with worded(f"schedule {name}", built_in=name in SCHEDULES.built_in):
+        worth = SCHEDULES[name].worth(known)
+        if worth.shape not in (wanted, (*wanted[:-1], 1)):
+            raise ValueError(f"worths of shape {worth.shape}, not {wanted}")
+    return worth
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:

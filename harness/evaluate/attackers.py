@@ -18,6 +18,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError
+from harness.core.strangers import worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
@@ -59,9 +60,12 @@ class Attackers:
         present, said, attacking = np.isfinite(truth.range_m), truth, none_attack
         for attack in self._attacks:
             drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
-            said = attack.act(
-                said, Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
-            )
+            turn = Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
+            kind, wanted = type(attack), truth.helpers.shape
+            with worded(f"attack {kind.__name__}", built_in=kind.__module__.startswith("harness.")):
+                said = attack.act(said, turn)
+                if said.voice_of is None and said.helpers.shape != wanted:
+                    raise ValueError(f"intents of shape {said.helpers.shape}, not {wanted}")
             attacking |= drawn
         for intents, episode in zip(truth.helpers, episodes, strict=True):
             intended = self._intended.setdefault(episode, [])
