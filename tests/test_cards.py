@@ -496,3 +496,10 @@ def test_a_card_saved_with_a_byte_order_mark_is_the_same_card(shelf: Path) -> No
     write_card(shelf, "\ufeff" + MINIMAL)
     assert (shelf / "models/mine.toml").read_bytes().startswith(b"\xef\xbb\xbf")
     assert cards.load("mine") == plain
+
+
+@pytest.mark.parametrize("config", ["[" * 100_000, "5", "[]"], ids=lambda text: text[:3])
+def test_a_checkpoint_whose_config_is_no_table_is_one_line(config: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(config)
+    with pytest.raises(UserError, match="its config does not say how it takes pictures"):
+        cards.resolve(str(tmp_path))

@@ -287,7 +287,7 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
             for file in (checkpoint / "config.json", checkpoint / "preprocessor_config.json")
         )
         return read_vision(config, processor)
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f"model directory {printable(text)!r}: its config does not say how it takes pictures "
             f"({printable(repr(error), 120)}); write a card with a [vision] for it"
@@ -303,7 +303,7 @@ def _system(template: str | None) -> System | None:
 
 def _template(checkpoint: Path) -> str | None:
     """Return a checkpoint's chat template; None if its files do not say, which opening it reports."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, AttributeError, RecursionError):
         if (file := checkpoint / _TEMPLATE_FILES[0]).is_file():
             return text_of(file)
         template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")

@@ -10,6 +10,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
+from keyword import iskeyword
+from math import isfinite
 from typing import Any
 
 from harness.core import formats
@@ -189,9 +191,12 @@ def _is_setting(name: Any, setting: Any) -> bool:
         isinstance(name, str)
         and name.isidentifier()
         and name.islower()
+        and not iskeyword(name)
+        and name != "help"  # which every command has
         and isinstance(setting, Setting)
         and setting.kind in (str, int, float, bool)
         and type(setting.default) is setting.kind
+        and (setting.kind is not float or isfinite(float(setting.default)))
         and isinstance(setting.help, str)
     )
 
