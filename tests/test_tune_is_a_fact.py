@@ -136,7 +136,7 @@ def test_nothing_fits_or_learns_there(
     assert not (tmp_path / "calibrations").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_scenes_that_a_command_reports_are_not_tuned_on(tmp_path: Path) -> None:
     """Whatever seeds they have: the vehicles of a first scene tell."""
     build(scenarios.get(NAME), tmp_path / "tune", 2, 10, 1, lambda done: None)
