@@ -11,6 +11,7 @@ from run_on_disk import Row, made_up
 
 from harness.core.errors import UserError
 from harness.core.figures import Unit
+from harness.core.plugins import say_once
 from harness.dataset.load import load
 from harness.evaluate.run import evaluate
 from harness.report.compare.difference import compare
@@ -19,7 +20,7 @@ from harness.report.compare.pair import pair
 from harness.report.compare.text import terminal
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BUILT_IN, METRICS, Metric, _tell, entry, metrics_of
+from harness.runs.metrics import BUILT_IN, METRICS, Metric, entry, metrics_of
 from harness.runs.records import Score
 
 GOLDEN = Path(__file__).parent / "golden_runs" / "data"
@@ -180,7 +181,7 @@ def test_a_metric_that_does_not_work_is_one_line(
 def test_a_metric_that_fails_costs_its_own_figure(
     name: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    _tell.cache_clear()
+    say_once.cache_clear()
     before = run_of(tmp_path / "before")
     plugged_in(tmp_path, monkeypatch, f"{name} = by_hand:{name.upper()}\n")
     after = run_of(tmp_path / "after")

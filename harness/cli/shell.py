@@ -13,7 +13,7 @@ from typer.main import get_command
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD, commands, groups, panels, short, spellings
 from harness.core.errors import UserError, one_line, printable
-from harness.core.extensions import owner, taken
+from harness.core.extensions import owner, part_of, taken
 from harness.core.strangers import ended, ends_the_program, worded
 
 UNREAD = object()
@@ -137,7 +137,7 @@ class Group(TyperGroup):
 
             typed = f"{self.path} {args[0]}".strip()
             if extension := owner(typed):
-                ctx.fail(f"`harness {typed}` is part of the extension {extension}, which is not installed")
+                ctx.fail(f"`harness {typed}` is {part_of(extension)}")
             last = {
                 **spellings(),
                 **{words.split()[-1]: words for words in (*commands(), *spellings().values())},

@@ -23,7 +23,6 @@ GROUP = "swarmdrive.extensions"
 # In the metadata: by command, kind of study and name from Python, the package of the extension that has it.
 COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdrive.names"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
-OURS = "harness.extensions."
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
 TYPED = ("commands", "groups", "studies", "spellings", "short")  # tables of what somebody types
@@ -71,7 +70,7 @@ def owner(command: str) -> str | None:
     """Return the extension that has a command or group, by the metadata of what is installed; else None."""
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
-            return str(entry.value).rpartition(".")[2]
+            return _extension_of(entry)
     return None
 
 
@@ -83,9 +82,18 @@ def from_python(name: str) -> Any:
     if name in PYTHON:
         return PYTHON[name]
     if gone := entries(NAMES).get(name):
-        extension = str(gone.value).rpartition(".")[2]
-        raise UserError(f"`harness.{name}` is part of the extension {extension}, which is not installed")
+        raise UserError(f"`harness.{name}` is {part_of(_extension_of(gone))}")
     return None
+
+
+def part_of(extension: str) -> str:
+    """Return what is said of a command or name whose extension is gone."""
+    return f"part of the extension {extension}, which is not installed"
+
+
+def _extension_of(entry: Any) -> str:
+    """Return the extension that an entry of the metadata names by its package."""
+    return str(entry.value).rpartition(".")[2]
 
 
 def joined(core: Texts, kind: str) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ import os
 import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Timer
@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 from harness.core import resources
 from harness.core.errors import UserError, one_line, printable
-from harness.core.strangers import strangers
+from harness.core.strangers import aside
 
 T = TypeVar("T")
 SAID_S = 3.0  # after which a line says which package a command waits for
@@ -60,7 +60,7 @@ def is_ours(entry: Any) -> bool:
 
 
 @cache
-def _say(line: str) -> None:
+def say_once(line: str) -> None:
     """Print a line on stderr, once."""
     print(f"harness: {line}", file=sys.stderr)
 
@@ -71,7 +71,7 @@ def _waiting(what: str, entry: Any) -> Iterator[None]:
     if is_ours(entry):
         yield
         return
-    timer = Timer(SAID_S, _say, [f"waiting for {what}, which loads"])
+    timer = Timer(SAID_S, say_once, [f"waiting for {what}, which loads"])
     timer.daemon = True
     timer.start()
     try:
@@ -112,7 +112,7 @@ class Plugins(Mapping[str, T], Generic[T]):
 
         by_extensions = added(self.group)
         for name in by_extensions.keys() & self.built_in.keys():
-            _say(f"{printable(name)!r} ({self.group}) of an extension is taken; it is left out")
+            say_once(f"{printable(name)!r} ({self.group}) of an extension is taken; it is left out")
         return {**entries(self.group), **by_extensions}
 
     def _load(self, name: str) -> T:
@@ -120,8 +120,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         what = f"plug-in {printable(name)!r} ({self.group}): {printable(entry.value)}"
         repair = "repair or uninstall the package that registers it"
         try:
-            # A program may read what a command prints.
-            with _waiting(what, entry), strangers(what), redirect_stdout(sys.stderr):
+            with _waiting(what, entry), aside(what):
                 plugin: T = entry.load()
                 # A class has the methods of its instances, so it would pass the check of the protocol.
                 fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)

@@ -11,7 +11,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 
 from harness.core.errors import UserError, printable
 from harness.core.process import Stop
@@ -39,19 +39,27 @@ def strangers(what: str = "a package") -> Iterator[None]:
 
 
 @contextmanager
+def aside(what: str) -> Iterator[None]:
+    """Run code as `strangers` does; what it prints goes to stderr, since a program may read stdout."""
+    with strangers(what), redirect_stdout(sys.stderr):
+        yield
+
+
+@contextmanager
 def worded(what: str, built_in: bool = False) -> Iterator[None]:
-    """Run a package's code whose errors end a run; those of `built_in` code are raised as they are.
+    """Run a package's code whose errors end a run; code that is `built_in` runs as it is.
 
     Raises UserError, in one line that names the package's thing, `what`, and where it failed.
     """
+    if built_in:
+        yield
+        return
     try:
         with strangers(what):
             yield
     except UserError:
         raise
     except Exception as error:
-        if built_in:
-            raise
         raise UserError(
             f"{what} fails ({_raised(error)}); repair or uninstall the package that registers it"
         ) from error

@@ -8,7 +8,7 @@ from harness.backends.registry import reads_prompts
 from harness.core.errors import one_line, printable
 from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins
-from harness.core.strangers import strangers
+from harness.core.strangers import aside
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.runs import contradictions, doubts, pinned
@@ -204,7 +204,7 @@ def of_extensions(manifest: Manifest) -> Iterator[str]:
     """Yield what extensions say of a run; one that fails says so itself."""
     for name, of in CAVEATS.usable().items():
         try:
-            with strangers(f"caveat {printable(name)}"):
+            with aside(f"caveat {printable(name)}"):
                 yield from map(str, of(manifest))
         except Exception as error:  # a package's code
             yield f"The caveat {printable(name)} of a package failed: {one_line(error)}."

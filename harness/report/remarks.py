@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 from harness.core.errors import UserError, one_line
 from harness.core.plugins import Plugins
-from harness.core.strangers import strangers
+from harness.core.strangers import aside
 from harness.report.runs import Runs
 from harness.report.templating import visible
 from harness.runs.folder import Run
@@ -73,7 +73,7 @@ def _of(name: str, ask: Callable[[Remarks], T]) -> T:
     except UserError as error:
         raise _Failed(str(error)) from error
     try:
-        with strangers(f"remarks {name}"):
+        with aside(f"remarks {name}"):
             return ask(remarks)
     except UserError:
         raise

@@ -4,15 +4,13 @@ An extension adds one by `adds={"sections": {"name": "module:function"}}`. The f
 and returns a `Section`, or None where it has nothing to say of that run.
 """
 
-import sys
 from collections.abc import Callable
-from contextlib import redirect_stdout
 
 from markupsafe import Markup
 
 from harness.core.errors import UserError, one_line, printable
 from harness.core.plugins import Plugins
-from harness.core.strangers import strangers
+from harness.core.strangers import aside
 from harness.report.document import Section
 from harness.report.runs import Runs
 from harness.report.templating import environment
@@ -32,7 +30,7 @@ def sections(runs: Runs) -> list[tuple[str, Markup]]:
 
 def _written(name: str, run: Run) -> tuple[str, Markup] | None:
     try:
-        with strangers(f"section {printable(name)}"), redirect_stdout(sys.stderr):
+        with aside(f"section {printable(name)}"):
             section = SECTIONS[name](run)
             return None if section is None else (section.title, _content(section))
     except Exception as error:  # a package's code

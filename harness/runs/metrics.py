@@ -4,9 +4,7 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 """
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, Protocol, get_args
@@ -18,7 +16,7 @@ from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, one_line, printable
 from harness.core.figures import PERCENT, POINTS, Unit, shown
-from harness.core.plugins import Plugins
+from harness.core.plugins import Plugins, say_once
 from harness.core.statistics import (
     LEVEL,
     Estimate,
@@ -33,7 +31,7 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
-from harness.core.strangers import strangers
+from harness.core.strangers import aside
 from harness.parsing.status import Repair
 from harness.runs import leading, reliability
 from harness.runs.decisions import Decisions
@@ -515,7 +513,7 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
         return values()
     what = f"metric {printable(metric.name)} of a package"
     try:
-        with strangers(what), redirect_stdout(sys.stderr):
+        with aside(what):
             found = values()
         if found.shape != (n,):
             raise ValueError(f"it has values of shape {found.shape}, not ({n},)")
@@ -523,15 +521,9 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
             raise ValueError(f"it has values beyond 0 to {metric.most:g}")
     except Exception as error:  # a stranger's code
         shown = one_line(error).removeprefix(f"{what} ") or type(error).__name__
-        _tell(f"{what}: {shown}; its figure is unknown")
+        say_once(f"{what}: {shown}; its figure is unknown")  # though figures are computed part by part
         return np.full(n, np.nan)
     return found
-
-
-@lru_cache(64)
-def _tell(line: str) -> None:
-    """Print a line once: figures are computed part by part."""
-    print(f"harness: {line}", file=sys.stderr)
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:

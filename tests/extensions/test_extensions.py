@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from harness.runs import metrics
 from harness.runs.metrics import METRICS, entry
 
 ROOT = Path(__file__).parents[2]
-OURS = ROOT / "harness" / "extensions"
+OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 Said = tuple[int, str, str]
@@ -54,11 +54,11 @@ def of_the_page(folder: Path) -> Path:
     return folder
 
 
-def in_process(site: Path, folder: Path, *typed: str) -> Said:
-    """Type a command in a process of its own that has a folder of packages."""
+def in_process(packages: Sequence[Path], folder: Path, *typed: str) -> Said:
+    """Type a command in a process of its own that has these folders of packages."""
     done = subprocess.run(
         [sys.executable, "-m", "harness", *typed], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(site)])}, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, packages))}, check=False,
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 
@@ -71,7 +71,7 @@ def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: P
     subprocess.run([*pip, str(of_the_page(tmp_path / "package"))], check=True)
     asked = ("--model", "proxy", "--condition", "6g", "--seeds", "0:2", "--dataset", str(two_path))
     typed = ("--doubt-above", "0.25", "--quiet", "--out", "reports/run")
-    assert in_process(site, tmp_path, "eval", *asked, *typed) == (0, "", "")
+    assert in_process([ROOT, site], tmp_path, "eval", *asked, *typed) == (0, "", "")
     stated = tomllib.loads((tmp_path / "reports" / "run" / "run.toml").read_text())
     assert stated["extensions"] == {"doubt_above": 0.25}
     manifest = json.loads((tmp_path / "reports" / "run" / "run.json").read_text())
@@ -81,17 +81,19 @@ def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: P
     assert "<h2>Doubt</h2>" in page
     assert page.count("Decisions in doubt") == 2  # its head, and the name of its region
     assert "decisions have a normalised entropy above 0.25." in page
-    again = in_process(site, tmp_path, "eval", "reports/run", "--quiet", "--out", "reports/again")
+    again = in_process([ROOT, site], tmp_path, "eval", "reports/run", "--quiet", "--out", "reports/again")
     assert again == (0, "", "")
     other = tmp_path / "reports" / "again" / "run.json"
     assert json.loads(other.read_text())["settings"]["extensions"] == {"doubt_above": 0.25}
     assert "doubt_rate" in (tmp_path / "reports" / "run" / "summary.csv").read_text()
-    code, out, err = in_process(site, tmp_path, "study", "doubt", "reports/run", "--out", "reports/doubt")
+    code, out, err = in_process(
+        [ROOT, site], tmp_path, "study", "doubt", "reports/run", "--out", "reports/doubt"
+    )
     assert (code, err) == (0, "")
     assert out.startswith("Doubt of run\n1 of 1 conditions have the metric.\n")
-    listed = json.loads(in_process(site, tmp_path, "run", "ls", "--json")[1])
+    listed = json.loads(in_process([ROOT, site], tmp_path, "run", "ls", "--json")[1])
     assert {one["name"]: one["kind"] for one in listed} == {"run": "eval", "again": "eval", "doubt": "doubt"}
-    assert "\n  doubt " in in_process(site, tmp_path, "study", "--help")[1]
+    assert "\n  doubt " in in_process([ROOT, site], tmp_path, "study", "--help")[1]
 
 
 @pytest.fixture
@@ -289,13 +291,13 @@ def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(installed: Installed) 
 def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     """They say what a command or study was part of where its folder is gone."""
     extension = known.extensions()[name]
-    assert ENTRIES[known.GROUP][name] == f"{known.OURS}{name}:EXTENSION"
+    assert ENTRIES[known.GROUP][name] == f"{PACKAGES}{name}:EXTENSION"
     for group, names in (
         (known.COMMANDS, extension.commands),
         (known.STUDIES, extension.studies),
         (known.NAMES, extension.adds.get("python", {})),
     ):
-        named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{known.OURS}{name}"}
+        named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"}
         assert named == set(names)
 
 
@@ -325,30 +327,22 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
-def without_extensions(core: Path, folder: Path, *typed: str) -> Said:
-    done = subprocess.run(
-        [sys.executable, "-m", "harness", *typed], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(core)}, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
-
-
 @pytest.mark.slow
 def test_the_core_writes_the_same_run_without_extensions(
     core: Path, two_path: Path, harness: Typed, tmp_path: Path
 ) -> None:
     asked = ("eval", "--model", "proxy", "--dataset", str(two_path), "--seeds", "0:2", "--quiet")
-    assert without_extensions(core, tmp_path, *asked, "--out", "without") == (0, "", "")
+    assert in_process([core], tmp_path, *asked, "--out", "without") == (0, "", "")
     assert harness(*asked, "--out", "with") == (0, "", "")
     for file in ("answers.jsonl", "episodes.csv", "summary.csv", "decisions.parquet"):
         one, other = ((tmp_path / run / file).read_bytes() for run in ("without", "with"))
         assert one == other, file
-    assert without_extensions(core, tmp_path, "--help")[0] == 0
+    assert in_process([core], tmp_path, "--help")[0] == 0
 
 
 @pytest.mark.parametrize("command", ["serve"])
 def test_a_command_that_is_gone_says_what_it_was_part_of(core: Path, tmp_path: Path, command: str) -> None:
-    code, out, err = without_extensions(core, tmp_path, *command.split())
+    code, out, err = in_process([core], tmp_path, *command.split())
     assert (code, out) == (2, "")
     extension = ENTRIES[known.COMMANDS][command].rpartition(".")[2]
     assert err.startswith(
