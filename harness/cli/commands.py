@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 from harness.core.extensions import extensions, joined
 
-# The function behind each command, as `module:function` of this package, or of another whose dotted name is
-# given. A module alone stands for its function `command`.
+# The function behind each command, as `module:function` of this package. A module alone stands for its
+# function `command`.
 COMMANDS = {
     "init": "init",
     "eval": "eval",

@@ -90,11 +90,12 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         problems = verify.check(path) or list(rebuilt.differences(load.load(path)))
     manifest, digest = verify.read_manifest(path)
     lost = 0 if problems else load.load(path).lost
+    built_again = find_spec("highway_env") is not None
     if as_json:
         counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
         echo_json({
             **counts, "sha256": digest, "problems": problems, "lost_before_first_action": lost,
-            "built_again": find_spec("highway_env") is not None,
+            "built_again": built_again,
         })  # fmt: skip
     elif problems:
         typer.echo("\n".join(problems))
@@ -103,7 +104,7 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
             f"{manifest.name} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"
             f"manifest sha256 {digest}"
         )
-        if find_spec("highway_env") is None:
+        if not built_again:
             typer.echo("no layout was built again from its seed, since highway-env is not installed")
         if lost:
             console().print(

@@ -9,6 +9,7 @@ from typing import Any
 import typer
 
 from harness.cli import options
+from harness.cli.options import as_command
 from harness.cli.progress import bar
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
@@ -64,10 +65,7 @@ def _with_formats(command: Any) -> Any:
     parameters = []
     for each in inspect.signature(command).parameters.values():
         parameters += instead.get(each.name, [each.replace(kind=inspect.Parameter.KEYWORD_ONLY)])
-    typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    typed.__annotations__ = {each.name: each.annotation for each in parameters}
-    typed.__doc__, typed.__name__ = command.__doc__, command.__name__
-    return typed
+    return as_command(typed, command, parameters)
 
 
 def _file(flag: str, format: Export) -> inspect.Parameter:

@@ -218,12 +218,17 @@ def takes(
         own = list(inspect.signature(command).parameters.values())[1:]
         own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
         parameters = [file, *settings, *own]
-        typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        typed.__annotations__ = {each.name: each.annotation for each in parameters}
-        typed.__doc__, typed.__name__ = command.__doc__, command.__name__
-        return typed
+        return as_command(typed, command, parameters)
 
     return decorate
+
+
+def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
+    """Return a function as typer reads it: with these parameters, and the name and help of a command."""
+    typed.__signature__ = inspect.Signature(parameters)
+    typed.__annotations__ = {each.name: each.annotation for each in parameters}
+    typed.__doc__, typed.__name__ = command.__doc__, command.__name__
+    return typed
 
 
 def _parameter(option: stated.Option) -> inspect.Parameter:

@@ -66,8 +66,8 @@ def check(
 ) -> None:
     """Compute runs again from their own answers; compare each number.
 
-    No model is asked; rule-based drivers are. Of a driven run, tables are held against each other, and three
-    episodes are driven again with their recorded actions. Exit code 1 means that a number differs.
+    No model is asked; rule-based drivers are. Of a driven run, the tables are compared with each other, and
+    three episodes are driven again with their recorded actions. Exit code 1 means that a number differs.
     """
     silent = as_json or quiet
     lines = [_checked(run, dataset, silent) for run in _runs_in(runs)]

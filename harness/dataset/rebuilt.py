@@ -8,8 +8,6 @@ so that only a few are built. Which ones follows from the dataset and from the n
 a command again draws no others, and who made the dataset does not know them.
 """
 
-import platform
-import random
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 
@@ -21,6 +19,7 @@ from harness.core.files import digest
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load, released
 from harness.dataset.schema import Branching, Record, Tree, scene_id
+from harness.dataset.select import spot_check
 from harness.dataset.verify import read_manifest
 
 BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the whole tree
@@ -69,8 +68,7 @@ def differences(dataset: Dataset) -> Iterator[str]:
 
 def drawn(dataset: Dataset, count: int) -> list[int]:
     """Draw layouts, always the same of a dataset on a machine."""
-    draw = random.Random(f"{dataset.sha256} {platform.node()}")
-    return draw.sample(dataset.episodes, min(count, len(dataset.episodes)))
+    return spot_check(dataset.episodes, dataset.sha256, count)
 
 
 def _other_starts(dataset: Dataset, numbers: Sequence[int]) -> list[int]:

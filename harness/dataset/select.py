@@ -1,12 +1,16 @@
 """Select the episodes of a dataset that are evaluated."""
 
+import platform
+import random
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import TypeVar
 
 from harness.core import noise
 from harness.core.errors import UserError, printable, unknown
 from harness.dataset.load import Dataset
 
+T = TypeVar("T")
 NONE = "none"  # the `danger` of layouts without one
 
 
@@ -81,3 +85,15 @@ def _numbers(text: str, end: int) -> set[int]:
             )
         numbers.update(span)
     return numbers
+
+
+def spot_check(items: Sequence[T], sha256: str, most: int) -> list[T]:
+    """Draw some of the items of a file, always the same on a machine; who made the file does not know them.
+
+    Args:
+        items: what is drawn from.
+        sha256: digest of the file.
+        most: how many, where there are as many.
+    """
+    draw = random.Random(f"{sha256} {platform.node()}")
+    return draw.sample(items, min(most, len(items)))

@@ -1,7 +1,5 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
-import platform
-import random
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -23,7 +21,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.dataset.load import Dataset
-from harness.dataset.select import Selection
+from harness.dataset.select import Selection, spot_check
 from harness.evaluate import latency as latencies
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
@@ -146,12 +144,6 @@ def _null(table: Any, name: str) -> bool:
     return name not in table.column_names or table[name].null_count == len(table)
 
 
-def drawn(run: Run) -> list[Episode]:
-    """Draw a few episodes of a driven run, always the same of a run on a machine."""
-    draw = random.Random(f"{sha256_file(run.path / 'episodes.csv')} {platform.node()}")
-    return draw.sample(run.episodes, min(AGAIN, len(run.episodes)))
-
-
 def driven_otherwise(run: Run) -> Iterator[str]:
     """Yield what episodes.csv says otherwise of a few episodes than the simulator, by the recorded actions.
 
@@ -160,7 +152,7 @@ def driven_otherwise(run: Run) -> Iterator[str]:
     from harness.evaluate.replay import driven_again, played
 
     yield from _of_latency(run)
-    for stated in drawn(run):
+    for stated in spot_check(run.episodes, sha256_file(run.path / "episodes.csv"), AGAIN):
         here = driven_again(played(run, stated.episode, stated.condition, stated.seed))
         for name, _ in differing([stated], [here]):
             if name in OF_ENDS and (current(run) or getattr(stated, name) is not None):

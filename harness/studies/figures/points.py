@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,9 +12,6 @@ from harness.core.statistics import Estimate
 from harness.report.drawing.colours import INK, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.studies.figures.axes import key, lettered, plain
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
