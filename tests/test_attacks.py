@@ -1,7 +1,8 @@
 """Attacks, played by hand: what reaches the channel in place of what helpers intend."""
 
 import json
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from swarm_extras import MUMBLE
 
-from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Turn, attackers, attacks_of
+from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Attack, Turn, attackers, attacks_of
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
@@ -224,6 +225,38 @@ def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
     assert (told.intents.helpers[:, :3][honest] == p[honest]).all()
     assert (told.intents.distance_m[:, 1:4][honest] == truth.distance_m[:, 1:][honest]).all()
     assert told.intents.helpers.shape[1] == told.draws.jitter.shape[1] == told.attackers.shape[1]
+
+
+@dataclass(frozen=True)
+class Bent(Attack):
+    """Does what no attacker can."""
+
+    way: str = ""
+
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        if self.way == "write":
+            sent.helpers[...] = 1 / 3
+        if self.way == "own":
+            return replace(sent, own=np.array(BOLD))
+        if self.way == "sums":
+            return self.intend(sent, turn, sent.helpers * 2)
+        return replace(sent, helpers=np.full_like(sent.helpers, 1 / 3))
+
+
+@pytest.mark.parametrize(
+    ("way", "says"),
+    [
+        ("write", "assignment destination is read-only"), ("own", "it changes the ego's own intent"),
+        ("sums", "intents that are no distributions"), ("others", "it changes what a helper says"),
+    ],
+)  # fmt: skip
+def test_a_packages_attack_says_what_an_attacker_can_or_is_one_line(
+    way: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "bent", Bent())
+    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
+    with pytest.raises(UserError, match=re.escape(f"attack Bent fails (ValueError: {says}")):
+        Attackers(under(f"bent:way={way}")).said(many(TRUTH, 9), drawn(range(9)), [(n, n) for n in range(9)])
 
 
 @pytest.mark.usefixtures("plugin")

@@ -3,8 +3,10 @@
 The two are of `tests/plugin`, here put where an entry point would put them.
 """
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +14,18 @@ from packaged import register
 from swarm_extras import FOG, SMOOTHING, Fog
 
 from harness.coordination.claims import Claims
-from harness.coordination.consensus import Messages, Rule
+from harness.coordination.consensus import Messages, Pool, Rule, linear_pool
 from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
+from harness.coordination.schedules import SCHEDULES
+from harness.coordination.scheduling import Formula, ScheduleInputs
+from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
-from harness.radio.channel import Channel, Draws, Links, Site, Unit
+from harness.radio.channel import Channel, Delivery, Draws, Links, Site, Unit
 from harness.radio.constant import Radio
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
@@ -277,6 +282,91 @@ def test_a_package_that_does_not_work_is_one_line(name: str, says: str):
     with pytest.raises(UserError, match=says) as error:
         OperatingPoint.of("x", name)
     assert "\n" not in str(error.value)
+
+
+def writes(array: Floats) -> None:
+    """Write into an array that somebody else reads, as a package's code may."""
+    array[...] = 0.5
+
+
+def pooled(p: Floats, weights: Floats) -> Floats:
+    writes(p)
+    return linear_pool(p, weights)
+
+
+@pytest.mark.parametrize(
+    ("pool", "says"),
+    [
+        (lambda p, w: linear_pool(p, w) * np.nan, "fused policies that are no distributions, such as [nan"),
+        (lambda p, w: linear_pool(p, w) * 2, "fused policies that are no distributions, such as [1.0, 1.0"),
+        (lambda p, w: [[0.5, 0.5]], "fused policies of shape (1, 2), not (2,)"),
+        (pooled, "assignment destination is read-only"),
+    ],
+)
+def test_a_packages_rule_returns_distributions_and_writes_to_nothing(
+    pool: Any, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RULES._loaded, "mine", Pool(pool))
+    monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
+    with pytest.raises(UserError, match=re.escape(f"rule mine fails (ValueError: {says}")):
+        coordinate(OperatingPoint.of("x", "6g", tau_nats=0.0, consensus="mine"), *three(link=0.99))
+
+
+def not_a_number(known: ScheduleInputs) -> Floats:
+    return known.range_m * np.nan
+
+
+def reaching(known: ScheduleInputs) -> Floats:
+    writes(known.may_ask)
+    return known.range_m
+
+
+@pytest.mark.parametrize(
+    ("worth", "says"),
+    [(not_a_number, "a worth that is NaN for"), (reaching, "assignment destination is read-only")],
+)
+def test_a_packages_schedule_says_what_asking_is_worth_and_writes_to_nothing(
+    worth: Any, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCHEDULES._loaded, "mine", Formula(worth, 0.1))
+    monkeypatch.setattr(type(SCHEDULES), "__iter__", lambda self: iter(self._loaded))
+    with pytest.raises(UserError, match=re.escape(f"schedule mine fails (ValueError: {says}")):
+        coordinate(OperatingPoint.of("x", "6g", schedule="mine"), *three())
+
+
+@dataclass(frozen=True)
+class Bent(Fog):
+    """A channel that fails, or says what cannot be."""
+
+    way: str = ""
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        right = super().deliver(links, draws)
+        if self.way == "read-only":
+            writes(links.asked)
+        ways = {
+            "integers": right._replace(up=right.up.astype(int)),
+            "delay": right._replace(delay_s=-right.delay_s),
+            "loss": right._replace(loss=right.loss + 1.0),
+            "shape": right._replace(up=right.up[..., :1]),
+        }
+        return ways[self.way]
+
+
+@pytest.mark.parametrize(
+    ("way", "says"),
+    [
+        ("integers", "ValueError: up of type int64, not bool"), ("read-only", "ValueError: assignment"),
+        ("delay", "ValueError: a delay that is negative or NaN"), ("loss", "ValueError: a loss that is no"),
+        ("shape", "ValueError: up of shape (1,), not (3,)"), ("other", "KeyError: 'other'"),
+    ],
+)  # fmt: skip
+def test_a_packages_channel_delivers_what_can_be_or_is_one_line(
+    way: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(CHANNELS._loaded, "fog", Bent(way=way))
+    with pytest.raises(UserError, match=re.escape(f"channel profile fog fails ({says}")):
+        coordinate(OperatingPoint.of("x", "fog", tau_nats=0.0), *three())
 
 
 def test_what_is_built_in_needs_no_look_at_the_packages(monkeypatch: pytest.MonkeyPatch):

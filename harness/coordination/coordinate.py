@@ -11,13 +11,22 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from harness.coordination.consensus import Messages, capped, inverse_distance_weights
+from harness.coordination.consensus import Fused, Messages, capped, inverse_distance_weights
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
-from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
+from harness.core.arrays import (
+    Bools,
+    Floats,
+    Ints,
+    any_of,
+    check_distributions,
+    check_shape,
+    count_of,
+    read_only,
+)
 from harness.core.strangers import worded
 from harness.radio.channel import Draws
 
@@ -107,17 +116,12 @@ def fuse(
     else:
         if point.has_fusion_call:  # the ego's own intent is its answer to the larger graph
             p[..., 0, :] = fused
-        name, (*batch, vehicles, actions) = point.fusion.consensus, p.shape
-        rule = RULES[name]
         messages = Messages(
             p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims,
             intents.plans,
         )  # fmt: skip
-        with worded(f"rule {name}", built_in=name in RULES.built_in):
-            state = rule.start(tuple(batch), vehicles - 1, actions) if fusion.state is None else fusion.state
-            fused, weights, state, rule_trust = rule.fuse(messages, state)
-            if fused.shape != heard.own.shape:
-                raise ValueError(f"fused policies of shape {fused.shape}, not {heard.own.shape}")
+        name = point.fusion.consensus
+        fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where(heard_any[..., None], fused, heard.own)
     unknown = np.isnan(intents.inference_s[..., 0]) & (point.cloud.round_trip_s is None)
@@ -132,6 +136,28 @@ def fuse(
         state=state,
         trust=trust,
     )
+
+
+def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
+    """Let a rule fuse, from its memory at the episodes' first step if `state` is None.
+
+    A package's rule cannot write to what it gets. Raises UserError if it fails, or if what it returns where
+    somebody was heard is no distribution.
+    """
+    *batch, vehicles, actions = messages.intents.shape
+    with worded(f"rule {name}", built_in=name in RULES.built_in):
+        rule = RULES[name]
+        memory = rule.start(tuple(batch), vehicles - 1, actions) if state is None else state
+        if name in RULES.built_in:
+            return rule.fuse(messages, memory)
+        fused = rule.fuse(read_only(messages), read_only(memory))
+        check_shape("fused policies", fused.policy, (*batch, actions))
+        check_distributions("fused policies", fused.policy, any_of(messages.heard))
+        check_shape("weights", fused.weights, (*batch, vehicles))
+        check_shape("memory", fused.state, memory.shape)
+        if fused.trust is not None:
+            check_shape("trust", fused.trust, (*batch, vehicles - 1))
+    return fused
 
 
 def _likeliest(policy: Floats, ties: TieDraws | None) -> Ints:

@@ -32,13 +32,13 @@ from harness.coordination.parts import FUSION
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ScheduleInputs, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
-from harness.core.arrays import Bools, Floats, Ints, any_of, count_of
+from harness.core.arrays import Bools, Floats, Ints, any_of, check_shape, count_of, read_only
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.core.strangers import worded
 from harness.radio.channel import Channel, Draws, Links
 from harness.radio.roadside import Consulted, by_unit
-from harness.radio.wrapped import heard_s
+from harness.radio.wrapped import delivered, heard_s, is_ours
 
 
 @dataclass(frozen=True)
@@ -185,14 +185,15 @@ def _ask_helpers(
         asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
         point.request_bits, intents.site,
     )  # fmt: skip
-    if point.radio.edge == FUSION and point.physical and point.unit:
-        until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
-        remaining_s = until_s - request_s[..., 0]
-        outcome = by_unit(
-            point.physical, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
-        )
-        return request_s, outcome, until_s
-    return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
+    with worded(f"channel profile {point.radio.profile}", built_in=is_ours(point.channel)):
+        if point.radio.edge == FUSION and point.physical and point.unit:
+            until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
+            remaining_s = until_s - request_s[..., 0]
+            outcome = by_unit(
+                point.physical, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
+            )
+            return request_s, outcome, until_s
+        return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
 
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
@@ -201,11 +202,14 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
 
 
 def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
-    name, wanted = point.ask.schedule, known.may_ask.shape
-    with worded(f"schedule {name}", built_in=name in SCHEDULES.built_in):
-        worth = SCHEDULES[name].worth(known)
-        if worth.shape not in (wanted, (*wanted[:-1], 1)):
-            raise ValueError(f"worths of shape {worth.shape}, not {wanted}")
+    name, shape = point.ask.schedule, known.may_ask.shape
+    if name in SCHEDULES.built_in:
+        return SCHEDULES[name].worth(known)
+    with worded(f"schedule {name}"):
+        worth = SCHEDULES[name].worth(read_only(known))
+        check_shape("worths", worth, shape, (*shape[:-1], 1))
+        if np.any(np.isnan(worth) & known.may_ask):
+            raise ValueError("a worth that is NaN for a helper that may be asked")
     return worth
 
 
@@ -265,14 +269,14 @@ def _ask_directly(
     """Let the ego ask the helpers itself, and wait until the last slot has ended."""
     request = channel.request(links.request_bits, draws)
     ready_s = ready(heard_s(channel, request, links, draws))
-    up, end_s, loss, airtime_s = channel.deliver(replace(links, ready_s=ready_s), draws)
-    requested, delivered = any_of(links.asked), links.asked & up
+    up, end_s, loss, airtime_s = delivered(channel, replace(links, ready_s=ready_s), draws)
+    requested, received = any_of(links.asked), links.asked & up
     replies_s = np.sum(np.where(links.asked, airtime_s, 0.0), axis=-1)
     return Consulted(
         asked=links.asked,
-        up=delivered,
+        up=received,
         end_s=end_s,
-        fused=delivered,
+        fused=received,
         acts_s=np.max(np.where(links.asked, end_s, 0.0), axis=-1, initial=0.0),
         loss=loss,
         requests=requested.astype(int),

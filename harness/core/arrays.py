@@ -1,6 +1,9 @@
 """Types of the arrays that rules take and return. `(...)` in a docstring means any number of batch dims."""
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from functools import reduce
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +13,9 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 Texts = NDArray[np.str_]
 Pixels = NDArray[np.uint8]  # of a picture, (height, width, 3) red, green and blue
+
+T = TypeVar("T")
+ROUNDING = 1e-6  # by which the probabilities of a distribution may miss a sum of 1
 
 
 def summed(values: Floats, axis: int) -> Floats:
@@ -34,3 +40,37 @@ def count_of(flags: Bools) -> Ints:
     none = np.zeros(flags.shape[:-1], dtype=np.int64)
     count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
     return count
+
+
+def read_only(value: T) -> T:
+    """Return an array, or a dataclass or mapping of some, with views that nobody can write to.
+
+    So code of a package that writes to its arguments raises ValueError, and moves nothing that others read.
+    """
+    given: Any = value
+    if isinstance(given, np.ndarray):
+        given = given.view()
+        given.flags.writeable = False
+    elif isinstance(given, Mapping):
+        given = {name: read_only(each) for name, each in given.items()}
+    elif is_dataclass(given) and not isinstance(given, type):
+        parts = {field.name: read_only(getattr(given, field.name)) for field in fields(given)}
+        given = replace(given, **parts)
+    result: T = given
+    return result
+
+
+def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
+    """Raise ValueError unless `values` is an array of one of the shapes."""
+    shape = np.shape(values)
+    if not isinstance(values, np.ndarray) or shape not in allowed:
+        raise ValueError(f"{name} of shape {shape}, not {' or '.join(map(str, allowed))}")
+
+
+def check_distributions(name: str, values: Floats, where: Bools) -> None:
+    """Raise ValueError unless the rows (..., A) at `where` (...) are distributions."""
+    rows = values[where]
+    sums_to_one = np.abs(np.sum(rows, axis=-1) - 1.0) <= ROUNDING
+    wrong = ~(sums_to_one & np.all(rows >= 0.0, axis=-1))
+    if wrong.any():
+        raise ValueError(f"{name} that are no distributions, such as {rows[wrong][0].tolist()}")

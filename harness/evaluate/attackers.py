@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.attacks import Turn, attackers, attacks_of
+from harness.coordination.attacks import Attack, Turn, attackers, attacks_of
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, check_distributions, check_shape, read_only
 from harness.core.errors import UserError
 from harness.core.strangers import worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
@@ -61,11 +61,7 @@ class Attackers:
         for attack in self._attacks:
             drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
             turn = Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
-            kind, wanted = type(attack), truth.helpers.shape
-            with worded(f"attack {kind.__name__}", built_in=kind.__module__.startswith("harness.")):
-                said = attack.act(said, turn)
-                if said.voice_of is None and said.helpers.shape != wanted:
-                    raise ValueError(f"intents of shape {said.helpers.shape}, not {wanted}")
+            said = _acted(attack, said, turn)
             attacking |= drawn
         for intents, episode in zip(truth.helpers, episodes, strict=True):
             intended = self._intended.setdefault(episode, [])
@@ -87,6 +83,27 @@ class Attackers:
             if steps:
                 first[decision, : len(steps[0])] = steps[0][: first.shape[1]]
         return first, past
+
+
+def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
+    """Let an attack act. A package's cannot write to what it gets, and says only what a message can hold.
+
+    Raises UserError if it fails, changes the ego's own intent, or lets a voice say no distribution.
+    """
+    kind = type(attack)
+    if kind.__module__.startswith("harness."):
+        return attack.act(said, turn)
+    with worded(f"attack {kind.__name__}"):
+        after = attack.act(read_only(said), read_only(turn))
+        if after.voice_of is None:
+            check_shape("intents", after.helpers, said.helpers.shape)
+            honest = ~turn.attackers
+            if not np.array_equal(after.helpers[honest], said.helpers[honest], equal_nan=True):
+                raise ValueError("it changes what a helper says that is no attacker")
+        check_distributions("intents", after.helpers, after.valid)
+        if not np.array_equal(after.own, said.own, equal_nan=True):
+            raise ValueError("it changes the ego's own intent")
+    return after
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:

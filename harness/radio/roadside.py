@@ -18,7 +18,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import ByLink, Delivery, Draws, Links, Physical, Site, Unit
-from harness.radio.wrapped import Wrapped, heard_s, innermost
+from harness.radio.wrapped import Wrapped, delivered, heard_s, innermost
 
 EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
 
@@ -37,10 +37,11 @@ class Relay(Wrapped):
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A lost reply keeps its slot, and that of its copy if there is one."""
-        up, delay_s, loss, airtime_s = self.channel.deliver(links, draws)
+        up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
         has_request = draws.packet[..., 0] >= link_loss(self.channel, links.where, draws, links.request_bits)
         at_unit = links.where.units[self.unit]
-        there = self.channel.deliver(
+        there = delivered(
+            self.channel,
             replace(links, asked=links.asked & has_request, site=at_unit.select(HELPERS)),
             draws.of(".roadside").requested,
         )
@@ -114,7 +115,7 @@ def by_unit(
     unit_s = heard_s(channel, to_unit, ego_link, to_ego.first)
     ready_s = ready(unit_s + delay_s + heard_s(channel, ask, helper_links, to_helpers))
     asked = links.asked & reached[..., None]
-    replies = channel.deliver(replace(helper_links, asked=asked, ready_s=ready_s), to_helpers)
+    replies = delivered(channel, replace(helper_links, asked=asked, ready_s=ready_s), to_helpers)
     back = channel.request(bits, replace(to_ego, given=back_draw[..., None]))
     back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").first)[..., 0]
     latest_s = left_s - back_s

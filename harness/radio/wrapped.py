@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core.arrays import Floats, Ints
+from harness.core.arrays import Floats, Ints, check_shape, read_only
 from harness.radio.channel import REQUEST, Broadcast, ByLink, Channel, Delivery, Draws, Links, Physical, Site
 
 
@@ -37,6 +37,35 @@ class Wrapped:
 def innermost(channel: Channel) -> Channel:
     """Return the innermost channel, without wrappers."""
     return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
+
+
+def is_ours(channel: Channel) -> bool:
+    """Return whether a channel's model is the harness's own, and no package's."""
+    return type(innermost(channel)).__module__.startswith("harness.")
+
+
+def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
+    """Let a channel deliver. A package's cannot write to what it gets, and what it returns is checked.
+
+    Raises ValueError if that has a wrong shape or type, or states what cannot be of helpers that were asked.
+    """
+    if is_ours(channel):
+        return channel.deliver(links, draws)
+    delivery = Delivery(*channel.deliver(read_only(links), read_only(draws)))
+    asked, shape = links.asked, links.asked.shape
+    check_shape("up", delivery.up, shape)
+    if delivery.up.dtype != bool:
+        raise ValueError(f"up of type {delivery.up.dtype}, not bool")
+    check_shape("delays", delivery.delay_s, shape)
+    if not np.all(delivery.delay_s[asked] >= 0.0):
+        raise ValueError("a delay that is negative or NaN for a helper that was asked")
+    check_shape("losses", delivery.loss, shape, (*shape[:-1], 1))
+    if np.any(((delivery.loss < 0.0) | (delivery.loss > 1.0)) & asked):
+        raise ValueError("a loss that is no probability")
+    check_shape("airtimes", delivery.airtime_s, shape)
+    if np.any(delivery.airtime_s[asked] < 0.0):
+        raise ValueError("a negative airtime")
+    return delivery
 
 
 def heard_s(channel: Channel, broadcast: Broadcast, links: Links, draws: Draws) -> Floats:
