@@ -284,7 +284,7 @@ def test_a_package_that_does_not_work_is_one_line(name: str, says: str):
     assert "\n" not in str(error.value)
 
 
-def writes(array: Floats) -> None:
+def writes(array: Any) -> None:
     """Write into an array that somebody else reads, as a package's code may."""
     array[...] = 0.5
 
