@@ -170,6 +170,10 @@ def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) 
         ({"world": {"kind": "closed-loop"}}, "its settings have world.kind closed-loop, and beside them it"),
         ({"batch_size": "many"}, "its settings have batch_size many, and beside them it is 8"),
         ({"server": 3}, "settings.server"),
+        ({"model": "qwen3-4b"}, "its settings have model qwen3-4b, and beside them it is made-up"),
+        ({"model": "models/prox.gguf"}, "its settings have model models/prox.gguf, and beside them"),
+        ({"model": 3}, "its settings have model 3, and beside them it is made-up"),
+        ({"world": {"dataset": "unsignalised"}}, "its settings have world.dataset unsignalised, and beside"),
     ],
 )
 def test_settings_that_say_otherwise_than_what_stands_beside_them(
@@ -260,7 +264,7 @@ def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_th
             assert said.replace("\n", "").isprintable()
             compared += is_read and fresh
             fresh = fresh and not is_read
-    assert compared > (2 if closed_loop else 40)
+    assert compared > (1 if closed_loop else 40)
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 3, 5, 10**9])

@@ -8,6 +8,7 @@ the old name. `tests/test_records.py` reads kept runs of earlier commits and fai
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from harness.core.errors import UserError, printable
@@ -26,7 +27,7 @@ BESIDE: Mapping[str, str] = {
     "sampling_seed": "sampling_seed", "latency_source": "latency", "device_model": "device_model",
 }  # fmt: skip
 
-# Settings that a user types in several ways: by a name, a path or a URL.
+# Settings that a user types in several ways, by a name, a path or a URL: a name is held to what it names.
 TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
 
 
@@ -188,10 +189,29 @@ def _table(stated: Mapping[str, Any]) -> Any:
         return table  # for the reader to refuse
     said = _flat(table)
     for name, there in _flat(beside).items():
-        if name not in TYPED and said.get(name, there) != there:
+        typed = said.get(name, there)
+        if typed != there and not (name in TYPED and _may_be(typed, there)):
             both = f"{printable(said[name], 60)}, and beside them it is {printable(there, 60)}"
             raise ValueError(f"its settings have {name} {both}")
     return _with(SETTINGS, table)
+
+
+def _may_be(typed: Any, names: Any) -> bool:
+    """Return whether what a user typed may open what has these names; a server's or a replayed one may."""
+    if not (isinstance(typed, str) and isinstance(names, str)):
+        return typed is None or names is None
+    if "://" in typed or typed.startswith("replay:"):
+        return True
+    each_name = names.split(",")
+    each_typed = typed.split(",", len(each_name) - 1)
+    pairs = zip(each_typed, each_name, strict=False)
+    return len(each_typed) == len(each_name) and all(_is_called(text, name) for text, name in pairs)
+
+
+def _is_called(text: str, name: str) -> bool:
+    """Return whether a text is this name, with settings or without, or a path that ends in it."""
+    place, bare = PurePath(text), PurePath(name.partition(":")[0]).name
+    return text == name or bare in (place.name, place.stem) or text.startswith(f"{name}:")
 
 
 def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:

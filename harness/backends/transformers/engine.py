@@ -22,6 +22,7 @@ from harness.core.image import Image
 
 # Suffixes of the files that decide an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
+MOST_LAYERS = 10_000  # or experts; the largest models have some hundred
 
 
 def open(
@@ -58,7 +59,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
 
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
-    _refuse_kernels(card, where)
+    _check_config(card, where)
     shown = f"{card.shown} in {where}"
     # trust_remote_code=False: otherwise a checkpoint with its own code asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
@@ -95,11 +96,13 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     return tokenizer, model
 
 
-def _refuse_kernels(card: Card, where: Path) -> None:
-    """Raise UserError if a checkpoint's config names a repository for its attention.
+def _check_config(card: Card, where: Path) -> None:
+    """Raise UserError if a checkpoint's config names a repository for its attention, or too many layers.
 
-    Where the package `kernels` is installed, transformers fetches that repository and runs its code.
+    Where the package `kernels` is installed, transformers fetches that repository and runs its code. It makes
+    the layers before it looks at the weights.
     """
+    shown = f"{card.shown} in {printable(where)}"
     try:
         rest: list[Any] = [json.loads(text_of(where / "config.json", "record"))]
     except (OSError, ValueError, RecursionError):
@@ -113,8 +116,15 @@ def _refuse_kernels(card: Card, where: Path) -> None:
             for key in ("attn_implementation", "_attn_implementation"):
                 if "/" in str(value.get(key, "")):
                     raise UserError(
-                        f"{card.shown} in {printable(where)}: {key} in its config.json "
+                        f"{shown}: {key} in its config.json "
                         "names code of the hub, which is never run; take it out of the file"
+                    )
+            for key, stated in value.items():
+                is_count = any(word in key for word in ("layer", "depth", "expert"))
+                if is_count and isinstance(stated, int) and stated > MOST_LAYERS:
+                    raise UserError(
+                        f"{shown}: {printable(key)} in its config.json is {printable(stated)}, and at most "
+                        f"{MOST_LAYERS}; {fetching(card)}"
                     )
 
 
