@@ -43,6 +43,16 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
     assert {path.name for path in tmp_path.iterdir()} == {"swarmdrive.toml", "models", name}
 
 
+def test_a_name_that_looks_like_several_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board shows a model, its prompt and its answer mode with a dot between them."""
+    monkeypatch.chdir(tmp_path)
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    Path("models/m · v2 · json.toml").touch()
+    with pytest.raises(UserError, match="`m · v2 · json.toml` has ` · `, which stands between names"):
+        resources.find("models", "m · v2 · json.toml")
+
+
 @pytest.mark.parametrize("name", ["Größe 1", "中文", "a.b-c_d", "😀"])
 def test_a_name_of_any_writing_is_taken(name: str, tmp_path: Path) -> None:
     write_whole(tmp_path / name, "x")

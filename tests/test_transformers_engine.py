@@ -285,6 +285,10 @@ def kernel_of_the_hub(folder: Path) -> None:
     change(folder / "config.json", attn_implementation="kernels-community/flash-attn")
 
 
+def thousand_million_layers(folder: Path) -> None:
+    change(folder / "config.json", num_hidden_layers=10**9)
+
+
 def change(file: Path, **values: object) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
 
@@ -299,6 +303,7 @@ def change(file: Path, **values: object) -> None:
             kernel_of_the_hub,
             "names code of the hub, which is never run",
         ),
+        (thousand_million_layers, "num_hidden_layers in its config.json is 1000000000, and at most 10000"),
     ],
 )
 def test_no_code_of_a_checkpoint_is_run(

@@ -21,6 +21,7 @@ EXIT_CODES = {
 }
 
 
+BETWEEN_NAMES = " · "  # in tables, of a model, a prompt and an answer mode
 MOST_LISTED, FEW, NEAR = 60, 24, 6  # names that a message lists, and how many it lists of more
 LISTS = {"model": "harness model list", "prompt": "harness prompt list"}  # what prints all of a kind
 
@@ -58,10 +59,13 @@ def _said(thing: object) -> str:
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
     """Return a name if terminals, pages and records carry it as it is. Raises UserError otherwise.
 
-    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none of these.
+    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none of these;
+    nor is a name that looks like several, with what stands between names in tables.
     """
     if not name.isprintable():
         raise UserError(f"{what} `{printable(name)}` has characters that nothing can show; {repair}")
+    if BETWEEN_NAMES in name:
+        raise UserError(f"{what} `{name}` has `{BETWEEN_NAMES}`, which stands between names; {repair}")
     return name
 
 

@@ -8,7 +8,7 @@ from msgspec import UNSET, Struct, UnsetType, defstruct, field
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.config import Seconds, convert
-from harness.core.errors import UserError
+from harness.core.errors import BETWEEN_NAMES, UserError
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
 from harness.runs.settings import Settings
@@ -25,6 +25,7 @@ def role_word(role: str) -> str:
 
 BLIND = "~blind"  # ends the key of a blind helper's answer
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
+MOST_LETTERS = 300  # of a name
 TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that tables show as columns
 
 
@@ -303,7 +304,7 @@ class Variant(Struct, frozen=True):
     helpers: str = ""  # the same for the helpers' agents; empty if the ego's agent answers for them
 
     def __str__(self) -> str:
-        return f"{self.model} · {self.prompt} · {self.answer}{self.mix}"
+        return f"{BETWEEN_NAMES.join((self.model, self.prompt, self.answer))}{self.mix}"
 
     @property
     def mix(self) -> str:
@@ -449,6 +450,11 @@ class Cost(Struct, frozen=True):
         return total
 
 
+def _is_name(name: str) -> bool:
+    """Return whether a text can be a name in a table, where it stands beside others."""
+    return bool(name.strip()) and len(name) <= MOST_LETTERS and BETWEEN_NAMES not in name
+
+
 class Manifest(Struct, frozen=True, kw_only=True):
     """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
 
@@ -503,6 +509,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
         ):  # fmt: skip
             if missing := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{table_name}: {missing[0]} is no text")
+            if table_name != "conditions" and not _is_name(table[keys[0]]):
+                raise ValueError(f"{table_name}: {keys[0]} is no name")
         if any(not isinstance(helper.get("thinking", False), bool) for helper in self.helpers):
             raise ValueError("helpers: thinking is neither true nor false")
         for point in self.conditions:
@@ -520,7 +528,10 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def variant(self) -> Variant:
         helpers = [(h["model"]["name"], h["prompt"]["version"], h["answer"]) for h in self.helpers]
         return Variant(
-            self.model["name"], self.prompt["version"], self.answer, " + ".join(map(" · ".join, helpers))
+            self.model["name"],
+            self.prompt["version"],
+            self.answer,
+            " + ".join(map(BETWEEN_NAMES.join, helpers)),
         )
 
     def agent(self, place: int) -> dict[str, Any]:
