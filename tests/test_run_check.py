@@ -207,6 +207,9 @@ OF_THE_RUN = {
         lambda run: (older(run), score("decisions_one_optimal", "value", 5000)(run)),
         "summary.csv has decisions_one_optimal 5000.0 in 6g",
     ),
+    "rules in another spelling": (
+        lambda run: configure(run, versions={"figures": "01"}), "run.json has figures of version 01, and",
+    ),
     "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
     "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),

@@ -378,3 +378,10 @@ def test_a_suite_that_nobody_changed_is_equal(evaluated: Harness) -> None:
     code, out, _ = evaluated("run", "check", DONE)
     assert (code, "not equal" in out) == (0, False)
     assert re.search(rf"{DONE}: equal: \d+ means, computed again from its\s+runs", out)
+
+
+def test_a_family_has_a_folder_in_that_of_the_suite(evaluated: Harness) -> None:
+    edited(DONE / "suite.json", '"exits"', '""')
+    code, out, error = evaluated("report", DONE)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "families: none, or one outside this folder" in error

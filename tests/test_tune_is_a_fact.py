@@ -9,6 +9,7 @@ from zipfile import ZipFile
 
 import pytest
 from former import NAME
+from msgspec.structs import replace
 from relabelling import SEED, relabel
 
 from harness.cli import dataset as checking
@@ -17,6 +18,7 @@ from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import find, load
 from harness.world import scenarios
+from harness.world.world import World
 
 Harness = Callable[..., tuple[int, str, str]]
 
@@ -167,3 +169,9 @@ def test_a_check_without_the_simulator_says_that_nothing_was_built(
     assert code == 0
     assert "no layout was built again from its seed, since highway-env is not installed" in out
     assert json.loads(harness("dataset", "check", small_path, "--json")[1])["built_again"] is False
+
+
+def test_a_difference_of_a_rounding_makes_no_other_layout() -> None:
+    [vehicle, *_] = World.start(scenarios.get(NAME), SEED).state().vehicles
+    assert rebuilt._coarse(replace(vehicle, x_m=vehicle.x_m + 1e-9)) == rebuilt._coarse(vehicle)
+    assert rebuilt._coarse(replace(vehicle, x_m=vehicle.x_m + 0.1)) != rebuilt._coarse(vehicle)

@@ -88,12 +88,12 @@ def resolve(text: str, engine: str | None = None) -> Card:
 
 
 def argument(card: Card) -> str:
-    """Return a value of `--model` that resolves to this card."""
+    """Return a value of `--model` that resolves to this card; its name, if none does."""
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     if card.server:
         return f"{card.server.urls[0]}#{card.weights}"
-    return f"replay:{card.weights}" if card.engine == "replay" else str(card.weights)
+    return f"replay:{card.weights}" if card.engine == "replay" else card.weights or card.name
 
 
 def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:

@@ -21,6 +21,7 @@ from harness.dataset.load import Dataset, load, released
 from harness.dataset.schema import Branching, Record, Tree, scene_id
 from harness.dataset.select import spot_check
 from harness.dataset.verify import read_manifest
+from harness.world.state import VehicleState
 
 BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the whole tree
 
@@ -128,7 +129,13 @@ def _reported(scenario: str) -> Iterator[Dataset]:
 
 
 def _starts(dataset: Dataset) -> dict[str, str]:
-    """Return the ids of all first scenes by the digest of what is there, whatever the seeds are."""
+    """Return the ids of all first scenes by the digest of what is there, to 1 cm, whatever the seeds are."""
     forest = dataset.forest
     scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
-    return {digest(to_builtins(scene.state.vehicles)): scene.id for scene in scenes}
+    return {digest([*map(_coarse, scene.state.vehicles)]): scene.id for scene in scenes}
+
+
+def _coarse(vehicle: VehicleState) -> dict[str, object]:
+    """Return a vehicle with its numbers to 0.01, since a difference of a rounding makes no other layout."""
+    stated = to_builtins(vehicle).items()
+    return {key: round(value, 2) if isinstance(value, float) else value for key, value in stated}

@@ -53,7 +53,7 @@ def contradictions(run: Run) -> Iterator[str]:
     A run by older rules is held against these, and may lack figures that are younger.
     """
     version = run.manifest.versions.get("figures", "1")
-    if not (version.isdecimal() and int(version) <= FIGURES):
+    if version not in map(str, range(1, FIGURES + 1)):
         yield f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes

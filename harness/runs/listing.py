@@ -168,7 +168,7 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
 
 def own_name(name: str) -> bool:
     """Return whether a name is a plain name of a visible folder, and no path."""
-    return os.path.basename(name) == name and not name.startswith(".")
+    return os.path.basename(name) == name and not name.startswith(".") and name != ""
 
 
 def _rows(path: str) -> Rows:
