@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from harness.core.image import Image
     from harness.prompts.versions import Prompt
 
-MODEL = "qwen3-vl-2b"  # unasked
+MODEL = "swarm-tiny-vl"  # unasked
 COLUMNS = 64  # of a picture in a terminal
 
 

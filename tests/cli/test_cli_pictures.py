@@ -37,6 +37,14 @@ def one_word(tmp_path: Path) -> Path:
     return tmp_path / "words.json"
 
 
+@pytest.fixture
+def mine(tmp_path: Path) -> None:
+    """A card of a model that sees, whose weights are not here."""
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/mine.toml").write_text(CARD.format(weights="a/b", patch_px=16))
+
+
 # -- how it looks --------------------------------------------------------------------------------------------
 
 
@@ -76,7 +84,8 @@ def test_a_terminal_with_colours_is_shown_the_picture_and_any_other_is_told_how(
     scene = load(small_path).scene("00001-0")
     seen = frame(load(small_path).scenario, scene.state, "v1")
     assert picture == (
-        "picture: 512 x 256 pixels, front above rear; 128 tokens with qwen3-vl-2b, sha256 " + seen.sha256[:8]
+        "picture: 512 x 256 pixels, front above rear; 128 tokens with swarm-tiny-vl, sha256 "
+        + seen.sha256[:8]
     )
     assert told == "not drawn: no terminal with colours here; --out FOLDER writes PNG files"
     for name, value in (("FORCE_COLOR", "1"), ("COLORTERM", "truecolor"), ("TERM", "xterm-256color")):
@@ -89,9 +98,10 @@ def test_a_terminal_with_colours_is_shown_the_picture_and_any_other_is_told_how(
     assert f"\x1b[38;2;{r};{g};{b};48;2;" in out[: out.index("▀")]
 
 
+@pytest.mark.usefixtures("mine")
 def test_pictures_are_written_in_the_size_of_a_model(harness: Harness, small_path: Path) -> None:
     show = ("prompt", "show", "v7", "--scene", "00001-0", "--dataset", small_path)
-    code, out, _ = harness(*show, "--model", "qwen2.5-vl-3b", "--out", "new/shots")
+    code, out, _ = harness(*show, "--model", "mine", "--out", "new/shots")
     assert code == 0
     data = load(small_path)
     scene = data.scene("00001-0")
@@ -113,14 +123,15 @@ def test_what_says_json_has_the_digest_and_no_pixels(harness: Harness, small_pat
         assert system.keys() == {"role", "content"}
         seen = frame(data.scenario, data.scene("00001-0").state, viewer)
         assert user["image"] == {
-            "model": "qwen3-vl-2b", "width_px": 512, "height_px": 256, "tokens": 128, "sha256": seen.sha256,
+            "model": "swarm-tiny-vl", "width_px": 512, "height_px": 256, "tokens": 128, "sha256": seen.sha256,
         }  # fmt: skip
 
 
 # -- how many tokens it has ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("model", "tokens"), [("qwen3-vl-2b", 128), ("smolvlm-256m", 64)])
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize(("model", "tokens"), [("swarm-tiny-vl", 128), ("mine", 98)])
 def test_a_picture_counts_in_every_prompt(
     harness: Harness, small_path: Path, one_word: Path, model: str, tokens: int
 ) -> None:

@@ -346,11 +346,13 @@ def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Pat
 
 @pytest.mark.slow
 def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, judging: Judging) -> None:
-    points, card = (named_point("single-local"),), cards.load("smolvlm-256m")
+    points, card = (named_point("single-local"),), cards.load("swarm-tiny-vl")
     spec = spec_of(small, "swarm-tiny", "v4", points=points, seeds=(0,), latency="paper")
     ego = Agent(card, prompt("v7"))
     seen = run(replace(spec, ego=ego), tmp_path / "seen").out
-    with pytest.raises(UserError, match="smolvlm-256m was shown pictures by prompt v7, and no object can be"):
+    with pytest.raises(
+        UserError, match="swarm-tiny-vl was shown pictures by prompt v7, and no object can be"
+    ):
         attribute(ReplayedRun(seen), "single-local", 2, 0)
     text = run(replace(spec, ego=replace(ego, image="none")), tmp_path / "text").out
     assert attribute(ReplayedRun(text), "single-local", 2, 0).left_out

@@ -292,7 +292,7 @@ def test_reordered_json_says_the_same(value: dict[str, Any], around: str) -> Non
 
 @pytest.mark.parametrize("version", versions.names(folder("prompts")))
 def test_every_prompt_that_ships_has_twins_of_its_text(crossing: Dataset, version: str) -> None:
-    model = "smolvlm-256m" if versions.load(version).image else "swarm-tiny"
+    model = "swarm-tiny-vl" if versions.load(version).image else "swarm-tiny"
     spec = spec_of(crossing, model, version, points=(), seeds=(0,))
     scene = scenes_in(crossing)[1]
     in_metres = spec.ego.prompt.examples is not None  # whose numbers stay, so that no unit may change
