@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,11 @@ basis = "declared: none"
 [failures]
 nan = 0.5
 """
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/model-cards.md"
+TO_COPY = dict(
+    re.findall(r"^### `([^`]+)`\n\n```toml\n(.*?)^```\n", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+)
 MINIMAL = """\
 engine = "driver"
 description = "d"
@@ -58,12 +64,62 @@ def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def copied(project: Path) -> None:
+    """All cards to copy, each in its file of the project that the test is in."""
+    for file, card in TO_COPY.items():
+        (project / file).write_text(card)
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project that the test is in, with no card of its own."""
+    monkeypatch.chdir(tmp_path)
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    return tmp_path
+
+
 def test_every_shipped_card_loads_under_its_file_name() -> None:
     assert cards.names() == sorted(file.stem for file in resources.folder("models").glob("*.toml"))
     assert [cards.load(name).name for name in cards.names()] == cards.names()
     assert [cards.load(card.name) for card in cards.load_all()] == cards.load_all()
 
 
+def test_every_card_of_the_page_is_one_of_ones_own_once_it_is_copied(project: Path) -> None:
+    assert len(TO_COPY) == PAGE.read_text().count("\n### ")
+    for file, card in TO_COPY.items():
+        with pytest.raises(UserError, match=f"no longer ships; .* to {re.escape(file)} in your"):
+            cards.resolve(Path(file).stem)
+        (project / file).write_text(card)
+        [first, *others] = cards.each_engine(Path(file).stem)
+        assert f"models/{first.name}.toml" == file
+        assert [cards.resolve(card.name) for card in (first, *others)] == [first, *others]
+
+
+def test_a_card_that_no_longer_ships_says_where_it_is_and_runs_again_once_it_is_copied(
+    harness: Callable[..., tuple[int, str, str]], project: Path
+) -> None:
+    file = "models/qwen3-8b.toml"
+    said = (
+        f"model 'qwen3-8b' no longer ships; copy its card from {PAGE} to {file} in your project's folder, "
+        "which `harness init` makes, and it runs again\n"
+    )
+    (project / "run.toml").write_text('[helpers]\nmodel = "proxy, qwen3-8b"\n')
+    planned = ("--limit", "1", "--dry-run")
+    for typed in (
+        ("eval", "--model", "qwen3-8b", *planned),
+        ("eval", "--model", "proxy", "--helper-model", "proxy,qwen3-8b", *planned),
+        ("model", "pull", "qwen3-8b:transformers"),
+    ):
+        assert harness(*typed) == (2, "", f"harness: {said}")
+    assert harness("eval", "run.toml", *planned) == (2, "", f"harness: settings run.toml: {said}")
+    (project / file).write_text(TO_COPY[file])
+    for again in (("--model", "qwen3-8b"), ("run.toml",)):
+        assert harness("eval", *again, *planned)[::2] == (0, "")
+
+
+@pytest.mark.usefixtures("copied")
 def test_language_models_declare_no_latency_that_was_not_measured() -> None:
     for card in cards.load_all():
         if capabilities(card.engine).renders:
@@ -73,6 +129,7 @@ def test_language_models_declare_no_latency_that_was_not_measured() -> None:
             assert card.licence or not from_hub, card.name
 
 
+@pytest.mark.usefixtures("copied")
 @pytest.mark.parametrize("name", ["kev-4b", "lev-4b", "laya", "julia-1", "clef", "d1-3b"])
 def test_a_published_decision_model_says_whose_it_is_and_that_it_never_ran_here(name: str) -> None:
     card = cards.load(name)
@@ -83,6 +140,7 @@ def test_a_published_decision_model_says_whose_it_is_and_that_it_never_ran_here(
         assert re.search(r"\b20\d\d\b", card.latency.basis)
 
 
+@pytest.mark.usefixtures("copied")
 @pytest.mark.parametrize(
     ("name", "size_px", "tokens"),
     [
@@ -142,7 +200,7 @@ def test_a_mistake_about_pictures_is_one_line(shelf: Path, change: tuple[str, st
 
 
 def test_a_server_may_be_one_of_a_model_that_sees(shelf: Path) -> None:
-    example = (Path(__file__).parents[1] / "models" / "openai-example.toml").read_text()
+    example = (ROOT / "models" / "openai-example.toml").read_text()
     write_card(shelf, re.sub(r"^# (?=\[vision|\w+ = )", "", example, flags=re.M))
     vision = cards.load("mine").vision
     assert vision is not None
@@ -453,7 +511,7 @@ def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "`harness model list`", "replay:RUN_DIR"]),
+        ("qwen3-4", ["'qwen3-4'", "did you mean 'qwen3-4b'", "known: brake, ", "replay:RUN_DIR"]),
         ("./no/such/dir", ["'./no/such/dir'", "no directory", ".gguf", "hub id"]),
         ("./no/such.gguf", ["'./no/such.gguf'", "no .gguf file"]),
         ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),

@@ -72,7 +72,7 @@ def one_line(said: Said) -> str:
     [
         (["eval", "--model", "proxi"], "unknown model 'proxi'; did you mean 'proxy'?"),
         (["eval", "--model", "replay:nowhere"], "no such run directory"),
-        (["eval", "--model", "qwen3-"], "did you mean one of qwen3-0.6b, qwen3-1.7b, qwen3-4b, qwen3-8b, "),
+        (["eval", "--model", "swarm-"], "did you mean one of swarm-smol, swarm-tiny, swarm-tiny-six, "),
         (["eval", "--prompt", "v22"], "unknown prompt 'v22'; did you mean 'v2'?"),
         (["eval", "--prompt", "../prompts/v2"], "unknown prompt '../prompts/v2'"),
         (["eval", "--condition", "5g"], "unknown operating point '5g'; known: 6g, cloud, "),

@@ -17,6 +17,18 @@ from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 
+CITED = """\
+engine = "systemone"
+description = "d"
+weights = "a/b"
+[server]
+base_url = "http://127.0.0.1:8080/v1"
+[latency]
+source = "cited"
+inference_s = 0.012
+basis = "cited: b"
+"""
+
 
 def harness(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *args: str
@@ -29,8 +41,12 @@ def harness(
 
 
 def test_the_list_has_every_card_in_eighty_columns(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    Path("models/cited.toml").write_text(CITED)
     code, out, _ = harness(monkeypatch, capsys, "model", "list")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
@@ -38,9 +54,9 @@ def test_the_list_has_every_card_in_eighty_columns(
     assert sorted(listed) == cards.names()
     assert "card 145 ms" in listed["proxy"]
     assert listed["proxy"].endswith(" yes")
-    assert listed["kev-4b"].endswith(" if its server runs"), "nobody is asked whether it does"
+    assert listed["cited"].endswith(" if its server runs"), "nobody is asked whether it does"
     assert listed["qwen3-4b"].split()[3] == "paper"
-    assert "cited 12 ms" in listed["kev-4b"]
+    assert "cited 12 ms" in listed["cited"]
     assert "\n  Deterministic rule on what its viewer sees\n" in out
     lines = out.splitlines()
     other = lines[lines.index(next(line for line in lines if line.startswith("qwen3-4b"))) + 1 :]

@@ -67,8 +67,8 @@ def test_the_letters_are_read_as_the_card_says_unless_told_otherwise() -> None:
     assert agent("llama-cpp", None).letters == "raw"
     assert agent("llama-cpp", None).settings()["letters"] == "raw"
     assert agent("llama-cpp").settings()["letters"] == "cyclic"
-    assert Agent(cards.resolve("qwen3-0.6b"), versions.load("v4"), "readout").letters == "cyclic"
-    assert Agent(cards.resolve("qwen3-0.6b"), versions.load("v4"), "json").letters == "raw"
+    assert Agent(cards.resolve("qwen3-4b"), versions.load("v4"), "readout").letters == "cyclic"
+    assert Agent(cards.resolve("qwen3-4b"), versions.load("v4"), "json").letters == "raw"
     assert Agent(cards.resolve("proxy"), versions.load("v4")).letters == "raw"
     with pytest.raises(UserError, match="--letters cyclic: proxy answers in json; leave it out"):
         Agent(cards.resolve("proxy"), versions.load("v4"), letters="cyclic")

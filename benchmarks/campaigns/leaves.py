@@ -194,8 +194,8 @@ def _project(project: Path) -> Iterator[Subject]:
         "schedule", "schedules/mine.toml", (*quick, "--condition", "6g:schedule=mine"),
         ("eval", "--limit", 1, "--seeds", "0", "--condition", "6g:schedule=mine", "--out", "out"),
     )  # fmt: skip
-    for name, shipped in {"faulty": "proxy-faulty", "weights": "qwen3-8b", "served": "openai-example",
-                          "eyes": "qwen3-vl-2b"}.items():  # fmt: skip
+    for name, shipped in {"faulty": "proxy-faulty", "weights": "qwen3-4b", "served": "openai-example",
+                          "eyes": "swarm-tiny-vl"}.items():  # fmt: skip
         shutil.copy(folder("models") / f"{shipped}.toml", project / f"models/{name}.toml")
         yield of("card", f"models/{name}.toml", ("model", "list"), ("model", "list", "--json"))
     yield of("card", "models/faulty.toml", (*quick, "--model", "faulty"))

@@ -50,7 +50,7 @@ def load(name: str) -> Card:
     """Load a card by `<name>` or `<name>:<engine>`. Raises UserError if there is none or it has a mistake."""
     stem, _, engine = name.partition(":")
     if stem not in names():
-        raise unknown("model", name, names())
+        raise _no_card(name)
     cards = {card.engine: card for card in each_engine(stem)}
     if engine and engine not in cards:
         raise unknown(f"engine of model {stem}", engine, cards)
@@ -81,7 +81,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
             "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, the URL of a "
             "server such as http://127.0.0.1:8080/v1, or replay:RUN_DIR"
         )
-        raise unknown("model", text, names(), f"; or {hint}")
+        raise _no_card(text, f"; or {hint}")
     if engine not in (None, card.engine):
         raise UserError(f"--engine {engine}: {printable(text)!r} runs on {card.engine}; leave it out")
     return card
@@ -107,7 +107,8 @@ def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card
     card = next((card for card in given if card.name == stated.name), None)
     if card is None:
         if stated.name.partition(":")[0] not in names():
-            raise UserError(f"{where}: its model {name} is none of your cards; {hint}")
+            lost = resources.card_to_copy(stated.name) or f"its model {name} is none of your cards; {hint}"
+            raise UserError(f"{where}: {lost}")
         card = load(stated.name)
     if differing := _differing(card, stated):
         raise UserError(
@@ -115,6 +116,12 @@ def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card
             "restore the card, or run again"
         )
     return card
+
+
+def _no_card(model: str, hint: str = "") -> UserError:
+    """Build the error for a model that has no card here; `hint` says what else would be a model."""
+    lost = resources.card_to_copy(model)
+    return UserError(lost) if lost else unknown("model", model, names(), hint)
 
 
 def _differing(card: Card, stated: Card) -> list[str]:

@@ -7,11 +7,13 @@ extensions keep so.
 """
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
 from harness.core.errors import UserError, printable, sayable
+from harness.core.files import text_of
 
 T = TypeVar("T")
 DATASET = "occluded-intersection-v3"  # taken if none is named
@@ -66,6 +68,19 @@ def find(kind: str, name: str) -> Path:
     if existing and "/" not in name:
         sayable(f"file of {kind}", name)
     return existing[0] if existing else candidates[0]
+
+
+def card_to_copy(model: str) -> str | None:
+    """Say where the card of a model is that no longer ships, and what to do with it; None of all others."""
+    page = root() / "docs" / "model-cards.md"
+    name, _, _ = model.partition(":")
+    file = f"models/{name}.toml"
+    if file not in re.findall("^### `(.+)`$", text_of(page), re.MULTILINE):
+        return None
+    return (
+        f"model {name!r} no longer ships; copy its card from {printable(page, 1000)} to {file} in your "
+        "project's folder, which `harness init` makes, and it runs again"
+    )
 
 
 def _folders(kind: str) -> list[Path]:

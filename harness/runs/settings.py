@@ -16,7 +16,7 @@ from harness.core import extensions
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable
 from harness.core.extensions import Setting
-from harness.core.resources import DATASET, names
+from harness.core.resources import DATASET, card_to_copy, names
 
 FILE = "run.toml"
 COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
@@ -566,6 +566,9 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     own = {name: words for name, words in _only_typed(settings).items() if name not in given}
     if own:
         flag, value, *_ = beside = [word for words in own.values() for word in words]
+        for model in value.split(","):
+            if lost := card_to_copy(model.strip()):
+                raise UserError(f"{where}: {lost}")
         what = (
             f"{printable(value)} is a server, and a file asks none"
             if flag == "--server"

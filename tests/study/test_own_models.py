@@ -172,6 +172,28 @@ def test_a_replay_asks_no_server_that_its_run_names(
     assert "its model mine is none of your cards; write one of that name, or make the run again" in err
 
 
+@pytest.mark.slow
+def test_a_run_of_a_model_that_no_longer_ships_is_read_and_runs_again_with_its_card(
+    run: Server, harness: Callable[..., Said]
+) -> None:
+    for name in ("run.json", "run.toml"):
+        file = Path("run") / name
+        file.write_text(file.read_text().replace('"mine"', '"qwen3-8b"'))
+    shutil.rmtree("cache", ignore_errors=True)
+    card = Path("models/mine.toml").rename("kept.toml")
+    for read in (("report", "run"), ("compare", "run", "run"), ("run", "check", "run")):
+        assert harness(*read)[0] == 0, read
+    again = ("eval", "run", "--out", "again")
+    for asks in (STUDY, again):
+        code, _, err = harness(*asks)
+        assert (code, err.count("\n"), run.asked) == (2, 1, [])
+        assert "model 'qwen3-8b' no longer ships; copy its card from " in err
+    card.rename("models/qwen3-8b.toml")
+    for asks in (STUDY, again):
+        assert harness(*asks)[0] == 0
+    assert run.asked
+
+
 def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
     stated = Card("proxy", "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1"))
     with pytest.raises(UserError, match=r"proxy is not what it was \(\[server\] of your card differs\)"):

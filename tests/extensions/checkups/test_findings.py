@@ -26,7 +26,7 @@ from harness.prompts import versions
 from harness.report.caveats import by_letter, caveats
 from harness.runs.records import Manifest, Score
 
-CARD = cards.resolve("qwen3-0.6b")
+CARD = cards.resolve("qwen3-4b")
 AGENT = Agent(CARD, versions.load("v2"))
 AGAIN = 2 * 8  # halves of pairs of scenes that are asked with letters read the other way
 
