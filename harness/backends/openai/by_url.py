@@ -5,18 +5,16 @@ A served model is `URL`, or `URL#NAME` where its server has several. `openai:NAM
 """
 
 import asyncio
-import json
 import os
 import re
-from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from harness.backends.card import Card, Latency, Thinking
+from harness.backends.card import Card, Latency
 from harness.backends.chat_template import needs_first_user
 from harness.backends.openai.http import Client, Reply
-from harness.backends.openai.statements import Ask
+from harness.backends.openai.kinds import SERVER_KINDS, kind_of
 from harness.backends.servers import Kind, Server
 from harness.core.errors import Unanswered, UserError, printable
 
@@ -24,7 +22,6 @@ PREFIX = "served:"  # of a card's name: such a model is none of the card files
 BASE, KEY = "OPENAI_BASE_URL", "OPENAI_API_KEY"
 OPENAI = "https://api.openai.com/v1"
 LONGEST, SHOWN = 200, 8  # characters of a model's name; names in an error
-SWITCH = "enable_thinking"  # name of the thinking switch in chat templates
 _PATH = re.compile(r"[/~]|[A-Za-z]:[/\\]")  # how the name of a file or a folder begins
 
 
@@ -34,16 +31,6 @@ class _Listed(NamedTuple):
     id: str
     owner: str
     decides: bool  # whether it says that it is a decision model
-
-
-# Where each kind of server tells that it is one, in the order in which they are believed: llama-server has
-# paths of Ollama's as well. What vLLM says of itself stands in its list of models.
-_MARKS: Mapping[Kind, tuple[str, Callable[[dict[str, Any]], bool]]] = {
-    "llama-server": ("/props", lambda said: "default_generation_settings" in said),
-    "lm-studio": ("/api/v0/models", lambda said: isinstance(said.get("data"), list)),
-    "ollama": ("/api/version", lambda said: isinstance(said.get("version"), str)),
-    "llama-cpp-python": ("/openapi.json", lambda said: "llama.cpp Python API" in str(said.get("info"))[:500]),
-}
 
 
 def served_card(text: str) -> Card:
@@ -77,15 +64,17 @@ def _base(address: str) -> str:
 async def _ask(server: Server, name: str) -> Card:
     url = server.urls[0]
     async with Client(server) as client:
+        replies: dict[tuple[str, bytes | None], Reply] = {}
 
         async def ask(path: str, content: bytes | None) -> Reply:
-            return await client.get(url, url.removesuffix("/v1") + path, content)
+            if (path, content) not in replies:
+                place = url.removesuffix("/v1") + path
+                replies[path, content] = await client.get(url, place, content)
+            return replies[path, content]
 
         model = _chosen(url, await client.get(url, f"{url}/models"), name)
-        kind: Kind = "vllm" if model.owner == "vllm" else await _kind(ask)
-        template, thinking = await _TEMPLATES.get(kind, _unknown)(model.id, ask)
-    if thinking == "none" and SWITCH in template and kind == "llama-server":
-        thinking = "switch"
+        kind: Kind = "vllm" if model.owner == "vllm" else await kind_of(ask)
+        template, thinking = await SERVER_KINDS[kind].reads(model.id, ask)
     return Card(
         f"{PREFIX}{_short(model.id)}",
         "systemone" if model.decides else "openai",
@@ -144,44 +133,6 @@ def _listed(payload: Any) -> list[_Listed]:
             decides = isinstance(outputs, list) and "decisions" in outputs
             models.append(_Listed(name, str(entry.get("owned_by", "")), decides))
     return models
-
-
-async def _kind(ask: Ask) -> Kind:
-    """Return which kind of server answers as only one kind does; `generic` if none does."""
-    replies = await asyncio.gather(*(ask(path, None) for path, _ in _MARKS.values()))
-    for (kind, (_, tells)), reply in zip(_MARKS.items(), replies, strict=True):
-        if isinstance(reply.payload, dict) and reply.status == 200 and tells(reply.payload):
-            return kind
-    return "generic"
-
-
-async def _llama_server(model: str, ask: Ask) -> tuple[str, Thinking]:
-    template = _field(await ask("/props", None), "chat_template")
-    return template if isinstance(template, str) else "", "none"
-
-
-async def _ollama(model: str, ask: Ask) -> tuple[str, Thinking]:
-    can = _field(await ask("/api/show", json.dumps({"model": model}).encode()), "capabilities")
-    return "", "always" if isinstance(can, list) and "thinking" in can else "none"
-
-
-async def _vllm(model: str, ask: Ask) -> tuple[str, Thinking]:
-    """Return whether a request can turn thinking off: another prompt is made of the same messages then."""
-    chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
-    bodies = [json.dumps({**chat, "chat_template_kwargs": {SWITCH: on}}).encode() for on in (True, False)]
-    counts = [_field(await ask("/tokenize", body), "count") for body in bodies]
-    return "", "switch" if None not in counts and counts[0] != counts[1] else "none"
-
-
-async def _unknown(model: str, ask: Ask) -> tuple[str, Thinking]:
-    return "", "none"
-
-
-_TEMPLATES = {"llama-server": _llama_server, "ollama": _ollama, "vllm": _vllm}
-
-
-def _field(reply: Reply, name: str) -> Any:
-    return reply.payload.get(name) if isinstance(reply.payload, dict) else None
 
 
 def _short(name: str) -> str:

@@ -6,16 +6,14 @@ only says when or where a server was started, or what it is doing, is left out.
 
 import json
 import math
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from harness.backends.openai.http import Reply
+from harness.backends.openai.kinds import SERVER_KINDS, Ask, as_text, entry_of
 from harness.backends.servers import Kind
 from harness.core.errors import printable
 from harness.core.files import sha256_bytes
 
-Ask = Callable[[str, bytes | None], Awaitable[Reply]]  # a path beside `/v1`, and JSON to send
 Fact = str | int | float | bool
 _LISTED = ("id", "owned_by", "root", "max_model_len")
 # Keys that say nothing of a model, at any depth: dates, permissions, prices, and what the server is doing.
@@ -54,70 +52,15 @@ async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Mod
 
     A server with one model accepts any name for it.
     """
-    if (entry := _entry(models, "data", weights)) is None:
+    if (entry := entry_of(models, "data", weights)) is None:
         return Model()
     listed = {
         k: v if type(v) is int and abs(v) <= _EXACT else printable(v) for k in _LISTED if (v := entry.get(k))
     }
     facts = {name: value for name, value in entry.items() if name not in _LISTED}
-    version = None
-    if kind in _MORE:
-        version, more = await _MORE[kind](weights, ask)
-        facts |= more
+    version, more = await SERVER_KINDS[kind].states(weights, ask)
+    facts |= more
     return Model(listed, printable(version) if isinstance(version, str) else None, _flat(facts))
-
-
-async def _vllm(weights: str, ask: Ask) -> tuple[Any, dict[str, Any]]:
-    return _dict(await ask("/version", None)).get("version"), {}
-
-
-async def _llama_server(weights: str, ask: Ask) -> tuple[Any, dict[str, Any]]:
-    props = _dict(await ask("/props", None))
-    settings = props.get("default_generation_settings")
-    settings = settings if isinstance(settings, dict) else {}
-    path = props.get("model_path")
-    facts = {name: props.get(name) for name in ("chat_template", "modalities", "bos_token", "eos_token")} | {
-        "file": path.replace("\\", "/").rpartition("/")[2] if isinstance(path, str) else None,
-        "n_ctx": settings.get("n_ctx", props.get("n_ctx")),
-        # What it does where a request says nothing: penalties, DRY, XTC.
-        "sampling": _text(settings["params"]) if isinstance(settings.get("params"), dict) else None,
-    }
-    return props.get("build_info"), facts
-
-
-async def _ollama(weights: str, ask: Ask) -> tuple[Any, dict[str, Any]]:
-    version = _dict(await ask("/api/version", None)).get("version")
-    tag = _entry(_dict(await ask("/api/tags", None)), "models", weights) or {}
-    show = _dict(await ask("/api/show", json.dumps({"model": weights}).encode()))
-    facts = {name: tag.get(name) for name in ("digest", "size", "details")}
-    for name in ("template", "parameters", "system", "details", "model_info", "projector_info"):
-        if (value := show.get(name)) is not None:
-            facts[name] = value if name == "details" else _text(value)
-    return version, facts
-
-
-async def _lm_studio(weights: str, ask: Ask) -> tuple[Any, dict[str, Any]]:
-    return None, _entry(_dict(await ask("/api/v0/models", None)), "data", weights) or {}
-
-
-_MORE: Mapping[Kind, Callable[[str, Ask], Awaitable[tuple[Any, dict[str, Any]]]]] = {
-    "vllm": _vllm, "llama-server": _llama_server, "ollama": _ollama, "lm-studio": _lm_studio,
-}  # fmt: skip
-
-
-def _dict(reply: Reply) -> dict[str, Any]:
-    return reply.payload if isinstance(reply.payload, dict) else {}
-
-
-def _entry(payload: Any, key: str, weights: str) -> dict[str, Any] | None:
-    """Return the entry of a model in a list of models, or the only one; None if there is none."""
-    listed = payload.get(key) if isinstance(payload, dict) else None
-    entries = [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
-    for name in (weights, f"{weights}:latest"):  # Ollama adds the tag
-        for entry in entries:
-            if name in (entry.get("id"), entry.get("name"), entry.get("model")):
-                return entry
-    return entries[0] if len(entries) == 1 else None
 
 
 def _flat(facts: Mapping[str, Any]) -> dict[str, Fact]:
@@ -146,14 +89,8 @@ def _fact(value: Any) -> Fact:
         return value
     if isinstance(value, float) and math.isfinite(value):
         return value
-    text = value if isinstance(value, str) else _text(value)
+    text = value if isinstance(value, str) else as_text(value)
     return printable(text) if len(text) <= _SHOWN else _digest(text)
-
-
-def _text(value: Any) -> str:
-    with suppress(RecursionError):
-        return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-    return "nested too deeply"
 
 
 def _digest(text: str) -> str:

@@ -1,0 +1,169 @@
+"""Each kind of server: how it is known, and what it is asked of itself and of its model."""
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from harness.backends.card import Thinking
+from harness.backends.openai.http import Reply
+from harness.backends.servers import Kind
+
+Ask = Callable[[str, bytes | None], Awaitable[Reply]]  # a path beside `/v1`, and JSON to send
+Statement = tuple[Any, dict[str, Any]]  # the server's version, and what it states of its model
+SWITCH = "enable_thinking"  # name of the thinking switch in chat templates
+
+
+class ServerKind:
+    """A kind of server that says nothing but its list of models."""
+
+    path = ""  # where it tells that it is one; empty if nowhere
+
+    def is_one(self, said: Mapping[str, Any]) -> bool:
+        """Return whether what a server says at `path` tells that it is one."""
+        return False
+
+    async def states(self, model: str, ask: Ask) -> Statement:
+        """Return what a server states of a model, by its name there."""
+        return None, {}
+
+    async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
+        """Return a model's chat template, empty if it is not told, and how the model thinks."""
+        return "", "none"
+
+
+class LlamaServer(ServerKind):
+    """llama.cpp's server."""
+
+    path = "/props"
+
+    def is_one(self, said: Mapping[str, Any]) -> bool:
+        return "default_generation_settings" in said
+
+    async def states(self, model: str, ask: Ask) -> Statement:
+        props = fields_of(await ask(self.path, None))
+        settings = props.get("default_generation_settings")
+        settings = settings if isinstance(settings, dict) else {}
+        path = props.get("model_path")
+        named = ("chat_template", "modalities", "bos_token", "eos_token")
+        facts = {name: props.get(name) for name in named}
+        facts["file"] = path.replace("\\", "/").rpartition("/")[2] if isinstance(path, str) else None
+        facts["n_ctx"] = settings.get("n_ctx", props.get("n_ctx"))
+        # What it does where a request says nothing: penalties, DRY, XTC.
+        sampling = settings.get("params")
+        facts["sampling"] = as_text(sampling) if isinstance(sampling, dict) else None
+        return props.get("build_info"), facts
+
+    async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
+        template = fields_of(await ask(self.path, None)).get("chat_template")
+        if not isinstance(template, str):
+            return "", "none"
+        return template, "switch" if SWITCH in template else "none"
+
+
+class LMStudio(ServerKind):
+    """LM Studio."""
+
+    path = "/api/v0/models"
+
+    def is_one(self, said: Mapping[str, Any]) -> bool:
+        return isinstance(said.get("data"), list)
+
+    async def states(self, model: str, ask: Ask) -> Statement:
+        return None, entry_of(fields_of(await ask(self.path, None)), "data", model) or {}
+
+
+class Ollama(ServerKind):
+    """Ollama."""
+
+    path = "/api/version"
+
+    def is_one(self, said: Mapping[str, Any]) -> bool:
+        return isinstance(said.get("version"), str)
+
+    async def states(self, model: str, ask: Ask) -> Statement:
+        version = fields_of(await ask(self.path, None)).get("version")
+        tag = entry_of(fields_of(await ask("/api/tags", None)), "models", model) or {}
+        show = await self._show(model, ask)
+        facts = {name: tag.get(name) for name in ("digest", "size", "details")}
+        for name in ("template", "parameters", "system", "details", "model_info", "projector_info"):
+            if (value := show.get(name)) is not None:
+                facts[name] = value if name == "details" else as_text(value)
+        return version, facts
+
+    async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
+        can = (await self._show(model, ask)).get("capabilities")
+        return "", "always" if isinstance(can, list) and "thinking" in can else "none"
+
+    async def _show(self, model: str, ask: Ask) -> dict[str, Any]:
+        return fields_of(await ask("/api/show", json.dumps({"model": model}).encode()))
+
+
+class LlamaCppPython(ServerKind):
+    """The server of llama-cpp-python."""
+
+    path = "/openapi.json"
+
+    def is_one(self, said: Mapping[str, Any]) -> bool:
+        return "llama.cpp Python API" in str(said.get("info"))[:500]
+
+
+class VLLM(ServerKind):
+    """vLLM, which says that it is one in its list of models."""
+
+    async def states(self, model: str, ask: Ask) -> Statement:
+        return fields_of(await ask("/version", None)).get("version"), {}
+
+    async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
+        """Ask whether a request can turn thinking off: another prompt is made of the same messages then."""
+        chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
+        counts = []
+        for on in (True, False):
+            body = json.dumps({**chat, "chat_template_kwargs": {SWITCH: on}}).encode()
+            counts.append(fields_of(await ask("/tokenize", body)).get("count"))
+        return "", "switch" if None not in counts and counts[0] != counts[1] else "none"
+
+
+# In the order in which they are believed: llama-server has paths of Ollama's as well.
+SERVER_KINDS: Mapping[Kind, ServerKind] = {
+    "llama-server": LlamaServer(),
+    "lm-studio": LMStudio(),
+    "ollama": Ollama(),
+    "llama-cpp-python": LlamaCppPython(),
+    "vllm": VLLM(),
+    "generic": ServerKind(),
+}
+
+
+async def kind_of(ask: Ask) -> Kind:
+    """Return which kind of server answers as only one kind does; `generic` if none does."""
+    known = {kind: server for kind, server in SERVER_KINDS.items() if server.path}
+    replies = await asyncio.gather(*(ask(server.path, None) for server in known.values()))
+    for (kind, server), reply in zip(known.items(), replies, strict=True):
+        if reply.status == 200 and server.is_one(fields_of(reply)):
+            return kind
+    return "generic"
+
+
+def fields_of(reply: Reply) -> dict[str, Any]:
+    """Return the fields of a reply; none if it is no JSON object."""
+    return reply.payload if isinstance(reply.payload, dict) else {}
+
+
+def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
+    """Return the entry of a model in a list of models, or the only one; None if there is none."""
+    listed = payload.get(key) if isinstance(payload, dict) else None
+    entries = [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
+    for name in (model, f"{model}:latest"):  # Ollama adds the tag
+        for entry in entries:
+            if name in (entry.get("id"), entry.get("name"), entry.get("model")):
+                return entry
+    return entries[0] if len(entries) == 1 else None
+
+
+def as_text(value: Any) -> str:
+    """Return a text as it is, and any other value as JSON."""
+    with suppress(RecursionError):
+        return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+    return "nested too deeply"
