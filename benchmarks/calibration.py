@@ -17,11 +17,11 @@ from typing import NamedTuple, get_args
 
 from pages import harness, markdown, options, write_tables
 
-from harness.coordination.calibrations import FOLDER, Level
 from harness.core.arrays import Floats
 from harness.core.figures import PERCENT, POINTS, Unit, shown
 from harness.core.resources import MARKER
 from harness.core.statistics import Estimate
+from harness.extensions.calibration.calibrations import FOLDER, Level
 from harness.runs import reliability
 from harness.runs.folder import Run, read
 from harness.runs.metrics import BALANCED, by_episode, difference, entry, metrics_of

@@ -7,6 +7,7 @@ from harness.cli.show import finish as finish_study
 from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
 from harness.coordination.intents import Intents
+from harness.coordination.parts import Kept, Part, RunFacts
 from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
@@ -46,6 +47,7 @@ __all__ = [
     "Hook",
     "Intents",
     "Ints",
+    "Kept",
     "Lane",
     "Layout",
     "LayoutDraws",
@@ -53,6 +55,7 @@ __all__ = [
     "Messages",
     "Metric",
     "Parameters",
+    "Part",
     "Path",
     "PathKey",
     "Physical",
@@ -63,6 +66,7 @@ __all__ = [
     "Road",
     "Rule",
     "Run",
+    "RunFacts",
     "Scenario",
     "ScheduleInputs",
     "Section",

@@ -9,7 +9,7 @@ import pytest
 
 from harness.backends.base import AnswerMode
 from harness.backends.card import Failures
-from harness.coordination.operating_point import POINTS, SETTINGS
+from harness.coordination.operating_point import POINTS, typed_settings
 from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.coordination.schedules import SCHEDULES
 from harness.parsing.parse import Repair, Status
@@ -34,7 +34,7 @@ def test_every_failure_on_purpose_is_documented() -> None:
         assert f"`{name}`" in documented
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("setting", typed_settings())
 def test_every_setting_of_an_operating_point_is_documented_with_its_default(setting: str) -> None:
     text = (ROOT / "docs/operating-points.md").read_text()
     [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]

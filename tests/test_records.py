@@ -20,7 +20,7 @@ from starlette.testclient import TestClient
 
 import harness as package
 from harness.backends.card import Card
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, more_parts
 from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart
@@ -229,7 +229,8 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     helpers = sum(name.startswith("helper_") for name in columns)
     with (HERE / run / "episodes.csv").open() as file:
         head = next(csv.reader(file))
-    condition, manifest = {*OperatingPoint.types()}, set(records.Manifest.__struct_fields__)
+    of_extensions = {key for kind in more_parts().values() for key in kind.__struct_fields__}
+    condition, manifest = {*OperatingPoint.types()} - of_extensions, set(records.Manifest.__struct_fields__)
     # Letters are a setting of the agent; an adapter, a price and a cost are stated where there is one.
     card = {field.name for field in fields(Card)} - {"letters", "adapter", "price"}
     lacks = {

@@ -27,7 +27,6 @@ COMMANDS = {
     "run export": "export",
     "model list": "model:list_models",
     "model pull": "model:pull",
-    "model calibrate": "calibrate",
     "model device list": "device:list_devices",
     "model device show": "device:show",
     "model device check": "device:check",

@@ -1,16 +1,19 @@
 """Define operating points: everything a cooperative decision depends on besides the scene and the model."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import chain
 from typing import Any, Literal, NamedTuple, get_type_hints
 
 from msgspec import structs
 
+from harness.coordination.added_parts import added_parts
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
 from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, TRUTH, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
-from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Part, Radio, wrong
+from harness.coordination.intents import Intents
+from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Kept, Part, Radio, wrong
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
@@ -18,6 +21,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
+from harness.core.extensions import part_of, setting_of_extension
 from harness.core.pairs import pairs
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
@@ -28,13 +32,6 @@ from harness.radio.wrapped import AtLoss
 
 OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
-ALONE = (
-    "calibration",
-    "fallback",
-    "round_trip",
-    "round_trip_s",
-    "window_s",
-)  # settings of an ego that asks nobody
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
@@ -42,9 +39,38 @@ LONGEST_NAME = 1000
 PARTS: dict[str, type[Part]] = {
     "radio": Radio, "ask": Ask, "fusion": Fusion, "guard": Guard, "cloud": Cloud,
 }  # fmt: skip
-# The part of each setting. Manifests and conditions have them flat; `radio` is there the further ones.
-PART_OF = {key: part for part, kind in PARTS.items() for key in kind.__struct_fields__}
-RECORDED = {"further": "radio"}
+RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
+IN_NO_TEXT = ("profile", "further")  # settings that a condition's text has in another way
+
+
+@cache
+def more_parts() -> Mapping[str, type[Part]]:
+    """Return the parts that extensions add, by name; their packages are imported."""
+    return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
+
+
+@cache
+def part_of_settings() -> Mapping[str, str]:
+    """Return the part of each setting, in the order in which manifests and conditions have them, flat."""
+    part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
+    for part, kind in more_parts().items():
+        after = 1 + [key for key, _ in part_of].index(kind.behind)
+        part_of[after:after] = [(key, part) for key in kind.__struct_fields__]
+    return dict(part_of)
+
+
+@cache
+def typed_settings() -> tuple[str, ...]:
+    """Return the settings that a condition's text has by their names."""
+    return tuple(key for key in part_of_settings() if key not in IN_NO_TEXT)
+
+
+@cache
+def settings_alone() -> Collection[str]:
+    """Return the settings of an ego that asks nobody."""
+    core = ("fallback", "round_trip", "round_trip_s", "window_s")
+    of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
+    return {*core, *chain(*of_extensions)}
 
 
 class Rewrites(NamedTuple):
@@ -72,8 +98,13 @@ class OperatingPoint:
     fusion: Fusion = Fusion()  # noqa: RUF009
     guard: Guard = Guard()  # noqa: RUF009
     cloud: Cloud = Cloud()  # noqa: RUF009
+    more: tuple[Part, ...] = ()  # those of extensions that do something, in the order of `more_parts`
 
     def __post_init__(self) -> None:
+        if self.more:
+            active, kinds = {type(part): part for part in self.more}, more_parts().values()
+            more = [active[kind] for kind in kinds if active.get(kind, kind()) != kind()]
+            object.__setattr__(self, "more", tuple(more))
         if not isinstance(self.name, str) or not self.name.strip():
             raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
         if len(self.name) > LONGEST_NAME:
@@ -92,12 +123,10 @@ class OperatingPoint:
         if self.guard.attack and self.radio.profile is None:
             raise wrong("attack", self.guard.attack, "left out where there is no channel")
         if self.cloud.round_trip and self.has_fusion_call:
-            twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
-            raise wrong("round_trip", self.cloud.round_trip, f"left out where {twice}, which asks twice")
-        if self.ask.calibration and self.has_fusion_call:
-            twice = f"consensus is {EGO_PROMPT}" if self.content == CONTENTS[INTENT] else holds
-            allowed = f"left out where {twice}: the second question has no fit"
-            raise wrong("calibration", self.ask.calibration, allowed)
+            allowed = f"left out where {self.asks_twice}, which asks twice"
+            raise wrong("round_trip", self.cloud.round_trip, allowed)
+        for part in self.more:
+            part.check_with(self)
         if self.content.graph == TRUTH and self.ask.messages == "shuffled":
             raise wrong("messages", "shuffled", f"own or blind where {holds}")
         if self.content.asks_again and self.radio.edge == FUSION:
@@ -169,7 +198,8 @@ class OperatingPoint:
 
         Raises UserError for an unknown key, or for a value that is not allowed.
         """
-        allowed = ["name", *(RECORDED.get(key, key) for key in PART_OF)]
+        allowed = ["name", *(RECORDED.get(key, key) for key in part_of_settings())]
+        values = without_gone(values)
         for key in values:
             if key not in allowed:
                 raise unknown("operating point setting", str(key), allowed)
@@ -180,28 +210,51 @@ class OperatingPoint:
     @staticmethod
     def types() -> dict[str, Any]:
         """Return the types of what `record` returns."""
-        hints = {key: hint for kind in PARTS.values() for key, hint in get_type_hints(kind).items()}
-        return {"name": str, **{RECORDED.get(key, key): hint for key, hint in hints.items()}}
+        hints = {part: get_type_hints(kind) for part, kind in {**PARTS, **more_parts()}.items()}
+        types: dict[str, Any] = {"name": str}
+        for key, part in part_of_settings().items():
+            types[RECORDED.get(key, key)] = hints[part][key]
+        return types
 
     def record(self) -> dict[str, Any]:
-        """Return the flat settings, as manifests have them; `from_dict` reads them."""
-        return {"name": self.name, **{RECORDED.get(key, key): self.setting(key) for key in PART_OF}}
+        """Return the flat settings, as manifests have them; `from_dict` reads them.
+
+        Those of an extension are there where they do something: without it, others' runs are read.
+        """
+        active = {type(part) for part in self.more}
+        idle = {name for name, kind in more_parts().items() if kind not in active}
+        record: dict[str, Any] = {"name": self.name}
+        for key, part in part_of_settings().items():
+            if part not in idle:
+                record[RECORDED.get(key, key)] = self.setting(key)
+        return record
 
     def setting(self, key: str) -> Any:
         """Return a setting by its flat name."""
-        return getattr(getattr(self, PART_OF[key]), key)
+        return getattr(self._part(part_of_settings()[key]), key)
+
+    def _part(self, name: str) -> Part:
+        """Return a part by name; of an extension's that does nothing, its defaults."""
+        if name in PARTS:
+            part: Part = getattr(self, name)
+            return part
+        kind = more_parts()[name]
+        return next((part for part in self.more if type(part) is kind), kind())
 
     def changed(self, **settings: Any) -> "OperatingPoint":
         """Return the point with some settings changed by their flat names, or its name. Raises UserError."""
         name = settings.pop("name", self.name)
         by_part: dict[str, dict[str, Any]] = {}
         for key, value in settings.items():
-            by_part.setdefault(PART_OF[key], {})[key] = value
+            by_part.setdefault(part_of_settings()[key], {})[key] = value
         try:
-            parts = {part: structs.replace(getattr(self, part), **some) for part, some in by_part.items()}
+            parts = {part: structs.replace(self._part(part), **some) for part, some in by_part.items()}
         except ValueError as error:
             raise _error_of(name, error) from None
-        return replace(self, name=name, **parts)
+        own: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
+        others = [part for part in self.more if type(part) not in {*map(type, parts.values())}]
+        more = (*others, *(parts[part] for part in more_parts() if part in parts))
+        return replace(self, name=name, more=more, **own)
 
     @cached_property
     def channel(self) -> Channel:
@@ -281,11 +334,11 @@ class OperatingPoint:
             setting: a setting of the point or of its channel; None for the number of vehicles.
         """
         ask, consensus = self.ask, self.fusion.consensus
-        if self.radio.profile is None and setting not in ALONE:
+        if self.radio.profile is None and setting not in settings_alone():
             return "it has no channel"
-        if ask.schedule == NEVER and setting not in (*ALONE, "schedule"):
+        if ask.schedule == NEVER and setting not in (*settings_alone(), "schedule"):
             return f"schedule {NEVER} asks nobody"
-        if ask.max_helpers == 0 and setting not in (*ALONE, "max_helpers"):
+        if ask.max_helpers == 0 and setting not in (*settings_alone(), "max_helpers"):
             return "max_helpers is 0, so it asks nobody"
         if setting == "tau_nats" and ask.schedule != PAPER and not self.radio.helper_rounds:
             return f"schedule {ask.schedule} has a threshold of its own"
@@ -311,6 +364,12 @@ class OperatingPoint:
                 return str(why)
             channel = getattr(channel, "channel", None)  # what a wrapper wraps
         return None
+
+    def prepared(self, intents: Intents) -> Intents:
+        """Return what vehicles intend, (n, ...), as its parts have it before anything is made of it."""
+        for part in self.more:
+            intents = part.before(intents)
+        return intents
 
     @property
     def asks(self) -> bool:
@@ -348,6 +407,12 @@ class OperatingPoint:
         return self.radio.profile is not None and second
 
     @property
+    def asks_twice(self) -> str:
+        """The setting by which the ego's model is asked a second time, in words."""
+        by_rule = self.content == CONTENTS[INTENT]
+        return f"consensus is {EGO_PROMPT}" if by_rule else f"content is {self.ask.content}"
+
+    @property
     def blind_helpers(self) -> bool:
         """Whether the helpers that are asked are shown nothing."""
         return self.radio.profile is not None and self.ask.messages == "blind"
@@ -364,6 +429,44 @@ class OperatingPoint:
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))
+
+
+def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
+    """Return what a run keeps of what its conditions' parts name, by folder and name."""
+    kept: dict[str, dict[str, Kept]] = {}
+    for point in points:
+        for part in point.more:
+            for folder, by_name in part.kept().items():
+                kept.setdefault(folder, {}).update(by_name)
+    return kept
+
+
+def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recorded condition's settings without those of extensions that do nothing.
+
+    Raises UserError for one of an extension that is gone, where it does something.
+    """
+    here = without_gone(settings)
+    for kind in more_parts().values():
+        defaults = kind()
+        if all(here.get(key, default) == default for key, default in structs.asdict(defaults).items()):
+            here = {key: value for key, value in here.items() if key not in kind.__struct_fields__}
+    return here
+
+
+def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a condition's settings without those of extensions that are gone, where these do nothing.
+
+    Raises UserError for one that does something.
+    """
+    kept: dict[str, Any] = {}
+    for key, value in settings.items():
+        gone = key not in part_of_settings() and setting_of_extension(key)
+        if not gone:
+            kept[key] = value
+        elif ("" if value is None else str(value)) != gone.idle:
+            raise UserError(f"setting {key}={printable(value)} of a condition is {part_of(gone.extension)}")
+    return kept
 
 
 def _error_of(name: str, error: ValueError) -> UserError:
@@ -405,12 +508,13 @@ def named_point(text: str) -> OperatingPoint:
     for setting in rest.split(",") if colon else ():
         key, _, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
-        if field not in SETTINGS and field not in channel_settings:
-            allowed = (*SETTINGS, *SHORT, *channel_settings)
+        if field not in typed_settings() and field not in channel_settings:
+            without_gone({field: value})
+            allowed = (*typed_settings(), *SHORT, *channel_settings)
             raise unknown(f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3")
         if field in settings or field in radio:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
-        if field not in SETTINGS:
+        if field not in typed_settings():
             radio[field] = value
             continue
         parsed = setting_of(field, value)
@@ -429,7 +533,6 @@ def named_point(text: str) -> OperatingPoint:
 
 # Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's unit.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
-SETTINGS = tuple(key for key in PART_OF if key not in ("profile", "further"))
 
 
 def setting_of(key: str, text: str) -> object:

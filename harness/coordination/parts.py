@@ -4,12 +4,12 @@ Each part checks itself and raises ValueError with the setting, its value and wh
 """
 
 import math
-from typing import Annotated, get_type_hints
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.attacks import attacks_of
-from harness.coordination.calibrations import calibration
 from harness.coordination.contents import CONTENTS, INTENT
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES, names
@@ -19,6 +19,10 @@ from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import printable, unknown
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
+
+if TYPE_CHECKING:
+    from harness.coordination.intents import Intents
+    from harness.coordination.operating_point import OperatingPoint
 
 FALLBACKS = ("uniform", "brake")
 MESSAGES = ("own", "shuffled", "blind")
@@ -34,12 +38,45 @@ Text = Annotated[str, Meta(description="a text")]
 Flag = Annotated[bool, Meta(description="true or false")]
 
 
+class Kept(NamedTuple):
+    """What a run keeps of something that a condition names."""
+
+    record: Any  # plain values: its content, or the digest of its file
+    file: Any = None  # path of its file, if it has one
+
+
+class RunFacts(Protocol):
+    """What a part is told of the run in which its condition is played."""
+
+    @property
+    def agents(self) -> Sequence[Any]:
+        """The agents, the ego's first; each has `settings()`."""
+
+    @property
+    def scenario(self) -> Any:
+        """The scenario, which has a name."""
+
+    @property
+    def ego_alone(self) -> bool:
+        """Whether the model answers only for the ego."""
+
+
 class Part(Struct, frozen=True, kw_only=True):
-    """Settings that are checked as they are made; whole numbers become floats where a float is meant."""
+    """Settings that are checked as they are made; whole numbers become floats where a float is meant.
+
+    A part with its defaults does nothing. Those that an extension adds (`adds={"parts": ...}`) are called in
+    the order of what follows, and only where they do something.
+    """
+
+    behind: ClassVar[str] = ""  # the setting behind which its own stand in records
+    of_ego: ClassVar[bool] = False  # whether it matters to an ego that asks nobody
+    # its settings that name something, and what returns the names that there are; empty names nothing
+    named: ClassVar[Mapping[str, Callable[[], Collection[str]]]] = {}
 
     def __post_init__(self) -> None:
-        for key, hint in get_type_hints(type(self), include_extras=True).items():
-            value = getattr(self, key)
+        hints = get_type_hints(type(self), include_extras=True)
+        for key in self.__struct_fields__:
+            hint, value = hints[key], getattr(self, key)
             try:
                 converted = convert(value, hint)
                 if isinstance(converted, float) and not math.isfinite(converted):
@@ -51,6 +88,20 @@ class Part(Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise ValueError or UserError for what no single setting's type says."""
+
+    def check_with(self, point: "OperatingPoint") -> None:
+        """Raise ValueError for what does not go together with other settings of its condition."""
+
+    def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
+        """Return why it cannot be played in a run, and what to do; None if it can."""
+
+    def kept(self) -> Mapping[str, Mapping[str, Kept]]:
+        """Return what a run keeps of what it names, by folder, such as `calibrations`, and by name."""
+        return {}
+
+    def before(self, intents: "Intents") -> "Intents":
+        """Return what vehicles intend, (n, ...), as it is before anything is made of it; NaN may be there."""
+        return intents
 
 
 def wrong(key: str, value: object, allowed: str) -> ValueError:
@@ -80,17 +131,12 @@ class Ask(Part, frozen=True, kw_only=True):
     # that are shown nothing (`blind`). A gain that remains under a control is not from what helpers see.
     messages: Text = "own"
     content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
-    # What every answer is corrected by before anything is made of it, a name of
-    # `harness.coordination.calibrations`; empty for nothing.
-    calibration: Text = ""
 
     def check(self) -> None:
         if self.messages not in MESSAGES:
             raise unknown("messages", self.messages, MESSAGES)
         if self.content not in CONTENTS:
             raise unknown("content", self.content, CONTENTS)
-        if self.calibration:
-            calibration(self.calibration)
         if self.schedule == ORACLE:
             raise ValueError(
                 f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` plays it, and "

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 from functools import cache
 from keyword import iskeyword
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.core import formats
 from harness.core.errors import UserError, printable
@@ -22,6 +22,8 @@ from harness.core.strangers import worded
 GROUP = "swarmdrive.extensions"
 # In the metadata: by command, kind of study and name from Python, the package of the extension that has it.
 COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdrive.names"
+# The same by setting of a condition, with the value that does nothing in brackets; nothing for an empty one.
+SETTINGS = "swarmdrive.settings"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
@@ -84,6 +86,22 @@ def from_python(name: str) -> Any:
     if gone := entries(NAMES).get(name):
         raise UserError(f"`harness.{name}` is {part_of(_extension_of(gone))}")
     return None
+
+
+class OfExtension(NamedTuple):
+    """Whose a setting of a condition is, by the metadata of what is installed."""
+
+    extension: str
+    idle: str  # the value that does nothing, as text; empty for none
+
+
+def setting_of_extension(name: str) -> OfExtension | None:
+    """Return the extension that has a setting of conditions, and the value that does nothing; else None."""
+    entry = entries(SETTINGS).get(name)
+    if entry is None:
+        return None
+    package, _, idle = str(entry.value).partition(" ")
+    return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
 
 
 def part_of(extension: str) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any, cast
 
 import msgspec
@@ -10,12 +11,11 @@ from msgspec import structs
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Letters, Sums
 from harness.backends.card import Card
-from harness.coordination.calibrations import file_of
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, kept_of
+from harness.coordination.parts import Kept
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_file
 from harness.core.formats import SOURCES
 from harness.evaluate.agent import Agent, ImageMode
 from harness.evaluate.frozen_world import FrozenSource
@@ -50,15 +50,19 @@ def card_here(card: Card) -> Card:
 def points_of(run: Run) -> dict[str, OperatingPoint]:
     """Return a run's operating points by name.
 
-    Raises UserError if a channel, network, calibration or schedule of them has changed since.
+    Raises UserError if a channel, network, schedule or what else they name has changed since.
     """
     manifest = run.manifest
+    points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+    kept = kept_of(points.values())
     stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
         "channel profile": (manifest.channels, CHANNELS.unchanged),
         "network": (manifest.networks, lambda name, then: _same(asdict(network(name)), then)),
-        "calibration": (manifest.calibrations, lambda name, then: _same(sha256_file(file_of(name)), then)),
         "schedule": (manifest.schedules, lambda name, then: _same(SCHEDULES.file_sha256(name), then)),
     }
+    for folder, recorded_there in manifest.kept.items():
+        is_kept = partial(_is_kept, kept.get(folder, {}))
+        stated[printable(folder.removesuffix("s"))] = recorded_there, is_kept
     for what, (by_name, unchanged) in stated.items():
         for name, recorded in by_name.items():
             if not unchanged(name, recorded):
@@ -66,7 +70,7 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
                     f"{printable(run.path)}: {what} {printable(name)} has changed since; restore it or run "
                     "again"
                 )
-    return {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+    return points
 
 
 def check_prompts(run: Run, spec: Spec) -> None:
@@ -78,6 +82,10 @@ def check_prompts(run: Run, spec: Spec) -> None:
             raise UserError(
                 f"{printable(run.path)}: prompt {version} has changed since; {_restore(run, each)}"
             )
+
+
+def _is_kept(kept: Mapping[str, Kept], name: str, recorded: Any) -> bool:
+    return name in kept and _same(kept[name].record, recorded)
 
 
 def _same(now: Any, recorded: Any) -> bool:

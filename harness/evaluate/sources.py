@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 
 from harness.backends import cards
-from harness.coordination.calibrations import FOLDER, file_of
+from harness.coordination.operating_point import kept_of
 from harness.coordination.schedules import SCHEDULES
 from harness.core import resources
 from harness.core.files import bytes_of
@@ -38,9 +38,9 @@ def sources(spec: Spec) -> dict[str, bytes]:
         if point.network:
             file = f"{point.cloud.round_trip}.toml"
             paths[f"networks/{file}"] = resources.find("networks", file)
-        if name := point.ask.calibration:
-            paths[f"{FOLDER}/{name}.toml"] = file_of(name)
         paths[f"schedules/{point.ask.schedule}.toml"] = SCHEDULES.file(point.ask.schedule)
+    for folder, by_name in kept_of(spec.points).items():
+        paths |= {f"{folder}/{name}.toml": kept.file for name, kept in by_name.items()}
     device = spec.device_profile
     if device and device.name in resources.names("devices") and devices.load(device.name) == device:
         paths[f"devices/{device.name}.toml"] = resources.find("devices", f"{device.name}.toml")

@@ -13,13 +13,11 @@ from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
-from harness.coordination import calibrations
 from harness.coordination.coordinate import TIES
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.plans import NO_PLANS
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_file
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.costs import Budget
@@ -256,8 +254,9 @@ class Spec:
             raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
         if point.content.plan and not self.several_decide:
             raise UserError(NO_PLANS.format(printable(point.name)))
-        if point.ask.calibration:
-            self._check_calibration(shown, point)
+        for part in point.more:
+            if obstacle := part.obstacle(point, self):
+                raise UserError(f"{shown}: {obstacle}")
         if point.has_fusion_call and point.content.graph and ego.can.language_model:
             self._check_shows_objects(shown)
         if point.has_fusion_call and point.rewrites.shuffled and self.device_profile:
@@ -275,16 +274,6 @@ class Spec:
             reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:
             raise UserError(f"{shown}: {reason}")
-
-    def _check_calibration(self, shown: str, point: OperatingPoint) -> None:
-        name = point.ask.calibration
-        fitted = calibrations.calibration(name)
-        what = f"{shown}: calibration {printable(name)}"
-        for agent in self.agents:
-            if obstacle := fitted.obstacle(agent.settings(), self.scenario.name):
-                raise UserError(f"{what} {obstacle}; fit one with `harness model calibrate`")
-        if point.asks and fitted.helper is None and not self.ego_alone:
-            raise UserError(f"{what} was fitted on no helper's answer; fit one on a run with --ask all")
 
     def _check_shows_objects(self, shown: str) -> None:
         """Raise UserError if the ego's prompt is the same whatever is around; it is tried on some scenes."""
@@ -399,10 +388,9 @@ class Spec:
                 for name in (point.ask.schedule for point in self.points)
                 if (sha256 := SCHEDULES.file_sha256(name))
             },
-            "calibrations": {
-                name: sha256_file(calibrations.file_of(name))
-                for point in self.points
-                if (name := point.ask.calibration)
+            "kept": {
+                folder: {name: kept.record for name, kept in by_name.items()}
+                for folder, by_name in kept_of(self.points).items()
             },
             "seeds": list(self.seeds),
             "device_profile": msgspec.to_builtins(self.device_profile),

@@ -11,7 +11,6 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from harness.coordination.calibrations import calibration
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Coordination, FusionCall, FusionInputs, fuse
 from harness.coordination.encodings import JSON, reply_bits
@@ -287,18 +286,12 @@ def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: D
         places = _sources(point, due)
         source, alone = own.take(places), places == np.arange(len(places))
         own = _with_helpers(own, source, source.valid & ~alone[:, None])
-    own = corrected(point, own)
+    own = point.prepared(own)
     if point.content.plan:
         if own.plans is None or due.senders is None:
             raise UserError(NO_PLANS.format(printable(point.name)))
         own = own.planned(due.senders)
     return as_sent(point, own) if point.asks else own
-
-
-def corrected(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return intents with the probabilities that the point's calibration makes of them."""
-    name = point.ask.calibration
-    return calibration(name).of(intents) if name else intents
 
 
 def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:

@@ -44,7 +44,7 @@ MANIFEST: Mapping[str, Added] = {
     "channels": Added("2026-11-23", {}, "channel profiles became files; older runs used those that ship"),
     "networks": Added("2026-11-23", {}, "a cloud behind a measured network"),
     "schedules": Added("2026-11-23", {}, "learnt schedules, by the digest of their file"),
-    "calibrations": Added("2026-11-27", {}, "corrected probabilities, by the digest of their file"),
+    "kept": Added("2026-11-29", {}, "what settings of extensions name; see `upgraded` for `calibrations`"),
     "helpers": Added("2026-11-23", (), "agents of their own for helpers; the ego's answered for all"),
     "device_profile": Added("2026-11-23", None, "on-board computers that time answers by their tokens"),
 }
@@ -85,7 +85,6 @@ CONDITION: Mapping[str, Added] = {
     "defence": Added("2026-11-23", "", "guarded fusion prompts"),
     "content": Added("2026-11-27", "intent", "messages that hold objects; all held intents"),
     "encoding": Added("2026-11-27", "json", "the standards' sizes of messages; all were JSON"),
-    "calibration": Added("2026-11-27", "", "corrected probabilities; all were as they were answered"),
     "rounds": Added("2026-11-27", 1, "several rounds of negotiation; all had one"),
     "weight_cap": Added("2026-11-23", 1.0, "a cap on one helper's weight"),
 }
@@ -156,8 +155,11 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of run.json, or the settings that a run began with, as this version states them.
 
     What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is named
-    without the settings that were typed after its name, which are among its parameters.
+    without the settings that were typed after its name, which are among its parameters. 2026-11-29: `kept`
+    has the table `calibrations`, which stood beside it.
     """
+    if isinstance(calibrations := stated.get("calibrations"), dict) and "kept" not in stated:
+        stated = {**stated, "kept": {"calibrations": calibrations} if calibrations else {}}
     older = {key: SETTINGS[name].absent for key, name in BESIDE.items() if name in SETTINGS}
     settings = _agent(_with(MANIFEST, {**older, **stated}))
     if isinstance(model := settings.get("identity"), dict):
@@ -276,9 +278,16 @@ def _agent(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _condition(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """2026-11-23: `edge` replaced `roadside_edge`, which sent replies once more, as `relay` does."""
+    """2026-11-23: `edge` replaced `roadside_edge`, which sent replies once more, as `relay` does.
+
+    2026-11-29: settings of extensions are left out where they do nothing.
+    """
+    from harness.coordination.operating_point import as_here  # imports NumPy, as above
+
     renamed = {name: value for name, value in stated.items() if name != "roadside_edge"}
-    return _with(CONDITION, {**renamed, "edge": "relay"} if stated.get("roadside_edge") is True else renamed)
+    if stated.get("roadside_edge") is True:
+        renamed["edge"] = "relay"
+    return as_here(_with(CONDITION, renamed))
 
 
 def checked(version: object, file: object) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from contextlib import suppress
+from functools import cache
 from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType, defstruct, field
@@ -420,10 +421,11 @@ class ChannelRecord(Struct, frozen=True, kw_only=True):
     limits: dict[str, tuple[float, float]] = {}
 
 
-# The settings of an operating point as a file states them; a run of another version has fewer or more.
-_CONDITION = defstruct(
-    "Condition", [(name, kind | UnsetType, UNSET) for name, kind in OperatingPoint.types().items()]
-)
+@cache
+def _condition() -> type[Struct]:
+    """Make the record of a condition's settings as a file states them; one of another version has others."""
+    types = OperatingPoint.types()
+    return defstruct("Condition", [(name, kind | UnsetType, UNSET) for name, kind in types.items()])
 
 
 _SUMMED = ("amount", "asked", "uncounted", "read_tokens", "written_tokens")  # fields of a cost
@@ -472,7 +474,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     channels: dict[str, ChannelRecord]
     networks: dict[str, dict[str, Any]]
     schedules: dict[str, str]
-    calibrations: dict[str, str] = {}
+    kept: dict[str, dict[str, Any]]
     seeds: tuple[int, ...]
     ask: Literal["used", "all"]
     ties: Literal["drawn", "first"]
@@ -514,9 +516,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
         if any(not isinstance(helper.get("thinking", False), bool) for helper in self.helpers):
             raise ValueError("helpers: thinking is neither true nor false")
         for point in self.conditions:
-            known = {name: point[name] for name in _CONDITION.__struct_fields__ if name in point}
+            known = {name: point[name] for name in _condition().__struct_fields__ if name in point}
             try:
-                convert(known, _CONDITION, "conditions")
+                convert(known, _condition(), "conditions")
             except UserError as mistake:
                 raise ValueError(str(mistake)) from None
         names = tuple(point["name"] for point in self.conditions)

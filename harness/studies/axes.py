@@ -1,16 +1,22 @@
 """What can be swept, any setting of the operating point or the number of vehicles, and the grid points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from harness.coordination import calibrations
 from harness.coordination.attacks import ATTACKS
 from harness.coordination.contents import CONTENTS, OF_HELPERS
-from harness.coordination.operating_point import POINTS, SETTINGS, SHORT, OperatingPoint, setting_of
+from harness.coordination.operating_point import (
+    POINTS,
+    SHORT,
+    OperatingPoint,
+    more_parts,
+    setting_of,
+    typed_settings,
+)
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import settable
@@ -20,7 +26,7 @@ from harness.radio.profiles import CHANNELS
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
 CROSS = " × "  # between axes that are crossed
-NONE = "none"  # of attacks and calibrations
+NONE = "none"  # of attacks, and what else may be left out
 # The usual attacks: each alone, and a false place and several voices with a lie; at a point those it allows.
 USUAL_ATTACKS = (
     "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
@@ -46,11 +52,11 @@ class Axis:
         """Return the operating point with this setting. Raises UserError where it is not allowed."""
         if self.field is None:
             return point
-        if self.field not in SETTINGS:
+        if self.field not in typed_settings():
             return point.of_radio({self.field: value if isinstance(value, str) else f"{value:.10g}"})
         setting: object
         if isinstance(value, str):
-            left_out = value == NONE and self.field in ("attack", "calibration")
+            left_out = value == NONE and self.field in ("attack", *_named())
             setting = "" if left_out else setting_of(self.field, value)
         else:
             setting = scaled = value * self.scale
@@ -81,7 +87,7 @@ def axis_of(name: str) -> Axis:
     """Return an axis by its name, or by that of any setting in its own unit. Raises UserError."""
     if name in AXES:
         return AXES[name]
-    usual = {name: POINTS["6g"].setting(name)} if name in SETTINGS else _usual()
+    usual = {name: POINTS["6g"].setting(name)} if name in typed_settings() else _usual()
     if name not in usual:
         raise unknown("--over", name, {*AXES, *usual})
     return Axis(name, name.replace("_", " "), name, 1.0, "", isinstance(usual[name], str | bool))
@@ -101,7 +107,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     if axis.worded:
         known = {
             "consensus": names(), "schedule": SCHEDULES, "attack": (NONE, *ATTACKS),
-            "calibration": (NONE, *calibrations.names()),
+            **{setting: (NONE, *there()) for setting, there in _named().items()},
         }.get(axis.name)  # fmt: skip
         for name in (part for text in parts for part in text.split("+")):
             if known and (first := name.partition(":")[0]) not in known:
@@ -120,6 +126,14 @@ def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
     return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
 
 
+def _named() -> dict[str, Callable[[], Collection[str]]]:
+    """Return the settings of extensions that name something, and what returns the names that there are."""
+    named: dict[str, Callable[[], Collection[str]]] = {}
+    for kind in more_parts().values():
+        named |= kind.named
+    return named
+
+
 def _allows(axis: Axis, point: OperatingPoint, value: Value) -> bool:
     try:
         axis.at(point, value)
@@ -132,7 +146,7 @@ def _usual() -> dict[str, object]:
     """Return what every setting of an operating point or of a channel usually is."""
     radios = CHANNELS.usable().values()
     of_radios = {name: getattr(channel, name) for channel in radios for name in settable(channel)}
-    return of_radios | {name: POINTS["6g"].setting(name) for name in SETTINGS}
+    return of_radios | {name: POINTS["6g"].setting(name) for name in typed_settings()}
 
 
 def _values(axis: Axis, part: str) -> Sequence[float]:

@@ -24,7 +24,7 @@ from harness.dataset.forest import Forest
 from harness.evaluate.device import helpers_j
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.outlook import outlook
-from harness.evaluate.walk import as_sent, corrected
+from harness.evaluate.walk import as_sent
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
 from harness.world.sight_lines import site
@@ -180,7 +180,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     draws = channel_draws(
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
-    intents, ties = as_sent(point, corrected(point, intents.take(node))), tie_draws(draws, stored.spec.ties)
+    intents, ties = as_sent(point, point.prepared(intents.take(node))), tie_draws(draws, stored.spec.ties)
     own_j, actions, costs = stored.joules(scenes, point)[node], [], []
     for who in sets[:, :width]:
         heard = fuse(

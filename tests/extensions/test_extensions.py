@@ -14,11 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluating import A_TENTH, spec_of
+from msgspec import structs
 from packaged import register
 from reference import DOCS, blocks
 
 import harness as package
 from harness.cli.commands import COMMANDS
+from harness.coordination.added_parts import added_parts
+from harness.coordination.operating_point import more_parts
 from harness.core import extensions as known
 from harness.core.errors import UserError
 from harness.core.extensions import Extension
@@ -28,6 +31,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import begin, unfinished
 from harness.report import sections
 from harness.runs import metrics
+from harness.runs.folder import read
 from harness.runs.metrics import METRICS, entry
 
 ROOT = Path(__file__).parents[2]
@@ -299,6 +303,10 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     ):
         named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"}
         assert named == set(names)
+    for part in extension.adds.get("parts", {}):
+        for setting, default in structs.asdict(more_parts()[part]()).items():
+            idle = "" if default is None else str(default)
+            assert known.setting_of_extension(setting) == known.OfExtension(name, idle)
 
 
 def test_every_folder_of_an_extension_is_registered() -> None:
@@ -366,6 +374,102 @@ def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
     assert f"'{name}'" not in names
     extension = ENTRIES[known.NAMES][name].rpartition(".")[2]
     assert said == f"`harness.{name}` is part of the extension {extension}, which is not installed"
+
+
+@pytest.mark.slow
+def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_part_of(
+    core: Path, tmp_path: Path
+) -> None:
+    """Runs have it, whether it did something or not."""
+    code = (
+        "from harness.coordination.operating_point import OperatingPoint, named_point\n"
+        "from harness.core.errors import UserError\n"
+        "print(OperatingPoint.from_dict({'name': '6g', 'profile': '6g', 'calibration': ''}).record() == "
+        "OperatingPoint.from_dict({'name': '6g', 'profile': '6g'}).record())\n"
+        "for ask in (lambda: OperatingPoint.from_dict({'name': '6g', 'calibration': 'l1'}), "
+        "lambda: named_point('6g:calibration=l1')):\n"
+        "    try:\n        ask()\n    except UserError as error:\n        print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(core)}, check=True,
+    )  # fmt: skip
+    of_one = "is part of the extension calibration, which is not installed"
+    assert done.stdout.splitlines() == ["True", *[f"setting calibration=l1 of a condition {of_one}"] * 2]
+
+
+PART = """
+from typing import ClassVar
+import numpy as np
+from dataclasses import replace
+from harness.extend import Part
+
+class Muffled(Part, frozen=True, kw_only=True):
+    behind: ClassVar[str] = "content"
+    muffle: float = 0.0
+
+    def check_with(self, point):
+        if point.radio.profile == "v2x":
+            raise ValueError("muffle does not go with v2x")
+
+    def before(self, intents):
+        return replace(intents, helpers=(1 - self.muffle) * intents.helpers + self.muffle / 3)
+"""
+
+
+@pytest.mark.slow
+def test_a_package_adds_a_part_of_a_condition(tmp_path: Path, two_path: Path) -> None:
+    """Its setting is typed and recorded like any other, and refuses in one line what it does not go with."""
+    parts = '{"parts": {"muffled": "muffled:Muffled"}}'
+    extension = f'from harness import Extension\nODD = Extension(name="odd", adds={parts})\n'
+    register(tmp_path / "site", f"[{known.GROUP}]\nodd = of_others:ODD\n", of_others=extension, muffled=PART)
+    both, alone = [ROOT, tmp_path / "site"], [ROOT]
+    asked = ("eval", "--model", "proxy", "--dataset", str(two_path), "--seeds", "0:2", "--quiet")
+    typed = ("--condition", "6g", "--condition", "6g:muffle=1", "--condition", "6g:muffle=0")
+    assert in_process(both, tmp_path, *asked, *typed, "--out", "run") == (0, "", "")
+    stated = json.loads((tmp_path / "run/run.json").read_text())["conditions"]
+    assert [condition.get("muffle") for condition in stated] == [None, 1.0, None]
+    decisions = read(tmp_path / "run").decisions
+    names, fused = np.array(decisions.labels("condition")), decisions.of_actions("fused")
+    plain, muffled, idle = (fused[names == name] for name in ("6g", "6g:muffle=1", "6g:muffle=0"))
+    assert np.array_equal(plain, idle)
+    assert not np.array_equal(plain, muffled)
+    code, out, err = in_process(both, tmp_path, *asked, "--condition", "v2x:muffle=1", "--out", "other")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "muffle does not go with v2x" in err
+    code, out, err = in_process(alone, tmp_path, "eval", "run", "--quiet", "--out", "again")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "muffle" in err
+
+
+PARTS = "from harness.coordination.parts import Ask, Part\nclass Own(Part, frozen=True):\n    "
+BROKEN_PARTS = {
+    "ODD = 3": "part odd of an extension is no subclass of Part; repair its package",
+    f"{PARTS}tau_nats: float = 0.0\nODD = Own": "has setting tau_nats, which another part has",
+    f"{PARTS}own: float = 0.0\nODD = Own": "stands behind '', which is no setting",
+    "ODD = 1 / 0": "part odd of an extension fails (ZeroDivisionError: division by zero at",
+}
+
+
+@pytest.mark.parametrize(("source", "said"), BROKEN_PARTS.items())
+def test_a_part_that_does_not_work_is_one_line_and_all_else_works(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    source: str,
+    said: str,
+) -> None:
+    extension = (
+        'from harness import Extension\nEXT = Extension(name="odd", adds={"parts": {"odd": "odd_part:ODD"}})'
+    )
+    register(
+        tmp_path / "site", f"[{known.GROUP}]\nodd = of_others:EXT\n", of_others=extension, odd_part=source
+    )
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    for name in ("of_others", "odd_part"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    assert "odd" not in added_parts(["tau_nats"])
+    assert said in capsys.readouterr().err
 
 
 def test_the_core_names_no_command_of_an_extension() -> None:

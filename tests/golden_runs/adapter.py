@@ -16,8 +16,10 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from msgspec import structs
 
 from harness.cli import main
+from harness.coordination.operating_point import more_parts
 from harness.report.drawing import pictures
 
 Row = dict[str, str]
@@ -62,8 +64,10 @@ def tables_of(run: Path) -> dict[str, Table]:
     needed = latency["source"] == "paper" or world["kind"] == "closed-loop" or any(
         condition["consensus"] == "ego-prompt" for condition in manifest["conditions"]
     )  # fmt: skip
+    # A condition leaves out the settings of an extension that do nothing.
+    idle = {key: value for kind in more_parts().values() for key, value in structs.asdict(kind()).items()}
     told = {
-        **world, **manifest,
+        **world, **manifest, "conditions": [{**idle, **condition} for condition in manifest["conditions"]],
         "latency": {
             "source": latency["source"], "basis": latency["basis"],
             "inference_s": {"ego": latency["ego_s"], "helper": latency["helper_s"]},

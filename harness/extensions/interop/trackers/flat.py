@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 PROJECT = "swarmdrive-harness"
 _FILES = ("run.json", "summary.csv", "report.html")
-_TABLES = ("channels", "networks", "schedules", "calibrations")  # of which a condition has the names
+_TABLES = ("channels", "networks", "schedules", "kept")  # of which a condition has the names
 
 
 def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:

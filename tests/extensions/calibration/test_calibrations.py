@@ -12,11 +12,11 @@ from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.calibrations import OF_QUESTION, Calibration, Correction, question_of
 from harness.core.resources import MARKER
 from harness.dataset.build import build
+from harness.extensions.calibration.calibrations import OF_QUESTION, Calibration, Correction, question_of
+from harness.extensions.calibration.fitting import TEMPERATURES, fit
 from harness.runs.folder import read
-from harness.studies.calibrating import TEMPERATURES, fit
 from harness.world import scenarios
 
 Typed = Callable[..., tuple[int, str, str]]
@@ -94,7 +94,7 @@ def test_a_calibration_corrects_every_answer_of_a_condition(
     code, _, error = evaluated(harness, small_path, "--out", "run", *words)
     assert (code, error) == (0, "")
     played = read(tuned / "run")
-    assert set(played.manifest.calibrations) == {"l0", "l1"}
+    assert set(played.manifest.kept["calibrations"]) == {"l0", "l1"}
     assert (tuned / "run/sources/calibrations/l1.toml").exists()
     fitted = tomllib.loads((tuned / "calibrations/l1.toml").read_text())
     own = {a.scene: np.array(a.intent) for a in played.answers if a.role == "ego"}

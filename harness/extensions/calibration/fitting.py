@@ -6,7 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.coordination.calibrations import (
+from harness.core.arrays import Bools, Floats
+from harness.core.errors import UserError, printable
+from harness.core.figures import amount
+from harness.core.files import write_whole
+from harness.core.seeds import stated
+from harness.dataset import rebuilt
+from harness.dataset.forest import Forest
+from harness.extensions.calibration.calibrations import (
     COOLEST,
     HOTTEST,
     LEAST_PRIOR,
@@ -16,13 +23,6 @@ from harness.coordination.calibrations import (
     check_seeds,
     question_of,
 )
-from harness.core.arrays import Bools, Floats
-from harness.core.errors import UserError, printable
-from harness.core.figures import amount
-from harness.core.files import write_whole
-from harness.core.seeds import stated
-from harness.dataset import rebuilt
-from harness.dataset.forest import Forest
 from harness.runs.folder import Run, dataset_of, read
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats

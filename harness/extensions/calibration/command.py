@@ -27,8 +27,8 @@ def command(
     from dataclasses import asdict
     from typing import cast, get_args
 
-    from harness.coordination.calibrations import Level
-    from harness.studies.calibrating import calibrate, write
+    from harness.extensions.calibration.calibrations import Level
+    from harness.extensions.calibration.fitting import calibrate, write
 
     if level not in get_args(Level):
         raise unknown("--level", level, get_args(Level))

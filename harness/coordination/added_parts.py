@@ -1,0 +1,42 @@
+"""The parts of an operating point that extensions add."""
+
+import sys
+from collections.abc import Collection, Mapping
+
+from harness.coordination.parts import Part
+from harness.core.errors import UserError, printable
+from harness.core.extensions import added
+from harness.core.strangers import aside, worded
+
+GROUP = "swarmdrive.parts"
+
+
+def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
+    """Return the parts of all extensions by name, those that ship first; `taken` are others' settings.
+
+    Of each part that does not work a line on stderr says what is wrong with it.
+    """
+    kinds: dict[str, type[Part]] = {}
+    settings = set(taken)
+    for name, entry in added(GROUP).items():
+        what = f"part {printable(name)} of an extension"
+        try:
+            with worded(what), aside(what):
+                kind = entry.load()
+                _check(what, kind, settings)
+                kind()  # its defaults are allowed
+        except UserError as error:
+            print(f"harness: {error}; all else works", file=sys.stderr)
+            continue
+        settings.update(kind.__struct_fields__)
+        kinds[name] = kind
+    return kinds
+
+
+def _check(what: str, kind: object, taken: Collection[str]) -> None:
+    if not (isinstance(kind, type) and issubclass(kind, Part)):
+        raise UserError(f"{what} is no subclass of Part; repair its package")
+    if lost := [key for key in kind.__struct_fields__ if key in taken]:
+        raise UserError(f"{what} has setting {lost[0]}, which another part has; give it another name")
+    if kind.behind not in taken:
+        raise UserError(f"{what} stands behind {printable(kind.behind)!r}, which is no setting")
