@@ -115,7 +115,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     names, *values = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
     widths = [max(column) for column in values]
     rooms = {gap: WIDTH - sum(widths) - gap * len(widths) for gap in (2, 1)}
-    gap, room = max(rooms.items(), key=lambda item: sum(length <= item[1] for length in names))
+    gap, room = max(rooms.items(), key=lambda of: (sum(length <= of[1] for length in names), of[1] >= 0))
     first = max((length for length in names if length <= room), default=0)
     for (name, *cells), length in zip(lines, names, strict=True):
         if length > room:
