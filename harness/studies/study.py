@@ -137,7 +137,8 @@ def refuse_taken(out: Path, kind: str) -> None:
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     """Raise UserError if a folder has a run, another kind of study, or one of this kind made otherwise.
 
-    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their latency.
+    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their latency. What
+    an older study does not state is not held against it.
     """
     refuse_taken(out, kind)
     try:
@@ -145,9 +146,9 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     except FileNotFoundError:
         return
     except (OSError, ValueError, RecursionError):
-        stated = {}  # it is no study of this kind
-    theirs = stated if isinstance(stated, dict) else {}
+        stated = None
     now = json.loads(json.dumps(manifest))
+    theirs = {**now, **stated} if stated and isinstance(stated, dict) else {}  # else it is no study
     if keys := [key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)]:
         raise UserError(
             f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another folder with "

@@ -255,7 +255,7 @@ def run_bench(
 
     Raises:
         UserError: the point has no channel, or asks nobody, or its rule is a fusion call, or none of the
-            rules changes anything; or the folder has the study of another run or condition.
+            rules changes anything; or the folder has another such study.
     """
     point = point_of([run], condition)
     if why := point.idle("attack"):
@@ -283,9 +283,10 @@ def run_bench(
     ]))  # fmt: skip
     for key in every:
         under(point, *key)  # which checks that they go together
-    refuse_other(
-        out, "trust", {"sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition}
-    )
+    refuse_other(out, "trust", {
+        "sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition,
+        "seeds": list(seeds), "rules": list(every_rule), "attacks": list(attacks), "shares": list(shares),
+    })  # fmt: skip
     depends_on = [
         run.manifest(), str(run.run.manifest.identity), point.record(), list(seeds),
         point.radio.profile and CHANNELS.record(point.radio.profile), versions(),
@@ -339,8 +340,8 @@ def trust_study(bench: Bench) -> Study:
         {"figures": pd.DataFrame(rows)},
         {
             "sources": [{"name": bench.name}], "dataset": bench.source, "condition": bench.condition,
-            "rules": list(bench.rules), "attacks": list(bench.attacks), "shares": list(bench.shares),
-            "versions": versions(),
+            "seeds": list(bench.seeds), "rules": list(bench.rules), "attacks": list(bench.attacks),
+            "shares": list(bench.shares), "versions": versions(),
         },
         {"run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells},
         lambda: {"heat-map": _heat_map(bench)}, bench.caveats,

@@ -16,9 +16,7 @@ MOST_EPISODES = 1_000_000
 
 
 def paper(
-    out: Path = typer.Option(
-        Path("reports/paper"), help="Folder to write; a study that is there is replaced."
-    ),
+    out: Path = typer.Option(Path("reports/paper"), help="Folder to write."),
     episodes: int = typer.Option(1500, help="Episodes per seed to compare the operating points."),
     sweep_episodes: int = typer.Option(300, help="Episodes per seed at each grid point of a sweep."),
     seeds: str = typer.Option(
@@ -32,15 +30,16 @@ def paper(
     It plays the paper's study, and writes a page with both numbers, and Figures A and B.
     """
     from harness.extensions.paper.panels import panels, run_paper
-    from harness.studies.study import refuse_taken
+    from harness.studies.study import refuse_other
 
     in_range("--episodes", episodes, 10, MOST_EPISODES)
     in_range("--sweep-episodes", sweep_episodes, 10, MOST_EPISODES)
     draws = parse_seeds(seeds)
     if len(set(draws)) < len(draws):
         raise UserError(f"--seeds {printable(seeds)}: give different whole numbers, such as 0:5")
-    refuse_taken(out, "study")
     settings = panels(episodes, sweep_episodes)
+    sizes = {panel.name: panel.episodes for panel in settings}
+    refuse_other(out, "study", {"seeds": list(draws), "episodes_per_seed": sizes})
     with bar("grid points", sum(len(panel.settings) for panel in settings), as_json or quiet) as progress:
         study = run_paper(settings, draws, progress)
     finish(study, out, as_json, quiet)

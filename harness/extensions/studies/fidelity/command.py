@@ -19,7 +19,9 @@ def command(
     Give at least one run of `harness eval` and one of `harness drive`, with the same models and layouts.
     """
     from harness.extensions.studies.fidelity.study import fidelity, fidelity_study
+    from harness.studies.study import refuse_other
 
     with bar("comparing frozen with closed loop", quiet=as_json):
         study = fidelity_study(fidelity(runs), runs)
+        refuse_other(out, study.kind, {"sources": study.manifest["sources"]})
     finish(study, out, as_json)
