@@ -326,6 +326,10 @@ def trust_study(bench: Bench) -> Study:
          "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None}
         for c in bench.cells.values()
     ]  # fmt: skip
+    means = [
+        {"rule": rule, "share": share, **as_mapping(bench.mean(rule, share))}
+        for share in bench.shares for rule in bench.rules
+    ]  # fmt: skip
     n = bench.price(BASE).n
     return Study(
         "trust", f"Consensus rules under attack: {bench.name} on {bench.source}", headline(bench),
@@ -343,7 +347,10 @@ def trust_study(bench: Bench) -> Study:
             "seeds": list(bench.seeds), "rules": list(bench.rules), "attacks": list(bench.attacks),
             "shares": list(bench.shares), "versions": versions(),
         },
-        {"run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells},
+        {
+            "run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells,
+            "alone": as_mapping(bench.counting.estimate(bench.alone)), "means": means,
+        },
         lambda: {"heat-map": _heat_map(bench)}, bench.caveats,
     )  # fmt: skip
 
