@@ -308,7 +308,7 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
             replace(run.spec, points=points),
             run.dataset,
             sorted({*run.dataset.courses(), *run.run.decisions.scenes}),
-            run.answered([]),
+            run.answers,
         )
         for family, run in model.runs.items()
     }

@@ -206,11 +206,16 @@ class ReplayedRun:
         """The evaluation that made the run, with all that decides its answers; it has no conditions."""
         return self._asker.spec
 
+    @property
+    def answers(self) -> Mapping[str, Answer]:
+        """The answers that are there, by request id; nothing is asked or written."""
+        return self._asker.answers
+
     def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
         """Return all answers by request id, with these; what is not there is asked, and kept in the run."""
         with self._writing():
             self._asker.answer(requests)
-        return self._asker.answers
+        return self.answers
 
     @property
     def caveats(self) -> tuple[str, ...]:
