@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from harness.coordination.operating_point import POINTS, named_point
+from harness.core.figures import crossed
 from harness.core.parallel import Workers
 from harness.core.work import tidy
 from harness.evaluate.lifecycle import Evaluated, finished
@@ -69,8 +70,9 @@ def run_closed_loop(
         "closed-loop", f"The paper's panels, driven: {m.variant} · {world.title}",
         [f"{table.title}: {in_a_sentence(table)}." for table in shown],
         [
-            f"Every grid point was driven in closed loop on the layouts of {world.title} with "
-            f"channel seeds {', '.join(map(str, m.seeds))}; 95 % intervals are over episodes. "
+            f"Every grid point was driven in closed loop on the layouts of {world.title}; n = "
+            f"{crossed(world.episodes, len(m.seeds))} (channel seeds {', '.join(map(str, m.seeds))}), and "
+            "95 % intervals are over episodes. "
             "conditions.csv has all figures with their n, and run/ the driven episodes."
         ],
         shown, {"conditions": summary}, {"run": RUN, "panels": described(grids), "versions": m.versions},
