@@ -29,7 +29,7 @@ from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 
-pytest_plugins = ["browsing", "relabelling"]
+pytest_plugins = ["browsing", "relabelling", "studied"]
 EPISODES, SEED = 4, 100
 EXTENSIONS = Path(cli.__file__).parents[1] / "extensions"  # without them the core's own tests run
 Once = Callable[[str, Callable[[Path], object]], Path]

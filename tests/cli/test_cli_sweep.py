@@ -33,29 +33,6 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
     assert p99["v2x:on_demand=true"] == pytest.approx(365, abs=3)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--over", "speed"), "unknown --over 'speed'"),
-        (("--over", "tau", "--grid", "a"), "--grid a: give numbers"),
-        (("--over", "tau", "--grid", ""), "--grid"),
-        (("--over", "tau", "--grid", "1", "--grid", "2"), "--grid: 2 given for 1 of --over"),
-        (("--over", "tau", "--condition", "6g:taus=1"), "unknown setting of operating point 6g 'taus'"),
-        (("--over", "tau", "--condition", "single-local"), "has no channel; nothing of it can be varied"),
-        (("--over", "consensus", "--grid", "ego-prompt"), "proxy is no language model"),
-        (("--latency", "mine"), "unknown --latency 'mine'"),
-    ],
-)
-def test_what_cannot_be_is_one_line_and_nothing_is_written(
-    options: tuple[str, ...], said: str, harness: Callable[..., Said], done: Path
-) -> None:
-    code, out, err = harness("study", "sweep", done, *options, "--out", "swept")
-    assert (code, out) == (2, "")
-    assert said in err
-    assert err.count("\n") == 1
-    assert not Path("swept").exists()
-
-
 def test_a_proxy_that_no_extension_has_is_one_line(
     harness: Callable[..., Said], done: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

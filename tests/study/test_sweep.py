@@ -220,23 +220,3 @@ def test_a_setting_that_is_refused_as_idle_changes_nothing(
 def test_a_setting_that_one_value_frees_is_drawn(source: ReplayedRun) -> None:
     axis = axis_of("schedule")
     assert len(settings([source], [axis], [("never", "entropy")], ["6g:schedule=never"])) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("svg_alone")
-def test_another_sweep_is_not_overwritten_and_the_same_one_is_made_again(
-    source: ReplayedRun, tmp_path: Path
-) -> None:
-    write_study(study_of(source, tmp_path, "tau", "0.7"), tmp_path)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    write_study(study_of(source, tmp_path, "tau", "0.7"), tmp_path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    axis = AXES["tau"]
-    for text, condition, seeds, other in (
-        ("0.8", "6g", source.seeds, "panels"), ("0.7", "v2x", source.seeds, "panels"),
-        ("0.7", "6g", (7,), "seeds"),
-    ):  # fmt: skip
-        points = {"tau": settings([source], [axis], [grid(axis, text)], [condition])}
-        with pytest.raises(UserError, match=f"holds another sweep, with other {other}; name another folder"):
-            run_sweep([source], points, seeds, tmp_path, lambda n: None)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

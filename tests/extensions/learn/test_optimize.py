@@ -279,9 +279,6 @@ def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     assert "read once, after the search" in page
     assert best in page
     assert not (tmp_path / "reports" / "new" / ".work").exists()
-    code, _, wrong = optimize()
-    assert code == 2
-    assert "a prompt of that name is there already" in wrong
 
 
 @pytest.mark.slow
@@ -357,34 +354,6 @@ def test_the_budget_is_never_exceeded(optimize: Typed, model: Model, tmp_path: P
     assert optimize("--folder", tmp_path / "some", budget=30)[0] == 0
     record = json.loads((tmp_path / "some" / "optimize.json").read_text())
     assert record["questions"] <= 30
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("args", "reason"),
-    [
-        (["--model", "proxy"], "reads the scene and no prompt"),
-        (["--prompt", "v3"], "no alternatives are marked"),
-        (["--first-seed", "100000"], "searched on tune seeds"),
-        (["--first-seed", "200000"], "searched on tune seeds"),
-        (["--tune", REPORT], "searched on tune seeds"),
-        (["--dataset", "SMALL"], "certified on report seeds"),
-        (["--condition", "6g", "--condition", "v2x"], "give one"),
-        (["--budget", "0"], "1 or more"),
-        (["--out", "v3"], "there already"),
-        (["--out", "../x"], "cannot name a prompt"),
-        (["--latency", "measured"], "give seconds"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused_in_a_line(
-    args: list[str], reason: str, optimize: Typed, model: Model, tmp_path: Path, small_path: Path
-) -> None:
-    args = [str(small_path) if word == "SMALL" else word for word in args]
-    code, out_text, wrong = optimize(*args, tune=() if args[0] == "--tune" else ("--tune", small_path))
-    assert (code, out_text, len(wrong.strip().splitlines())) == (2, "", 1), wrong
-    assert reason in wrong
-    assert not model.chats
-    assert not (tmp_path / "reports").exists()
 
 
 def test_an_alternative_that_does_not_render_is_named(optimize: Typed, model: Model, tmp_path: Path) -> None:

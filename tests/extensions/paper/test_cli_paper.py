@@ -42,12 +42,3 @@ def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     sizes = json.loads(Path("swept/sweep.json").read_text())["panels"]["size"]
     assert [s["vehicles"] for s in sizes] == [1, 2, 3, 4]
     assert all(s["density_coupled"] for s in sizes)
-
-
-@pytest.mark.slow
-def test_the_papers_study_ends_with_how_many_numbers_it_met(harness: Callable[..., Said]) -> None:
-    code, out, err = harness("study", "paper", "--episodes", "10", "--sweep-episodes", "10", "--out", "p")
-    assert (code, err) == (0, "")
-    assert max(map(len, out.splitlines())) <= 80
-    assert "of 30 numbers within the aim" in out
-    assert out.splitlines()[-1] == "wrote p/index.html"

@@ -383,14 +383,6 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     kept = of_run(folder.read(tmp_path / "run"))
     assert kept
     assert f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind" in page
-    for typed, said in {
-        ("run", "--sample", "0"): "--sample 0 is out of range; give 1 to 100000",
-        ("run", "--condition", "7g"): "unknown condition '7g'",
-        ("nowhere",): "nowhere is no finished run",
-    }.items():
-        code, _, err = harness("study", "attribute", *typed)
-        assert (code, err.count("\n")) == (2, 1)
-        assert said in err
 
 
 def test_a_broken_file_is_one_line(harness: Callable[..., Said], small: Dataset, tmp_path: Path) -> None:

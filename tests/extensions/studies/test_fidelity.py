@@ -1,6 +1,5 @@
 """Frozen against closed, on four layouts that were frozen and driven."""
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -89,13 +88,6 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
         " ".join(few.split()),
     )
     assert "too few" in Path("few/index.html").read_text()
-    names = {f"fidelity.{kind}" for kind in ("csv", "json", "jsonl", "svg", "pdf", "png")}
-    assert {p.name for p in Path("told").iterdir()} == names | {
-        "episodes.csv",
-        "episodes.jsonl",
-        "index.html",
-    }
-    assert len(json.loads(harness("study", "fidelity", *runs, "--json")[1])) == 12
 
 
 @pytest.mark.slow

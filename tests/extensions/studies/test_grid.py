@@ -207,16 +207,6 @@ def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
 
 
 @pytest.mark.slow
-def test_a_grid_is_printed_as_json(harness: Callable[..., Any], small_path: Path) -> None:
-    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "6g")
-    code, out, err = harness("study", "grid", "--prompt", "v1,v2", *few, "--out", "grid", "--json")
-    assert code == 0, err
-    answer = json.loads(out)
-    assert {row["metric"] for row in answer["cells"]} >= {SUCCESS, LATENCY, "tokens"}
-    assert next(row["effect"] for row in answer["effects"]) == "ego prompt: v1 → v2"
-
-
-@pytest.mark.slow
 def test_letters_are_those_of_the_agents_that_read_out(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path
 ) -> None:

@@ -1,0 +1,45 @@
+"""How this extension's studies are tried."""
+
+from studied import ASKED, BOTH, Trial
+
+TRIALS = {
+    "grid": Trial(
+        "study grid --dataset data", f"--prompt v2,v3 --helper-prompt v2 {BOTH}", "--prompt v1,v2",
+        "--out out already holds a finished grid; choose another",
+        {
+            "--prompt v2": "1 combinations: give 2 to 256, such as --model a,b",
+            "--prompt v2,v2": "--prompt v2,v2: give different names, such as a,b",
+            "--prompt v1,v2 --letters cyclic": "--letters cyclic: proxy answers in json; leave it out",
+        },
+        "the same for all combinations", ends=False,
+    ),
+    "twins": Trial(
+        "study twins --dataset data", "--sample 3 --workers 1", "--sample 2 --workers 1",
+        "--out out already holds finished twins; choose another folder",
+        {
+            "--twin mirrord": "did you mean 'mirrored'?",
+            "--model full-view": "reads the truth",
+            "--twin units": "units needs a language model",
+            "--twin mirrored --dataset roundabout-entry-v1": "traffic goes round one way",
+            "--fail-if 'ids:success_rate < 1'": "known: failed_rate, invariance_rate, tv_distance",
+            "--fail-if 'letters:invariance_rate < 1'": "unknown twin of --fail-if",
+            "--fail-if often": "such as 'mirrored:invariance_rate < 0.9'",
+            "--sample 0": "--sample 0",
+        },
+        "the number of questions that the twin changes", ends=False,
+    ),
+    "fidelity": Trial(
+        "study fidelity", "run driven", "copy driven",
+        "out holds another fidelity, with other sources; name another folder",
+        {"run": "no run on live episodes", "run nowhere": "nowhere is no finished run"},
+        "driving on with a planner that sees everything",
+    ),
+    "attribution": Trial(  # which lies in its run's folder
+        "study attribute run", "--sample 6", "--sample 7", "",
+        {
+            "--sample 0": "--sample 0 is out of range; give 1 to 100000",
+            "--condition 7g": "unknown condition '7g'",
+        },
+        "", out="", folder="run", beside=ASKED,
+    ),
+}  # fmt: skip
