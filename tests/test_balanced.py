@@ -22,13 +22,13 @@ from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.matrix import BEST, WORSE, headline, lines
 from harness.report.runs import Runs
-from harness.report.words import Pairing
 from harness.report.words import headline as of_one
 from harness.runs.folder import Run, read
 from harness.runs.leading import SUCCESS, lead_of
 from harness.runs.listing import runs
 from harness.runs.metrics import BALANCED, GAINS, METRICS, of_ends
 from harness.runs.success import Success, alike, half_difference
+from harness.runs.suite import plays
 
 HALVES = METRICS[BALANCED].halves
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half or metric.halves}
@@ -204,7 +204,7 @@ def test_the_headline_has_what_cooperation_does_where_there_is_a_danger_and_wher
             row |= {"success": False, "failure": "late"}
 
     done = read(made_up(tmp_path / "run", episode=end, episodes=40))
-    pairs = Pairing(done).pairs("6g", "single-local")
+    pairs = plays([done], BALANCED).pairs("6g", "single-local")
     danger, price = (shown(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False))
     assert danger.startswith("+60.0 [")
     assert price.startswith("-10.0 [")

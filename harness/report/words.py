@@ -16,10 +16,10 @@ from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
-from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, METRICS, SUCCESS, entry, of_ends, written
+from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, SUCCESS, entry, written
 from harness.runs.records import Latency, Manifest, Score, Times, role_word
-from harness.runs.success import Pairs, Success, half_difference, mean_difference, p_of_mean
-from harness.runs.suite import SuiteRun
+from harness.runs.success import half_difference, mean_difference, p_of_mean
+from harness.runs.suite import SuiteRun, plays
 
 # Layouts from which on a corrected figure is shown beside the plain one, whatever both are: intervals of so
 # many hold the truth in 94 % of studies or more, plain and balanced (`benchmarks/difficulty.py`).
@@ -61,8 +61,7 @@ def headline(run: Run | SuiteRun) -> str:
         if halves := entry(lead).halves:
             text += ": {} with a danger, {} without".format(*(_shown(run, best, half) for half in halves))
         return text + (f", and no other condition{of} does better." if several else ".")
-    pairing = Pairing(run)
-    pairs, p = pairing.pairs(best, base), pairing.p_values(base)
+    pairs, p = plays(_runs(run), lead).pairs(best, base), p_values(run, base)
     corrected = dict(zip(p, holm(list(p.values())), strict=True))
     clear = judged(mean_difference(pairs), corrected[best])
     if lead == SUCCESS:
@@ -150,35 +149,11 @@ def adjusted_lines(run: Run) -> Iterator[str]:
             yield f"{words} % adjusted for difficulty: {'; '.join(cells)}"
 
 
-class Pairing:
-    """Success of the same episodes in two conditions of a run, or of a suite's."""
-
-    def __init__(self, run: Run | SuiteRun) -> None:
-        lead = lead_of(run)
-        self._runs = []
-        for of in _runs(run):
-            success = Success.of(of.episodes[: len(of.grid.episodes)], lead)
-            self._runs.append((success, of_ends(METRICS[SUCCESS], of.grid, of.episodes)))
-        self._places = {condition: place for place, condition in enumerate(run.conditions)}
-
-    def pairs(self, condition: str, base: str) -> Pairs:
-        """Return success in a condition and in the one that it is held against, by family."""
-        a, b = self._places[condition], self._places[base]
-        return [(success, values[a], values[b]) for success, values in self._runs]
-
-    def p_values(self, base: str) -> dict[str, float]:
-        """Return p of each other condition's gain over `base`."""
-        values = dict[str, float]()
-        for condition in self._places:
-            if condition != base:
-                p = p_of_mean(self.pairs(condition, base))
-                values[condition] = 1.0 if p is None else p
-        return values
-
-
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
-    return Pairing(run).p_values(base)
+    played = plays(_runs(run), lead_of(run))
+    found = {c: p_of_mean(played.pairs(c, base)) for c in run.conditions if c != base}
+    return {condition: 1.0 if p is None else p for condition, p in found.items()}
 
 
 def p_value(p: float) -> str:

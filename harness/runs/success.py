@@ -6,6 +6,7 @@ All that picks, orders or tests by success of single episodes does so here.
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import comb
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, paired
 from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
+
+Setting = TypeVar("Setting")
 
 
 @dataclass(frozen=True)
@@ -117,10 +120,12 @@ class Success:
         return mean_of([*map(estimate, parts)]) if len(parts) > 1 else estimate(parts[0])
 
 
-def by_condition(grid: Grid, episodes: Sequence[Episode]) -> tuple[Success, dict[str, Floats]]:
+def by_condition(
+    grid: Grid, episodes: Sequence[Episode], lead: str = BALANCED
+) -> tuple[Success, dict[str, Floats]]:
     """Return how success of a run's episodes counts, and success (S, E) by condition; in the grid's order."""
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
-    return Success.of(episodes[: len(grid.episodes)], BALANCED), values
+    return Success.of(episodes[: len(grid.episodes)], lead), values
 
 
 def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
@@ -141,6 +146,27 @@ def is_gain(score: Score, conditions: Container[str]) -> bool:
 
 
 Pairs = Sequence[tuple[Success, Floats, Floats]]  # of each family: how success counts, and both, (S, E)
+
+
+@dataclass(frozen=True)
+class Plays(Generic[Setting]):
+    """Success of the same episodes under several settings, in one family of scenes or more."""
+
+    # of each family: how success counts, and success by setting, (S, E)
+    families: Sequence[tuple[Success, Mapping[Setting, Floats]]]
+
+    @property
+    def plain(self) -> "Plays[Setting]":
+        """The same, read by plain success."""
+        return Plays([(rule.plain, success) for rule, success in self.families])
+
+    def pairs(self, setting: Setting, base: Setting) -> Pairs:
+        """Return success under a setting and under the one that it is held against, by family."""
+        return [(rule, success[setting], success[base]) for rule, success in self.families]
+
+    def difference(self, setting: Setting, base: Setting) -> Estimate:
+        """Return the mean over families of the difference in success, paired by episode."""
+        return mean_difference(self.pairs(setting, base))
 
 
 def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:

@@ -1,6 +1,6 @@
 """Read and write a suite's folder: a run of each family of scenes, and the means over families."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 
-from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of, write_whole
 from harness.core.formats import SUITE
@@ -19,7 +18,7 @@ from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import own_name
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
-from harness.runs.success import Success, by_condition, is_gain, mean_difference
+from harness.runs.success import Plays, by_condition, is_gain
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
@@ -91,22 +90,24 @@ class SuiteRun:
                 yield self._gain(s) if is_gain(s, self.conditions) else mean(of_families)
 
     @cached_property
-    def _success(self) -> list[tuple[Success, dict[str, Floats]]]:
-        return [by_condition(run.grid, run.episodes) for run in self.runs.values()]
+    def _plays(self) -> Plays[str]:
+        return plays(self.runs.values(), BALANCED)
 
     def _gain(self, score: Score) -> Score:
         """Return a gain over the condition without V2V; the layouts of all families are taken together."""
-        balanced = score.metric == GAINS[BALANCED]
-        pairs = [
-            (how if balanced else how.plain, values[score.condition], values[BASELINE])
-            for how, values in self._success
-        ]
-        return Score.of(score.condition, score.metric, mean_difference(pairs), PAIRED)
+        plays = self._plays if score.metric == GAINS[BALANCED] else self._plays.plain
+        gain = plays.difference(score.condition, BASELINE)
+        return Score.of(score.condition, score.metric, gain, PAIRED)
 
     def score(self, condition: str, metric: str) -> Score | None:
         """Return a metric's mean over families; None if a family has no value."""
         of_metric = (s for s in self.scores if (s.condition, s.metric) == (condition, metric))
         return next((s for s in of_metric if s.value is not None), None)
+
+
+def plays(runs: Iterable[Run], lead: str) -> Plays[str]:
+    """Return success by condition of runs of one family each, which are read by `lead`."""
+    return Plays([by_condition(run.grid, run.episodes, lead) for run in runs])
 
 
 def mean(scores: Sequence[Score]) -> Score:

@@ -4,11 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from markupsafe import Markup
 
 from harness.backends.registry import reads_prompts
-from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.extensions.benchmark.edition import Edition
@@ -18,12 +16,11 @@ from harness.report.page import save
 from harness.report.templating import visible
 from harness.report.words import cell
 from harness.runs import pinned
-from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
-from harness.runs.metrics import BASELINE, GAINS, METRICS, SUCCESS, of_ends
+from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Score
-from harness.runs.success import Pairs, Success
-from harness.runs.suite import SuiteRun
+from harness.runs.success import Pairs
+from harness.runs.suite import SuiteRun, plays
 
 
 @dataclass(frozen=True)
@@ -84,26 +81,17 @@ def _rank(suite: SuiteRun, ranked: Sequence[SuiteRun], edition: Edition, lead: s
     return 1 + sum(difference.low > 0 for difference in differences)
 
 
-def _pairs(a: SuiteRun, b: SuiteRun, condition: str, lead: str, base: str = "") -> Pairs:
-    """Return success of a under a condition, and of b under the same or another, by family."""
-    pairs = []
-    for family, run in a.runs.items():
-        x = _success(run, condition)
-        y = _success(b.runs[family], base or condition)
-        pairs.append((Success.of(run.episodes[: len(run.grid.episodes)], lead), x, y))
-    return pairs
-
-
-def _success(run: Run, condition: str) -> Floats:
-    values = of_ends(METRICS[SUCCESS], run.grid, run.episodes)
-    return np.asarray(values[run.conditions.index(condition)])
+def _pairs(a: SuiteRun, b: SuiteRun, condition: str, lead: str) -> Pairs:
+    """Return success of both under a condition, by family."""
+    both = [plays([of.runs[family] for family in a.runs], lead).families for of in (a, b)]
+    return [(rule, x[condition], y[condition]) for (rule, x), (_, y) in zip(*both, strict=True)]
 
 
 def _gain(suite: SuiteRun, edition: Edition, lead: str) -> Score | None:
     by = edition.ranked_by
     if by == BASELINE or BASELINE not in edition.condition:
         return None
-    gain = edition.difference(_pairs(suite, suite, by, lead, BASELINE))
+    gain = edition.difference(plays(suite.runs.values(), lead).pairs(by, BASELINE))
     return Score.of(by, GAINS[lead], gain, edition.gains)
 
 
