@@ -16,20 +16,20 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from families import Row, finished
 from markupsafe import Markup
 from pages import harness, markdown, options, write_tables
 
 from harness.coordination.contents import OF_HELPERS
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Floats
 from harness.core.figures import shown
 from harness.core.progress import Progress
 from harness.dataset import suites
 from harness.dataset.load import find, load
 from harness.report.document import Table
 from harness.runs.folder import read
-from harness.runs.metrics import METRICS, SUCCESS, by_episode
+from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode
+from harness.runs.success import Success, alike
 from harness.studies.contents import BASE, NOTHING, Outcome, folders, models, panels_of, run_contents
 from harness.studies.contents_page import contents_study
 from harness.studies.replayed_run import ReplayedRun
@@ -114,19 +114,19 @@ def drive(asked: Asked, here: Path, limit: int | None, study: Study) -> None:
 def driven(asked: Asked, here: Path) -> dict[str, Outcome]:
     """Return what a model comes to driven, by content; nothing unless all is done."""
     families: dict[str, dict[str, dict[str, Floats]]] = {}
-    dangerous: dict[str, Bools] = {}
     outs = {name: here / "driven" / name for name in asked.datasets}
     if not all((out / "run.json").exists() for out in outs.values()):
         return {}
-    for name, out in outs.items():
-        run = read(out)
+    runs = {name: read(out) for name, out in outs.items()}
+    rules = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in runs.values()])
+    for name, run in runs.items():
         [success] = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes).values()
-        dangerous[name] = np.array([e.danger != "none" for e in run.episodes[: len(run.grid.episodes)]])
         for content, point in PLAYED.items():
             if point in run.conditions:
                 at = run.conditions.index(point)
                 families.setdefault(content, {})[name] = {SUCCESS: success[at]}
-    return {content: Outcome(of, dangerous) for content, of in families.items()}
+    counting = dict(zip(runs, rules, strict=True))
+    return {content: Outcome(of, counting) for content, of in families.items()}
 
 
 def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:

@@ -6,7 +6,7 @@ intents are paired by episode within each family.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,11 +27,11 @@ from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
 from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metrics import LATENCY, entry, over_episodes
-from harness.runs.success import Success, alike, mean_difference, p_of_mean
+from harness.runs.success import Success, mean_difference, p_of_mean
 from harness.runs.suite import contents_of
 from harness.studies.axes import Setting, axis_of, described, grid
 from harness.studies.play import by_episode, metric_columns
-from harness.studies.replayed_run import ReplayedRun
+from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import corrected, refuse_other
 from harness.studies.sweep import point_of, settings
 from harness.world.lookouts import radios
@@ -82,14 +82,7 @@ class Outcome:
     """What a model's runs came to at one point."""
 
     families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
-    dangerous: Mapping[str, Bools] = field(default_factory=dict)  # which episodes have a danger, (E,)
-
-    @cached_property
-    def counting(self) -> dict[str, Success]:
-        """How success counts in each family: alike in all."""
-        unknown = {name: np.zeros(each[SUCCESS].shape[1], bool) for name, each in self.families.items()}
-        every = {**unknown, **self.dangerous}
-        return dict(zip(every, alike([*map(Success, every.values())]), strict=True))
+    counting: Mapping[str, Success]  # how success counts in each family: alike in all
 
     @property
     def lead(self) -> str:
@@ -363,8 +356,9 @@ def _played(
             metrics = {**walk.ends, **by_episode(walk, METRICS)}
             by_family[setting.point, setting.vehicles][family] = metrics
             progress(1)
-    dangerous = {family: run.dataset.dangerous for family, run in model.runs.items()}
-    return Result(model, panels, {key: Outcome(of, dangerous) for key, of in by_family.items()})
+    by_run = counted(list(model.runs.values()))
+    counting = {family: by_run[run] for family, run in model.runs.items()}
+    return Result(model, panels, {key: Outcome(of, counting) for key, of in by_family.items()})
 
 
 def witnesses(run: ReplayedRun) -> Ints:
