@@ -3,7 +3,7 @@
 import os
 import sys
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -15,6 +15,7 @@ from harness.core.errors import UserError, one_line, printable
 from harness.core.strangers import aside
 
 T = TypeVar("T")
+Said = TypeVar("Said")
 SAID_S = 3.0  # after which a line says which package a command waits for
 
 
@@ -80,6 +81,10 @@ def _waiting(what: str, entry: Any) -> Iterator[None]:
         timer.cancel()
 
 
+class Failed(UserError):
+    """What people read in the place of what a plug-in would have said: whose it is, and why it says none."""
+
+
 class Plugins(Mapping[str, T], Generic[T]):
     """Plug-ins by name. A package adds one by an entry point, which is loaded when its name is looked up.
 
@@ -100,6 +105,23 @@ class Plugins(Mapping[str, T], Generic[T]):
     def usable(self) -> dict[str, T]:
         loaded = resources.each(self, self.__getitem__)
         return {name: plugin for name, plugin in loaded.items() if not isinstance(plugin, UserError)}
+
+    def ask(self, name: str, question: Callable[[T], Said]) -> Said:
+        """Return what a plug-in says to people, who read on where it fails.
+
+        Raises Failed if it does not load or its package fails, and UserError if the plug-in raises that.
+        """
+        try:
+            plugin = self[name]
+        except UserError as error:
+            raise Failed(f"{printable(name)}: {error}") from error
+        try:
+            with aside(f"{self.group.rpartition('.')[2]} {printable(name)}"):
+                return question(plugin)
+        except UserError:
+            raise
+        except Exception as error:  # a package's code
+            raise Failed(f"{printable(name)}: its package failed: {one_line(error)}") from error
 
     def __iter__(self) -> Iterator[str]:
         return iter({**self.built_in, **self._entries()})

@@ -5,10 +5,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import reads_prompts
-from harness.core.errors import one_line, printable
+from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins
-from harness.core.strangers import aside
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.runs import contradictions, doubts, pinned
@@ -202,12 +201,11 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
 
 def of_extensions(manifest: Manifest) -> Iterator[str]:
     """Yield what extensions say of a run; one that fails says so itself."""
-    for name, of in CAVEATS.usable().items():
+    for name in CAVEATS:
         try:
-            with aside(f"caveat {printable(name)}"):
-                yield from map(str, of(manifest))
-        except Exception as error:  # a package's code
-            yield f"The caveat {printable(name)} of a package failed: {one_line(error)}."
+            yield from CAVEATS.ask(name, lambda of: list(map(str, of(manifest))))
+        except UserError as error:
+            yield str(error)
 
 
 def by_letter(scores: Sequence[Score]) -> Iterator[str]:

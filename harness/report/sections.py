@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 from markupsafe import Markup
 
-from harness.core.errors import UserError, one_line, printable
+from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins
-from harness.core.strangers import aside
 from harness.report.document import Section
 from harness.report.runs import Runs
 from harness.report.templating import environment
@@ -30,12 +29,13 @@ def sections(runs: Runs) -> list[tuple[str, Markup]]:
 
 def _written(name: str, run: Run) -> tuple[str, Markup] | None:
     try:
-        with aside(f"section {printable(name)}"):
-            section = SECTIONS[name](run)
-            return None if section is None else (section.title, _content(section))
-    except Exception as error:  # a package's code
-        reason = str(error) if isinstance(error, UserError) else f"its package failed: {one_line(error)}"
-        return printable(name), _content(Section(name, warnings=[reason]))
+        return SECTIONS.ask(name, lambda of: _titled(of(run)))
+    except UserError as error:
+        return printable(name), _content(Section(name, warnings=[str(error)]))
+
+
+def _titled(section: Section | None) -> tuple[str, Markup] | None:
+    return None if section is None else (section.title, _content(section))
 
 
 def _content(section: Section) -> Markup:

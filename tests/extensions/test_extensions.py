@@ -197,7 +197,8 @@ def test_what_a_package_prints_as_it_loads_is_no_output_of_a_command(
 def test_what_sections_and_metrics_print_is_no_output_of_a_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sections, "SECTIONS", {"loud": lambda run: print("from a section")})
+    loud_section = {"loud": lambda run: print("from a section")}
+    monkeypatch.setattr(sections, "SECTIONS", Plugins("swarmdrive.sections", Callable, loud_section))
     assert sections._written("loud", None) is None
     loud = replace(METRICS["success_rate"], name="loud")
     assert list(metrics._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [0.0, 0.0]
