@@ -65,7 +65,8 @@ class Run(Tables):
         return DecisionPoint(self, seen, viewer)
 
     def _repr_html_(self) -> str:
-        from harness.report import caveats, words
+        from harness.report import words
+        from harness.report.findings import Kind, findings
 
         def cell(score: Score) -> str:
             shown = words.shown(score)
@@ -82,8 +83,9 @@ class Run(Tables):
             }
             for condition in self.source.conditions
         ]
-        sentences = [words.headline(self.source), *caveats.unread(self.source.scores)]
+        void = [finding.sentence for finding in findings(self.source, Kind.VOID)]
         n = f"n = {crossed(len(self.source.grid.episodes), len(self.source.grid.seeds))}"
+        sentences = [words.headline(self.source), *void]
         return _page(sentences, _frame(pd.DataFrame(rows)), f"{n}; 95 % intervals over episodes; {self.path}")
 
 

@@ -16,7 +16,7 @@ from harness.core.figures import shown
 from harness.core.statistics import mean_of, paired_difference, rate_interval
 from harness.dataset.load import Dataset, load
 from harness.evaluate.live_world import LiveSource
-from harness.report.caveats import of_run
+from harness.report.caveats import saturated
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
@@ -214,4 +214,4 @@ def test_the_headline_has_what_cooperation_does_where_there_is_a_danger_and_wher
     )
     assert f"and in 90.0 % of those without, {price} points; the mean of both is 75.0 %, +25.0 [" in said
     assert said.endswith("points, a clear difference.")
-    assert "With a danger, success" not in " ".join(of_run(done))
+    assert "With a danger, success" not in " ".join(saturated(done))

@@ -13,8 +13,10 @@ from msgspec.structs import replace
 from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
-from harness.report.caveats import caveats, no_prompt, of_run, unheard
+from harness.report.caveats import no_prompt, unheard
+from harness.report.findings import FIRST, Kind, findings
 from harness.runs import folder
+from harness.runs.folder import Run
 from harness.runs.records import Manifest, Score
 
 Said = tuple[int, str, str]
@@ -37,6 +39,14 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     return evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path_factory.mktemp("sound") / "run")
 
 
+def said_of(run: Run, *kinds: Kind) -> list[str]:
+    return [finding.sentence for finding in findings(run, *kinds)]
+
+
+def without_prompt(done: Evaluated, *manifests: Manifest) -> list[str]:
+    return no_prompt({str(n): Run(done.out, manifest) for n, manifest in enumerate(manifests)})
+
+
 def with_engine(done: Evaluated, engine: str) -> Manifest:
     return replace(done.manifest, model={**done.manifest.model, "engine": engine})
 
@@ -49,7 +59,9 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
     language_model = with_engine(done, "llama-cpp")
 
     def told(*scores: Score) -> list[str]:
-        return caveats(language_model, scores)
+        run = Run(done.out, language_model)
+        run.__dict__["scores"] = scores  # as if it had read them from its file
+        return said_of(run, Kind.VOID, Kind.CAVEAT)
 
     assert told() == []
     assert told(share("failed_rate_ego", 0.49)) == []
@@ -67,7 +79,7 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
 
 @pytest.mark.parametrize("engine", ["proxy", "driver"])
 def test_a_rule_reads_no_prompt_and_says_so(done: Evaluated, engine: str) -> None:
-    assert caveats(with_engine(done, engine), done.scores) == [NO_PROMPT]
+    assert said_of(Run(done.out, with_engine(done, engine)), Kind.CAVEAT) == [NO_PROMPT]
 
 
 def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
@@ -76,29 +88,50 @@ def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
         names = {"model": {**manifest.model, "name": model}, "prompt": {**manifest.prompt, "version": prompt}}
         return replace(manifest, **names)
 
-    assert no_prompt([under("v1"), under("v2")]) == [NO_PROMPT.replace("v2", "v1 or v2")]
-    assert no_prompt([under("v2", "mine"), under("v2", "yours"), done.manifest]) == [
+    assert without_prompt(done, under("v1"), under("v2")) == [NO_PROMPT.replace("v2", "v1 or v2")]
+    assert without_prompt(done, under("v2", "mine"), under("v2", "yours"), done.manifest) == [
         "mine, yours and proxy read no prompt: they decide by the scene graph, whatever v2 says."
     ]
-    assert no_prompt([with_engine(done, "llama-cpp"), done.manifest]) == [NO_PROMPT]
+    assert without_prompt(done, with_engine(done, "llama-cpp"), done.manifest) == [NO_PROMPT]
 
 
 def test_a_driver_that_looks_at_nothing_does_not_decide_by_the_scene_graph(done: Evaluated) -> None:
     def driven(name: str) -> Manifest:
         return replace(done.manifest, model={**done.manifest.model, "engine": "driver", "name": name})
 
-    told = no_prompt([driven("local-view"), *map(driven, ("cruise", "brake", "uniform", "constant"))])
+    told = without_prompt(done, *map(driven, ("local-view", "cruise", "brake", "uniform", "constant")))
     assert told == [
         NO_PROMPT.replace("proxy", "local-view"),
         "cruise, brake, uniform and constant read no prompt: they decide without looking, whatever v2 says.",
     ]
-    assert no_prompt([driven("uniform")]) == [
+    assert without_prompt(done, driven("uniform")) == [
         "uniform reads no prompt: it decides without looking, whatever v2 says."
     ]
 
 
 def test_an_engine_that_is_not_here_is_not_judged(done: Evaluated) -> None:
-    assert caveats(with_engine(done, "elsewhere"), done.scores) == []
+    assert said_of(Run(done.out, with_engine(done, "elsewhere")), Kind.CAVEAT) == []
+
+
+@pytest.mark.slow
+def test_whatever_shows_a_run_says_the_same_of_it_in_the_same_order(
+    small_path: Path, harness: Callable[..., Said]
+) -> None:
+    Path("swarmdrive.toml").touch()
+    Path("models").mkdir()
+    Path("models/mute.toml").write_text(CARD)
+    options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g", "--ties", "first")
+    code, terminal, err = harness("eval", "--model", "mute", *options, "--out", "run")
+    assert (code, err) == (0, "")
+    every = said_of(folder.read(Path("run")), *FIRST)
+    assert len(every) > 4
+    page = unescape(Path("run/report.html").read_text())
+    for shown in (" ".join(terminal.split()), page):
+        places = [shown.index(sentence) for sentence in every]
+        assert places == sorted(places)
+    asked_again = harness("eval", "--model", "mute", *options, "--out", "again", "--json")[1]
+    assert json.loads(asked_again)["caveats"] == every
+    assert json.loads(harness("compare", "run", "again", "--json")[1])["caveats"] == every
 
 
 @pytest.mark.slow
@@ -134,7 +167,8 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert "none of the ego's answers could be read: it drives by the fallback" in harness("run", "ls")[1]
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)
-    assert json.loads(out)["caveats"] == [NO_PROMPT.replace("v2", "v1")]
+    few = "Only 4 episodes: the interval of a rate may reach 49 points to either side."
+    assert json.loads(out)["caveats"] == [NO_PROMPT.replace("v2", "v1"), few]
     assert "answers could be read" not in unescape(Path("reports/sound/report.html").read_text())
     both = ("reports/mute", "reports/sound")
     assert f"A: {UNREAD}" in " ".join(harness("compare", *both)[1].split())
@@ -150,7 +184,7 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
     """Four episodes; decisions over v2x take longer than the dataset's lag; two conditions are controls."""
     points = (POINTS["v2x"], *map(named_point, ("6g:messages=shuffled", "6g:messages=blind")))
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
-    assert list(of_run(folder.read(done.out))) == [
+    assert said_of(folder.read(done.out), Kind.LIMIT) == [
         "Only 4 episodes: the interval of a rate may reach 49 points to either side.",
         "Without a danger, success is 100.0 % under every condition in 1 layout: none changes that half of "
         "the balance here. In other layouts one may, by as much as the interval of its gain says.",
@@ -174,4 +208,4 @@ def test_a_window_that_no_reply_keeps_is_said(small: Dataset, tmp_path: Path) ->
         f"Under {points[-1].name}, nobody is heard: of {scheduled.value:.0f} messages that arrived, none "
         "came within the decision window, so that the ego decided alone."
     )
-    assert said in list(of_run(run))
+    assert said in said_of(run, Kind.LIMIT)

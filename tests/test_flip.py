@@ -25,7 +25,7 @@ from harness.evaluate.lifecycle import finished_with
 from harness.evaluate.resolve import agents
 from harness.evaluate.spec import Spec
 from harness.prompts import readout, versions
-from harness.report.caveats import of_run
+from harness.report.caveats import flipped
 from harness.runs import folder
 from harness.runs.records import Answer
 from harness.runs.settings import HelperSettings, Settings
@@ -148,7 +148,7 @@ def test_a_run_and_its_replay_count_it_and_decide_as_without(
     assert [s for s in done.scores if s.metric not in rates] == list(plain.scores)
     assert any(
         "ego's" in said and "when the list of actions is reversed" in said
-        for said in of_run(folder.read(done.out))
+        for said in flipped(folder.read(done.out))
     )
     assert done.manifest.flip
     assert "--flip" in done.manifest.command

@@ -25,7 +25,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.looks import Until
 from harness.evaluate.run import evaluate, evaluate_shard
 from harness.evaluate.spec import Spec
-from harness.report.caveats import caveats
+from harness.report.caveats import looked_at
 from harness.report.compare.pair import pair
 from harness.report.compare.words import caveats as of_pair
 from harness.runs.folder import read
@@ -121,7 +121,7 @@ def test_a_run_stops_when_its_interval_is_narrow_and_says_so(small: Dataset, tmp
     assert row.high is not None
     assert row.high - row.low <= 0.999
     assert read(tmp_path / "run").score("single-local", "success_rate") == row
-    assert f"stopped after {at[-1]} of 4 layouts" in " ".join(caveats(done.manifest, done.scores))
+    assert f"stopped after {at[-1]} of 4 layouts" in " ".join(looked_at(read(done.out)))
     whole = run(
         spec_of(Dataset.of_episodes(small, frozenset(small.episodes[: at[-1]])), "constant", **ALONE),
         tmp_path / "whole",
@@ -136,10 +136,10 @@ def test_a_run_that_is_never_sure_takes_all_layouts(small: Dataset, tmp_path: Pa
     world = done.manifest.world
     assert world.looks is not None
     assert (world.episodes, world.looks.at, world.looks.enough) == (4, (2, 3, 4), False)
-    assert "took all 4 layouts" in " ".join(caveats(done.manifest, done.scores))
+    assert "took all 4 layouts" in " ".join(looked_at(read(done.out)))
     one = small.of_episodes(frozenset(small.episodes[:1]))
     done = run(until(spec_of(one, "constant", **ALONE), Until(width=0.1)), tmp_path / "one")
-    [said] = (s for s in caveats(done.manifest, done.scores) if "looked at" in s)
+    [said] = looked_at(read(done.out))
     assert said.startswith("It took the only layout, and still")
     assert "It was looked at 1 time: " in said
 

@@ -16,7 +16,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.asking import answer_of
 from harness.evaluate.lifecycle import finished_with
 from harness.prompts import versions
-from harness.report.caveats import of_run
+from harness.report.caveats import divided
 from harness.runs import folder
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
@@ -93,7 +93,7 @@ def test_a_run_says_how_many_were_divided_and_is_no_run_that_refuses_them(
         assert f"ego answers divided by their sum: 100.0 % of {n}" in out
         assert run.score("all", "divided_rate_ego").value == 1
         assert f"{n} of the ego's {n} answers did not sum to 1 and were divided by their sum" in "".join(
-            of_run(run)
+            divided(run)
         )
         assert run.manifest.sums == run.manifest.agent(0)["sums"] == "divide"
         assert "--sums divide" in run.manifest.command

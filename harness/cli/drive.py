@@ -163,8 +163,10 @@ def deciding(scenario: str, agents: str) -> str:
 
 def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     """Print a closed-loop run."""
+    from harness.runs.folder import read
+
     if as_json:
-        echo_json(as_mapping(done))
+        echo_json(as_mapping(read(done.out)))
     if as_json or quiet:
         return
     world = cast("ClosedLoop", done.manifest.world)

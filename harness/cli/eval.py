@@ -70,6 +70,7 @@ def command(
     from harness.backends.cache import default_file
     from harness.dataset import suites
     from harness.evaluate import costs, hooks, resolve
+    from harness.runs.folder import read
 
     world: Any = settings.world
     named = suites.named(world.dataset)
@@ -128,7 +129,7 @@ def command(
         done, page = evaluated(specs[0], out or default_out(specs[0]))
     dataset = walked(frozen[0], done)
     if as_json:
-        echo_json(as_mapping(done))
+        echo_json(as_mapping(read(done.out)))
     if silent:
         return
     from harness.report.references import BESIDE, in_trees, label, meaning

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
+    from harness.runs.folder import Run
     from harness.runs.records import Manifest, Score
 
 
@@ -179,16 +180,16 @@ def _mode(agent: "Agent") -> str:
     return answer + ("" if agent.image == "own" else f"-{agent.image}-image")
 
 
-def as_mapping(done: "Evaluated") -> dict[str, Any]:
+def as_mapping(run: "Run") -> dict[str, Any]:
     """A finished run for machines: its folder, its manifest, its caveats and the rows of its summary."""
-    from harness.report.caveats import caveats
+    from harness.report.findings import FIRST, findings
 
-    variant = msgspec.to_builtins(done.manifest.variant)
+    variant = msgspec.to_builtins(run.manifest.variant)
     return {
-        "run": str(done.out),
-        "manifest": msgspec.to_builtins(done.manifest),
-        "caveats": caveats(done.manifest, done.scores),
-        "summary": [{**variant, **msgspec.to_builtins(score)} for score in done.scores],
+        "run": str(run.path),
+        "manifest": msgspec.to_builtins(run.manifest),
+        "caveats": [finding.sentence for finding in findings(run, *FIRST)],
+        "summary": [{**variant, **msgspec.to_builtins(score)} for score in run.scores],
     }
 
 
@@ -201,8 +202,8 @@ def show(
     Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know their
     dangers has a table of balanced success before it.
     """
-    from harness.report.caveats import causes, caveats, lost_at_once
-    from harness.report.constancy import ignores_input, in_a_line
+    from harness.report.constancy import in_a_line
+    from harness.report.findings import FIRST, findings
     from harness.report.words import adjusted_lines
     from harness.runs.folder import read
 
@@ -214,8 +215,8 @@ def show(
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
     run = read(done.out)
-    for caveat in (*caveats(m, done.scores), *ignores_input(run), *causes(run), *lost_at_once(run)):
-        text.print(caveat)
+    for finding in findings(run, *FIRST):
+        text.print(finding.sentence)
     every = (*BALANCED, *columns)
     rows: dict[str, Mapping[str, Score | None]] = {
         name: {c.metric: figures.get((name, c.metric)) for c in every} for name in names

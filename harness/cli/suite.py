@@ -85,15 +85,12 @@ def evaluate(
 
 def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
     """Return a suite's run for machines: each family's run, and the means over families."""
-    from harness.evaluate.lifecycle import Evaluated
-
     drivers = {line.name: msgspec.to_builtins(line.drivers) for line in lines}
     return {
         "suite": done.name,
         "folder": str(done.path),
         "families": {
-            family: {**as_mapping(Evaluated(run.path, run.manifest, run.scores)), "drivers": drivers[family]}
-            for family, run in done.runs.items()
+            family: {**as_mapping(run), "drivers": drivers[family]} for family, run in done.runs.items()
         },
         "mean": {"summary": msgspec.to_builtins(done.scores), "drivers": drivers[lines[-1].name]},
     }
@@ -101,8 +98,7 @@ def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
 
 def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     """Print success, gains and what needs no model, each a table of families."""
-    from harness.report import caveats
-    from harness.report.constancy import ignores_input
+    from harness.report.findings import Kind, findings
     from harness.report.suite import seeds_of
     from harness.runs.leading import IN_WORDS, lead_of
     from harness.runs.metrics import BASELINE
@@ -110,12 +106,8 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
 
     text, m = console(), done.variant
     text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
-    for sentence in (
-        *caveats.merged(done.runs, lambda run: caveats.unread(run.scores)),
-        *caveats.merged(done.runs, ignores_input),
-        *caveats.no_prompt(run.manifest for run in done.runs.values()),
-    ):
-        text.print(sentence)
+    for finding in findings(done, Kind.VOID, Kind.CAVEAT):
+        text.print(finding.sentence)
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
     _matrix(f"{IN_WORDS[lead_of(done)]}, % [95 % CI]", "success", done.conditions, lines)
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)

@@ -1,4 +1,4 @@
-"""What must be said before a run's numbers: that its answers were not read, or that it read no prompt."""
+"""What must be said before a run's numbers, a function a sentence; `findings` has them in their order."""
 
 import math
 from collections import Counter
@@ -10,7 +10,7 @@ from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
-from harness.runs import contradictions, doubts, pinned
+from harness.runs import doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
 from harness.runs.metrics import ALL, BALANCED, GAINS, entry
@@ -34,16 +34,9 @@ _CONTROLS = {
 }
 
 
-def caveats(manifest: Manifest, scores: Sequence[Score]) -> list[str]:
-    """Return sentences for a run's headline; none for a language model whose answers could be read."""
-    first = [*unread(scores), *no_prompt([manifest]), *of_extensions(manifest), *moved_system(manifest)]
-    first += by_letter(scores)
-    return [*first, *beyond_sources(manifest), *on_device(manifest), *looked_at(manifest)]
-
-
-def looked_at(manifest: Manifest) -> Iterator[str]:
+def looked_at(run: Run) -> Iterator[str]:
     """Yield when a run was looked at, and which of its intervals hold though it may have stopped early."""
-    looks = manifest.world.looks
+    looks = run.manifest.world.looks
     if looks is None:
         return
     what = (
@@ -64,32 +57,13 @@ def looked_at(manifest: Manifest) -> Iterator[str]:
     )
 
 
-def merged(runs: Mapping[str, Run], of: Callable[[Run], Iterable[str]]) -> list[str]:
-    """Return the caveats of runs, each sentence once, with the names of those it is about if not of all."""
-    about: dict[str, list[str]] = {}
-    for name, run in runs.items():
-        for sentence in of(run):
-            about.setdefault(sentence, []).append(name)
-    return [
-        sentence if len(names) == len(runs) else f"{', '.join(names)}: {sentence}"
-        for sentence, names in about.items()
-    ]
-
-
-def unread(scores: Sequence[Score]) -> Iterator[str]:
+def unread(run: Run) -> Iterator[str]:
     """Yield whose answers could not be read, half of them or more, and what takes their place."""
-    failed = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, instead) in _FAILED.items():
-        score = failed.get(f"failed_rate_{role}")
+        score = run.score(ALL, f"failed_rate_{role}")
         if score is not None and score.value is not None and score.value >= UNREAD:
             share = "None" if score.value == 1 else f"Only {100 * (1 - score.value):.1f} %"
             yield f"{share} of {whose} {score.n} answers could be read: {instead}."
-
-
-def void(run: Run) -> Iterator[str]:
-    """Yield why the numbers of a run are no result."""
-    yield from unanswered(run)
-    yield from unread(run.scores)
 
 
 def causes(run: Run) -> Iterator[str]:
@@ -113,7 +87,15 @@ def unanswered(run: Run) -> Iterator[str]:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
 
-def _saturated(run: Run) -> Iterator[str]:
+def few(run: Run) -> Iterator[str]:
+    """Yield how wide intervals may be of so few episodes."""
+    n = len(run.grid.episodes)
+    if n < FEW:
+        reach = f"{98 / n**0.5:.0f} points to either side"
+        yield f"Only {amount(n, 'episode')}: the interval of a rate may reach {reach}."
+
+
+def saturated(run: Run) -> Iterator[str]:
     """Yield each half of balanced success that is 0 or 100 % under every condition, as it can say nothing."""
     for name, where in zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True):
         scores = [run.score(condition, name) for condition in run.conditions]
@@ -127,52 +109,72 @@ def _saturated(run: Run) -> Iterator[str]:
             )
 
 
-def of_run(run: Run) -> Iterator[str]:
-    """What else a reader of a run's page has to know first: few episodes, a stumbling engine, another lag."""
-    n = len(run.grid.episodes)
-    if n < FEW:
-        reach = f"{98 / n**0.5:.0f} points to either side"
-        yield f"Only {amount(n, 'episode')}: the interval of a rate may reach {reach}."
-    yield from _saturated(run)
+def earlier_gains(run: Run) -> Iterator[str]:
+    """Yield that gains have the intervals of older rules."""
     if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
-    yield from contradictions.unchecked(run)
-    if run.manifest.settings.temperature:
+
+
+def sampled(run: Run) -> Iterator[str]:
+    """Yield how answers were sampled, where they were."""
+    settings = run.manifest.settings
+    if settings.temperature:
         yield (
-            f"Answers were sampled at temperature {run.manifest.settings.temperature:g} with sampling seed "
-            f"{run.manifest.settings.sampling_seed}: another seed gives other answers."
+            f"Answers were sampled at temperature {settings.temperature:g} with sampling seed "
+            f"{settings.sampling_seed}: another seed gives other answers."
         )
+
+
+def divided(run: Run) -> Iterator[str]:
+    """Yield how many of each role's answers were divided by their sum."""
     for role, (whose, _) in _FAILED.items():
         if run.manifest.sums == "divide" and (score := run.score(ALL, f"divided_rate_{role}")):
             yield (
-                f"{round((score.value or 0.0) * score.n)} of {whose} {score.n} answers did not sum to 1 and "
+                f"{_hits(score)} of {whose} {score.n} answers did not sum to 1 and "
                 "were divided by their sum, as --sums divide says."
             )
+
+
+def flipped(run: Run) -> Iterator[str]:
+    """Yield how many of each role's read-outs change with the order of the list of actions."""
+    for role, (whose, _) in _FAILED.items():
         if score := run.score(ALL, f"flip_rate_{role}"):
             yield (
-                f"{round((score.value or 0.0) * score.n)} of {whose} {score.n} read-outs have another "
+                f"{_hits(score)} of {whose} {score.n} read-outs have another "
                 "likeliest action when the list of actions is reversed."
             )
-    retries = sum(answer.retries for answer in run.answers)
+
+
+def lost_messages(run: Run) -> Iterator[str]:
+    """Yield what helpers' questions said that got no answer, where a run can do without."""
     if (tallied := tally(run)).words and not tallied.missing:
         yield f"{tallied}: each counts as a lost message."
-    if retries:
+
+
+def retried(run: Run) -> Iterator[str]:
+    """Yield how many attempts failed before an answer came."""
+    if retries := sum(answer.retries for answer in run.answers):
         yield f"The engine had errors: {retries} attempts were repeated."
+
+
+def controls(run: Run) -> Iterator[str]:
+    """Yield the conditions in which the ego hears what no helper would say."""
     for control, heard in _CONTROLS.items():
         if names := doubts.controls(run.manifest.conditions, control):
             yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
-    yield from unheard(run)
-    yield from lost_at_once(run)
-    yield from of_extensions(run.manifest)
-    yield from by_letter(run.scores)
-    yield from moved_system(run.manifest)
-    yield from beyond_sources(run.manifest)
-    yield from on_device(run.manifest)
+
+
+def lagging(run: Run) -> Iterator[str]:
+    """Yield the conditions under which most decisions act later than frozen scenes assume."""
     if off := doubts.lagging(_off_lag(run)):
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
             "closed-loop success may differ. harness study fidelity compares the two."
         )
+
+
+def unmeasured(run: Run) -> Iterator[str]:
+    """Yield that a run, or its dataset, is older than the measures of conflicts."""
     if all(e.short_ttc is None for e in run.episodes):
         older = "dataset" if run.world == "frozen" else "run"
         yield (
@@ -190,6 +192,10 @@ def doubted(*runs: Run) -> set[str]:
     }
 
 
+def _hits(share: Score) -> int:
+    return round((share.value or 0.0) * share.n)
+
+
 def _off_lag(run: Run) -> dict[str, float | None]:
     scores = {c: run.score(c, doubts.OFF_LAG) for c in run.conditions}
     return {c: score.value for c, score in scores.items() if score}
@@ -199,26 +205,24 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
     return {name: (record.parameters, record.limits) for name, record in manifest.channels.items()}
 
 
-def of_extensions(manifest: Manifest) -> Iterator[str]:
+def of_extensions(run: Run) -> Iterator[str]:
     """Yield what extensions say of a run; one that fails says so itself."""
     for name in CAVEATS:
         try:
-            yield from CAVEATS.ask(name, lambda of: list(map(str, of(manifest))))
+            yield from CAVEATS.ask(name, lambda of: list(map(str, of(run.manifest))))
         except UserError as error:
             yield str(error)
 
 
-def by_letter(scores: Sequence[Score]) -> Iterator[str]:
+def by_letter(run: Run) -> Iterator[str]:
     """Yield whose read-outs follow the letter more than all else, where they were read over cyclic orders."""
-    of = {s.metric: s for s in scores if s.condition == ALL}
     for role, (whose, _) in _FAILED.items():
-        share, follows = of.get(f"letter_share_{role}"), of.get(f"follows_letter_{role}")
+        share, follows = (run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter"))
         if share and follows and (share.value or 0.0) > MOST_SHARE:
-            hits = round((follows.value or 0.0) * follows.n)
             yield (
                 f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the letter and "
-                f"not the action: one letter is the likeliest in every order in {hits} of {follows.n}. The "
-                "average over the orders cancels that, and adds no judgement."
+                f"not the action: one letter is the likeliest in every order in {_hits(follows)} of "
+                f"{follows.n}. The average over the orders cancels that, and adds no judgement."
             )
 
 
@@ -253,18 +257,19 @@ def lost_at_once(run: Run) -> Iterator[str]:
         )
 
 
-def moved_system(manifest: Manifest) -> Iterator[str]:
+def moved_system(run: Run) -> Iterator[str]:
     """Yield whose system text stands in the first user turn, since the chat template has no place for it."""
-    agents = (manifest.agent(0), *manifest.helpers)
-    for name in dict.fromkeys(str(a["model"]["name"]) for a in agents if a["model"].get("system")):
+    models = [agent["model"] for agent in (run.manifest.agent(0), *run.manifest.helpers)]
+    for name in dict.fromkeys(str(model["name"]) for model in models if model.get("system")):
         yield (
             f"{printable(name, 30)} reads the system text at the beginning of the first user turn: its chat "
             "template has no place for a system message."
         )
 
 
-def on_device(manifest: Manifest) -> Iterator[str]:
+def on_device(run: Run) -> Iterator[str]:
     """Whose answers, and on what computer, the times and the joules of a run with a device profile are of."""
+    manifest = run.manifest
     if (device := manifest.device_profile) is None:
         return
     agents = (manifest.agent(0), *manifest.helpers)
@@ -277,14 +282,15 @@ def on_device(manifest: Manifest) -> Iterator[str]:
             )
 
 
-def beyond_sources(manifest: Manifest) -> Iterator[str]:
+def beyond_sources(run: Run) -> Iterator[str]:
     """Yield conditions whose radio has settings that its model's source never held against anything."""
-    for name, sentence in doubts.beyond(manifest.conditions, _channels(manifest)):
+    for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"
 
 
-def no_prompt(manifests: Iterable[Manifest]) -> list[str]:
+def no_prompt(runs: Mapping[str, Run]) -> list[str]:
     """A sentence about the models that read no prompt, and one about those that look at nothing either."""
+    manifests = [run.manifest for run in runs.values()]
     rules: dict[str, list[tuple[str, str]]] = {"by the scene graph": [], "without looking": []}
     for agent in (agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)):
         name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))

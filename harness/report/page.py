@@ -17,13 +17,14 @@ from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
 from harness.parsing.parse import Repair, Status
-from harness.report import caveats, contents, library, matrix, words
+from harness.report import contents, library, matrix, words
 from harness.report.charts import policies, timeline
-from harness.report.constancy import ignores_input, tile
+from harness.report.constancy import tile
 from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
+from harness.report.findings import FIRST, of_runs
 from harness.report.panels import panels
 from harness.report.remarks import sentences
 from harness.report.runs import Runs
@@ -120,20 +121,12 @@ def _pieces(
     charts = list(panels(runs))
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
-    void = caveats.merged(by_name, caveats.void)
-    looked = caveats.merged(by_name, lambda run: caveats.looked_at(run.manifest))
-    warnings = [
-        sentence
-        for of in (ignores_input, caveats.causes, caveats.of_run)
-        for sentence in caveats.merged(by_name, of)
-    ]
     return environment().get_template("page.html.j2").generate(
         runs=runs,
         title=runs.names[0] if alone else f"{len(runs.names)} runs",
         policy=library.policy(library.vega(), library.script()),
         lacks=" ".join(decisions.lacks()),
-        warnings=[*void, *caveats.no_prompt(run.manifest for run in runs.runs), *looked, *warnings],
-        void=len(void),
+        warnings=of_runs(by_name, *FIRST),
         size=contents.size(runs),
         headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
         key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),

@@ -12,11 +12,11 @@ from harness.core.formats import SUITE
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seeds import purposes
 from harness.dataset.load import Dataset
-from harness.report import caveats, words
+from harness.report import words
 from harness.report.compare.page import Place, beside
-from harness.report.constancy import ignores_input
 from harness.report.document import Section, Table, document, linked
 from harness.report.drawing import colours
+from harness.report.findings import Kind, findings
 from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.contradictions import refuse
@@ -126,11 +126,8 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
             "95 % intervals over episodes."
         ],
         [_families(lines, place, lead_of(suite)), _metrics(suite)],
-        warnings=caveats.merged(suite.runs, caveats.void),
-        caveats=[
-            *caveats.no_prompt(run.manifest for run in suite.runs.values()),
-            *caveats.merged(suite.runs, ignores_input), *caveats.merged(suite.runs, caveats.of_run),
-        ],
+        warnings=[finding.sentence for finding in findings(suite, Kind.VOID)],
+        caveats=[finding.sentence for finding in findings(suite, Kind.CAVEAT, Kind.LIMIT)],
         numbers=_numbers(suite),
     )  # fmt: skip
 

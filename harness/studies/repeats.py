@@ -26,10 +26,10 @@ from harness.core.statistics import Estimate, episode_interval, known_mean, rate
 from harness.core.versions import versions
 from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.spec import Spec
-from harness.report.caveats import caveats, merged
 from harness.report.compare.page import beside
 from harness.report.document import Table
 from harness.report.drawing.colours import conditions
+from harness.report.findings import Kind, of_runs
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
 from harness.runs.records import Score
@@ -247,6 +247,7 @@ def repeats_study(repeats: Repeats) -> Study:
     rows = [{**variant, **msgspec.to_builtins(score)} for score in repeats.scores]
     reports = ((place(run), run.path.name) for run in repeats.runs)
     links = (Markup('<p><a href="{}">Report of {}</a></p>').format(*each) for each in reports if each[0])
+    found = of_runs({run.path.name: run for run in repeats.runs}, Kind.VOID, Kind.CAVEAT)
     return Study(
         "repeats", f"{k} repeats of {first.variant} on {source}", headline(repeats),
         [
@@ -268,9 +269,7 @@ def repeats_study(repeats: Repeats) -> Study:
             "repeats": str(repeats.path), "runs": [str(run.path) for run in repeats.runs],
             "temperature": first.settings.temperature, "figures": rows,
         },
-        caveats=merged(
-            {run.path.name: run for run in repeats.runs}, lambda run: caveats(run.manifest, run.scores)
-        ),
+        caveats=[finding.sentence for finding in found],
         more=Markup("\n").join(links), figures=lambda: {"repeats": _figure(repeats)},
     )  # fmt: skip
 

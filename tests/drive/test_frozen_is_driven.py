@@ -22,7 +22,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint, named_p
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.live_world import LiveSource
-from harness.report.caveats import of_run
+from harness.report.caveats import unmeasured
 from harness.runs import folder
 from harness.runs.folder import Run
 from harness.world.drivers import DRIVERS
@@ -137,4 +137,4 @@ def test_what_an_older_tree_does_not_hold_is_unknown_and_said(tmp_path: Path) ->
     assert {getattr(e, name) for e in older.episodes for name in CONFLICTS} == {None}
     assert np.isnan(older.decisions["short_ttc"]).all()
     assert not {s.metric for s in older.scores} & {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate"}
-    assert [s for s in of_run(older) if "Time to collision" in s and "dataset is older" in s]
+    assert [s for s in unmeasured(older) if "Time to collision" in s and "dataset is older" in s]

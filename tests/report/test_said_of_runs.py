@@ -33,7 +33,7 @@ def test_a_package_that_fails_is_said_in_the_same_words_wherever_it_would_speak(
         kind = getattr(module, table).kind
         monkeypatch.setattr(module, table, Plugins("swarmdrive.none", kind, {"odd": Broken()}))
     said = "odd: its package failed: no way"
-    assert list(caveats.of_extensions(run.manifest)) == [said]
+    assert list(caveats.of_extensions(run)) == [said]
     alone = Runs((run,), ("run",), None)
     assert remarks.sentences(alone) == [said]
     [(title, content)] = sections.sections(alone)

@@ -10,9 +10,10 @@ from harness.core.errors import UserError, printable
 from harness.core.files import making, refuse_taken, write_whole
 from harness.extensions.view.folder import own_file, whole
 from harness.extensions.view.pages import RUNS, suite_of, whole_text, with_way_back
-from harness.report import caveats, words
 from harness.report import suite as suites
+from harness.report import words
 from harness.report.document import Section, Table, document, linked
+from harness.report.findings import Kind, findings
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import Run
@@ -71,7 +72,8 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
                         studies.append((link, run.kind, run.model or "–", f"{run.date:%Y-%m-%d}"))
                         continue
                     rows.append(_row(run, done))
-                    warnings += [f"{run.name}: {text}" for text in caveats.merged(_parts(done), caveats.void)]
+                    void = findings(done, Kind.VOID)
+                    warnings += [f"{run.name}: {finding.sentence}" for finding in void]
                 finally:
                     progress(1)
             if not (rows or studies):

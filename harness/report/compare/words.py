@@ -9,7 +9,6 @@ from harness.core.figures import POINTS, amount, crossed, shown, within
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
-from harness.report.caveats import looked_at, no_prompt, void
 from harness.report.compare.difference import (
     LOST_BY,
     AnswerChanged,
@@ -22,8 +21,8 @@ from harness.report.compare.difference import (
 )
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
+from harness.report.findings import FIRST, of_runs
 from harness.report.words import SHOWN_FROM, as_good_as, p_value, pace
-from harness.runs.contradictions import unchecked
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
@@ -154,14 +153,8 @@ def paces(pair: Pair) -> list[str]:
 
 def caveats(pair: Pair) -> list[str]:
     """Return what must be said of the runs before their numbers, with the run's letter where it is of one."""
-    sides = (("A", pair.a.run), ("B", pair.b.run))
-    return [
-        *(f"{name}: {text}" for name, run in sides for text in void(run)),
-        *no_prompt(run.manifest for _, run in sides),
-        *(f"{name}: {text}" for name, run in sides for text in looked_at(run.manifest)),
-        *(f"{name}: {text}" for name, run in sides for text in unchecked(run)),
-        *_any_time(pair),
-    ]
+    found = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
+    return [*(finding.sentence for finding in found), *_any_time(pair)]
 
 
 def _any_time(pair: Pair) -> Iterator[str]:

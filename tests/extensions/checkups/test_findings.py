@@ -23,7 +23,9 @@ from harness.extensions.checkups.read_outs import (
     recall_findings,
 )
 from harness.prompts import versions
-from harness.report.caveats import by_letter, caveats
+from harness.report.caveats import by_letter
+from harness.report.findings import findings
+from harness.runs.folder import Run
 from harness.runs.records import Manifest, Score
 
 CARD = cards.resolve("qwen3-4b")
@@ -121,7 +123,8 @@ def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     ran = replace(done.manifest, answer="readout", letters="cyclic")
 
     def said(manifest: Manifest) -> list[str]:
-        return [s for s in caveats(manifest, done.scores) if "read the scene" in s or "letter" in s]
+        every = [finding.sentence for finding in findings(Run(done.out, manifest))]
+        return [s for s in every if "read the scene" in s or "letter" in s]
 
     assert not said(ran)
     mute = (Moved("gap", 4, 0, 0.0),)
@@ -132,7 +135,7 @@ def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     assert scene.endswith("in 0 of 4 pairs (model check, answer readout, prompt v2).")
     assert letter.startswith("proxy: its likeliest action follows the letter in 12 of 12 questions")
     helped = replace(ran, helpers=(ran.agent(0),), identity={**ran.identity, "helpers": [ran.identity]})
-    assert said(helped) == [scene, letter, scene, letter]
+    assert said(helped) == [scene, letter], "once, though two agents are the same model"
     others = (
         replace(ran, answer="json"),
         replace(ran, answer="decision"),
@@ -145,7 +148,7 @@ def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     assert said(in_json) == [scene, letter], "of its helper alone"
     for file in (kept.folder() / "findings").iterdir():
         file.unlink()
-    assert not list(by_letter(done.scores))
+    assert not list(by_letter(Run(done.out, ran)))
 
 
 @pytest.mark.parametrize(("share", "says"), [(0.97, True), (0.3, False)])
@@ -154,7 +157,9 @@ def test_a_page_says_whose_read_outs_follow_the_letter(share: float, says: bool)
         Score("all", f"{name}_ego", value, None, None, 40, 0, "answers")
         for name, value in (("letter_share", share), ("follows_letter", 0.95))
     ]
-    said = list(by_letter(scores))
+    run = Run(Path("run"), None)
+    run.__dict__["scores"] = scores  # as if it had read them from its file
+    said = list(by_letter(run))
     assert len(said) == says
     if says:
         assert said[0].startswith("97 % of what the ego's read-outs say follows the letter")
