@@ -278,12 +278,12 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.pair import pair
     from harness.report.compare.text import mapping
-    from harness.report.compare.words import findings
+    from harness.report.compare.words import outcomes
 
     difference = compared(pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b))))
     return Comparison(
         mapping(difference, (), most=10),
-        tuple(sentence for sentence, _ in findings(difference)),
+        tuple(sentence for sentence, _ in outcomes(difference)),
         difference.held,
     )
 

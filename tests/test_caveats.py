@@ -14,7 +14,7 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
 from harness.report.caveats import no_prompt, unheard
-from harness.report.findings import FIRST, Kind, findings
+from harness.report.findings import FIRST, LAST, Kind, findings
 from harness.runs import folder
 from harness.runs.folder import Run
 from harness.runs.records import Manifest, Score
@@ -126,11 +126,15 @@ def test_whatever_shows_a_run_says_the_same_of_it_in_the_same_order(
     every = said_of(folder.read(Path("run")), *FIRST)
     assert len(every) > 4
     page = unescape(Path("run/report.html").read_text())
+    assert f"<strong>{every[0]}</strong>" in page
+    assert f"<strong>{every[-1]}" not in page
+    below = said_of(folder.read(Path("run")), *LAST)
+    assert len(below) > 1
     for shown in (" ".join(terminal.split()), page):
-        places = [shown.index(sentence) for sentence in every]
+        places = [shown.index(sentence) for sentence in (*every, *below)]
         assert places == sorted(places)
-    asked_again = harness("eval", "--model", "mute", *options, "--out", "again", "--json")[1]
-    assert json.loads(asked_again)["caveats"] == every
+    again = json.loads(harness("eval", "--model", "mute", *options, "--out", "again", "--json")[1])
+    assert (again["caveats"], again["notes"]) == (every, below)
     assert json.loads(harness("compare", "run", "again", "--json")[1])["caveats"] == every
 
 

@@ -32,7 +32,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.latency import PAPER, as_declared, declared, known, times
 from harness.evaluate.timing import IDLE, measured
 from harness.prompts import versions
-from harness.report.words import pace
+from harness.report.notes import pace
 from harness.runs import folder
 from harness.runs.records import Latency, Times
 
@@ -260,7 +260,7 @@ def test_a_replay_keeps_its_runs_times_to_first_token(
     ego = first.answer_times["ego"]
     assert again.answer_times == first.answer_times
     assert ego.first_token == Times(ego.n, 0.3, 0.3, 0.3)
-    assert list(pace(again))[:3] == [
+    assert list(pace(folder.read(tmp_path / "again")))[:3] == [
         "ego: 60 % of the median answer is prefill (batch 1, measured where it ran)",
         f"  ego TTFT 300.0 ms, p95 300.0, n = {ego.n}",
         f"  ego TPOT 10.0 ms, p95 10.0, n = {ego.n}",
@@ -275,7 +275,7 @@ def test_answers_of_before_there_were_times_to_first_token_have_none(small: Data
     assert len(old[0]) == len(lines[0]) - 2
     file.write_text("".join(json.dumps(line) + "\n" for line in old))
     assert {(a.first_token_s, a.token_s) for a in answers_of(tmp_path / "run")} == {(None, None)}
-    assert list(pace(folder.read(tmp_path / "run").manifest)) == []
+    assert list(pace(folder.read(tmp_path / "run"))) == []
 
 
 def same_rows(one: Path, other: Path) -> bool:

@@ -1,11 +1,11 @@
 """What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import typer
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
     from harness.runs.folder import Run
-    from harness.runs.records import Manifest, Score
+    from harness.runs.records import Score
 
 
 @dataclass(frozen=True)
@@ -181,14 +181,15 @@ def _mode(agent: "Agent") -> str:
 
 
 def as_mapping(run: "Run") -> dict[str, Any]:
-    """A finished run for machines: its folder, its manifest, its caveats and the rows of its summary."""
-    from harness.report.findings import FIRST, findings
+    """A finished run for machines: its folder and manifest, what is said of it, the rows of its summary."""
+    from harness.report.findings import FIRST, LAST, Kind, findings
 
     variant = msgspec.to_builtins(run.manifest.variant)
     return {
         "run": str(run.path),
         "manifest": msgspec.to_builtins(run.manifest),
         "caveats": [finding.sentence for finding in findings(run, *FIRST)],
+        "notes": [finding.sentence for finding in findings(run, Kind.FIGURE, *LAST)],
         "summary": [{**variant, **msgspec.to_builtins(score)} for score in run.scores],
     }
 
@@ -202,9 +203,7 @@ def show(
     Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know their
     dangers has a table of balanced success before it.
     """
-    from harness.report.constancy import in_a_line
-    from harness.report.findings import FIRST, findings
-    from harness.report.words import adjusted_lines
+    from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
 
     m = done.manifest
@@ -233,7 +232,8 @@ def show(
             of_each = " and ".join(str(half.n) for half in halves if half)
             text.print(f"balanced: mean of both, of {of_each} episodes\n")
     by_witnesses(figures, names)
-    for note in (*notes, *adjusted_lines(run), *in_a_line(run), *origins(m, figures)):
+    below = findings(run, Kind.FIGURE, *LAST)
+    for note in (*notes, *(finding.sentence for finding in below)):
         text.print(note)
 
 
@@ -256,63 +256,3 @@ def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequenc
             ],
         )  # fmt: skip
     typer.echo("seen by: helpers, at the first decision; with a radio: it tells of itself\n")
-
-
-def of_letter(figures: "Mapping[tuple[str, str], Score]", role: str) -> str | None:
-    """Return the share of a role's read-outs that follows the letter; None without cyclic orders."""
-    share, follows = (figures.get(("all", f"{what}_{role}")) for what in ("letter_share", "follows_letter"))
-    if share is None or follows is None:
-        return None
-    hits = round((follows.value or 0) * follows.n)
-    return (
-        f"{100 * (share.value or 0):.0f} % follows the letter, the likeliest action in {hits} of {follows.n}"
-    )
-
-
-def origins(m: "Manifest", figures: "Mapping[tuple[str, str], Score]", means: str = "") -> Iterator[str]:
-    """Where a run's times come from and how its answers were read; `means` says what shares are means of."""
-    from harness.report.words import energy, pace
-    from harness.runs.records import Role, role_word
-
-    yield from pace(m)
-    yield f"latency: {m.latency.source} ({printable(m.latency.basis)})"
-    yield from energy(m, lambda condition, metric: figures.get((condition, metric)))
-    for role, took in m.answer_times.items():
-        low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        took_ms = f"{half} ms (5-95 %: {low} to {high}, n = {took.n})"
-        yield f"{role_word(role)} answers took {took_ms}; not used as latency"
-    for model, cost in (m.cost or {}).items():
-        left_out = f", {cost.uncounted} of which are not in it" if cost.uncounted else ""
-        yield (
-            f"cost: {cost.amount:.4g} {printable(cost.currency)} for {cost.asked} questions to "
-            f"{printable(model, 40)}{left_out}"
-        )
-    if m.cached_answers:
-        yield f"{m.cached_answers} answers came from the cache (--no-cache asks the model again)"
-    if m.engine_errors:
-        asked = sum(s.n for role in ("helper", "blind") if (s := figures.get(("all", f"failed_rate_{role}"))))
-        yield (
-            f"{m.engine_errors} of {asked} questions to helpers got no answer, and count as lost messages; "
-            "answers.jsonl has the errors"
-        )
-    if m.retries:
-        yield f"{m.retries} attempts failed before an answer came; answers.jsonl counts them as retries"
-    for role in get_args(Role):
-        word = role_word(role)
-        shares = [figures.get(("all", f"{v}_rate_{role}")) for v in ("strict", "recovered", "failed")]
-        if shares[0] is not None:
-            values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
-            yield f"{word} answers strict / recovered / failed: {values} % of {shares[0].n}{means}"
-        if divided := figures.get(("all", f"divided_rate_{role}")):
-            share = f"{100 * (divided.value or 0):.1f}"
-            yield f"{word} answers divided by their sum: {share} % of {divided.n}{means}"
-        if (mass := figures.get(("all", f"label_mass_{role}"))) is not None:
-            read = of_letter(figures, role) or "letters read once"
-            if flip := figures.get(("all", f"flip_rate_{role}")):
-                hits = round((flip.value or 0) * flip.n)
-                read += f"; the reversed list changes the likeliest action in {hits} of {flip.n}"
-            yield f"{word} read-outs: {read}; mass on the letters {mass.value or 0:.2f}{means}"
-        for when in ("at_first", "after_repair"):
-            if turn := figures.get(("all", f"valid_{when}_rate_{role}")):
-                share = Column("", turn.metric, interval=True).cell(turn)
-                yield f"{word} answers valid {when.replace('_', ' ')}: {share} % of {turn.n}{means}"

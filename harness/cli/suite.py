@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from harness.cli.run import RunGroup, as_mapping, free_folder, origins
+from harness.cli.run import RunGroup, as_mapping, free_folder
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount, shown
@@ -98,7 +98,7 @@ def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
 
 def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     """Print success, gains and what needs no model, each a table of families."""
-    from harness.report.findings import Kind, findings
+    from harness.report.findings import LAST, Kind, findings
     from harness.report.suite import seeds_of
     from harness.runs.leading import IN_WORDS, lead_of
     from harness.runs.metrics import BASELINE
@@ -129,9 +129,8 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family the same "
         "weight, and its interval is about other episodes of these families, not about other families"
     )
-    figures = {(s.condition, s.metric): s for s in done.scores}
-    for note in origins(done.manifest, figures, ", as means over families"):
-        text.print(note)
+    for finding in findings(done, *LAST):
+        text.print(finding.sentence)
 
 
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:

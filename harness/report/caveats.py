@@ -153,7 +153,7 @@ def lost_messages(run: Run) -> Iterator[str]:
 
 def retried(run: Run) -> Iterator[str]:
     """Yield how many attempts failed before an answer came."""
-    if retries := sum(answer.retries for answer in run.answers):
+    if retries := run.manifest.retries:
         yield f"The engine had errors: {retries} attempts were repeated."
 
 

@@ -1,19 +1,22 @@
 """Gather every sentence about a run, in the order in which all that shows a run says them.
 
-A new sentence is a function of a run and its line in `OF_RUNS`. What shows runs chooses by the kind.
+A new sentence is a function and its line in a table below. What shows runs chooses by the kind.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
+from typing import TypeVar
 
-from harness.report import caveats
-from harness.report.constancy import ignores_input
+from harness.report import caveats, notes, words
+from harness.report.constancy import ignores_input, in_a_line
 from harness.runs.contradictions import unchecked
 from harness.runs.folder import Run
 from harness.runs.suite import SuiteRun
 
+T = TypeVar("T")
+Source = Callable[[T], Iterable[str]]
 Runs = Mapping[str, Run]  # by the name that each is shown by
 
 
@@ -23,9 +26,13 @@ class Kind(StrEnum):
     VOID = "void"  # why the numbers are no result
     CAVEAT = "caveat"  # who decided, and how that is known
     LIMIT = "limit"  # how far the numbers carry
+    FIGURE = "figure"  # what else they come to
+    PACE = "pace"  # how fast the answers came
+    ORIGIN = "origin"  # where the numbers come from
 
 
 FIRST = (Kind.VOID, Kind.CAVEAT, Kind.LIMIT)  # what a reader must know before the numbers
+LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 
 
 @dataclass(frozen=True)
@@ -36,12 +43,12 @@ class Finding:
     sentence: str
 
 
-def each(of: Callable[[Run], Iterable[str]]) -> Callable[[Runs], list[str]]:
+def each(of: Source[Run]) -> Source[Runs]:
     """Return what says of several runs what `of` says of each."""
     return partial(_merged, of)
 
 
-def _merged(of: Callable[[Run], Iterable[str]], runs: Runs) -> list[str]:
+def _merged(of: Source[Run], runs: Runs) -> list[str]:
     """Return each sentence once, with the names of the runs that it is about if not of all."""
     about: dict[str, list[str]] = {}
     for name, run in runs.items():
@@ -53,7 +60,7 @@ def _merged(of: Callable[[Run], Iterable[str]], runs: Runs) -> list[str]:
     ]
 
 
-OF_RUNS: Mapping[Kind, Sequence[Callable[[Runs], Iterable[str]]]] = {
+OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.VOID: [*map(each, (caveats.unanswered, caveats.unread))],
     Kind.CAVEAT: [
         caveats.no_prompt,
@@ -66,6 +73,8 @@ OF_RUNS: Mapping[Kind, Sequence[Callable[[Runs], Iterable[str]]]] = {
             caveats.looked_at,
             ignores_input,
             unchecked,
+            caveats.lost_messages,
+            caveats.retried,
         )),
     ],
     Kind.LIMIT: [*map(each, (
@@ -76,27 +85,43 @@ OF_RUNS: Mapping[Kind, Sequence[Callable[[Runs], Iterable[str]]]] = {
         caveats.sampled,
         caveats.divided,
         caveats.flipped,
-        caveats.lost_messages,
-        caveats.retried,
         caveats.controls,
         caveats.unheard,
         caveats.lost_at_once,
         caveats.lagging,
         caveats.unmeasured,
     ))],
+    Kind.FIGURE: [*map(each, (words.adjusted_lines, in_a_line))],
 }  # fmt: skip
+# Of a run, or of a suite as a whole.
+OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
+    Kind.PACE: [notes.pace],
+    Kind.ORIGIN: [
+        notes.latency,
+        notes.energy,
+        notes.answer_times,
+        notes.cost,
+        notes.cached,
+        notes.readings,
+    ],
+}
 
 
 def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
-    """Return what is said of a run or of a suite's runs, all of it or only of these kinds."""
-    return of_runs(run.runs if isinstance(run, SuiteRun) else {"": run}, *kinds)
+    """Return what is said of a run, or of a suite and its runs, all of it or only of these kinds."""
+    runs = run.runs if isinstance(run, SuiteRun) else {"": run}
+    return [*of_runs(runs, *kinds), *_said(OF_ONE, run, kinds)]
 
 
 def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
     """Return what is said of runs that stand side by side, all of it or only of these kinds."""
+    return _said(OF_RUNS, runs, kinds)
+
+
+def _said(table: Mapping[Kind, Sequence[Source[T]]], of: T, kinds: Sequence[Kind]) -> list[Finding]:
     return [
         Finding(kind, sentence)
-        for kind, sources in OF_RUNS.items() if kind in (kinds or Kind)
-        for of in sources
-        for sentence in of(runs)
+        for kind, sources in table.items() if kind in (kinds or Kind)
+        for source in sources
+        for sentence in source(of)
     ]  # fmt: skip

@@ -24,7 +24,7 @@ from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
-from harness.report.findings import FIRST, of_runs
+from harness.report.findings import FIRST, LAST, findings, of_runs
 from harness.report.panels import panels
 from harness.report.remarks import sentences
 from harness.report.runs import Runs
@@ -144,6 +144,7 @@ def _pieces(
         examples=contents.examples(runs),
         remarks=sentences(runs),
         sections=sections(runs),
+        notes=[findings(run, *LAST) for run in runs.runs],
         sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
         licence=library.licence(),
         vega=library.packed(library.vega()),

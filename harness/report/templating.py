@@ -31,7 +31,6 @@ def environment(*more: Path) -> Environment:
     templates.filters |= {
         "number": lambda value, decimals: Unit(decimals=decimals).number(value),
         "facts": words.facts, "shown": words.shown, "cell": words.cell, "p_value": words.p_value,
-        "latency_source": words.latency_source, "answer_times": words.answer_times, "pace": words.pace,
         "mapping": _mapping, "columns": _table, "nameless": text, "visible": visible,
     }  # fmt: skip
     return templates

@@ -1,14 +1,14 @@
 """Numbers and findings in the words of the report."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from markupsafe import Markup
 
 from harness.core.covariate import worth
 from harness.core.errors import printable
-from harness.core.figures import PLAIN, POINTS, Unit, within
+from harness.core.figures import POINTS, within
 from harness.core.figures import shown as shown_estimate
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
@@ -17,7 +17,7 @@ from harness.runs import metrics
 from harness.runs.folder import Run
 from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
 from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, SUCCESS, entry, written
-from harness.runs.records import Latency, Manifest, Score, Times, role_word
+from harness.runs.records import Score
 from harness.runs.success import half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun, plays
 
@@ -168,79 +168,6 @@ def _runs(run: Run | SuiteRun) -> list[Run]:
 def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:
     score = run.score(condition, metric)
     return shown(score)["value"] if score else "–"
-
-
-def latency_source(latency: Latency) -> str:
-    """Return where the inference time comes from, and how long it is."""
-    source = {
-        "measured": "measured on the machine of the run, before it",
-        "card": "stated by the model card, not measured here",
-        "paper": "the paper's, not measured here",
-        "declared": "declared by the user, not measured here",
-        "device": "computed for each answer from its tokens, on a declared device",
-    }[latency.source]
-    if latency.ego_s is None or latency.fusion_s is None:
-        return f"{source} ({latency.basis})"
-    by_role = {
-        "ego": (latency.ego_s,), "helper": latency.helper_times_s(), "ego with messages": (latency.fusion_s,),
-    }  # fmt: skip
-    times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
-    return f"{times}; {source} ({latency.basis})"
-
-
-def energy(m: Manifest, score: Callable[[str, str], Score | None]) -> Iterator[str]:
-    """Yield what a decision takes in each condition, as lines; none without a device profile.
-
-    Args:
-        m: the run's manifest.
-        score: a metric's figure in a condition.
-    """
-    for name in [str(condition["name"]) for condition in m.conditions]:
-        total, helpers, radio = (score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj"))
-        if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
-            joules = PLAIN.interval(total.value, total.low, total.high)
-            yield (
-                f"{printable(name)}: {joules} J per decision, of which the helpers' inference takes "
-                f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
-            )
-
-
-def answer_times(times: Mapping[str, Times]) -> str:
-    """Return how long a run's own answers took."""
-    parts = []
-    for role, took in times.items():
-        low, half, high = (f"{1000 * s:.0f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        spread = f"5 to 95 %: {low} to {high}; " if took.n > 1 else ""
-        parts.append(f"{role_word(role)} {half} ms ({spread}n = {took.n})")
-    return ", ".join(parts) or "unknown, since no answer was asked alone"
-
-
-def pace(m: Manifest) -> Iterator[str]:
-    """Yield what prefill and decode take of answers that were asked alone, a role after the other, as lines.
-
-    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own answers;
-    where it knows none of these, of those that its latency was measured with.
-    """
-    own = {role: took for role, took in m.answer_times.items() if took.first_token}
-    for role, took in (m.latency.sample | own).items():
-        first, word = took.first_token, printable(role_word(role))
-        if first is None:
-            continue
-        if first.n == took.n and took.median_s:
-            share = 100 * first.median_s / took.median_s
-            text = f"{share:.0f} % of the median answer is prefill"
-            yield f"{word}: {text} (batch 1, measured where it ran)"
-        for what, of in (("TTFT", first), ("TPOT", took.token)):
-            if of:
-                half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
-                tail = f", p95 {high}" if of.n > 1 else ""
-                yield f"  {word} {what} {half} ms{tail}, n = {of.n}"
-
-
-def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
-    """With a decimal, or two below ten, and the interval where there is one."""
-    unit = Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0)
-    return unit.interval(seconds, *ends) if ends else unit.number(seconds)
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

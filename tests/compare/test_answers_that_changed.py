@@ -111,6 +111,6 @@ def test_where_there_is_no_interval_a_finding_says_so(runs: tuple[Path, Path], t
     twin = Path(shutil.copytree(runs[1], tmp_path / "twin"))
     configure(twin)
     ends(twin, "6g", [["late"] * 4] * 2)
-    found = " ".join(sentence for sentence, _ in words.findings(compare(pair(runs[0], twin))))
+    found = " ".join(sentence for sentence, _ in words.outcomes(compare(pair(runs[0], twin))))
     assert "points: not clear, since there is no interval" in found
     assert "–" not in found

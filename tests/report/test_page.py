@@ -25,7 +25,6 @@ from typer.testing import CliRunner
 
 from harness.backends.base import Completion
 from harness.cli.report import command
-from harness.cli.run import origins
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.evaluate.asking import answer_of, requests
@@ -33,11 +32,12 @@ from harness.prompts import readout
 from harness.prompts import versions as prompts
 from harness.report import contents, library
 from harness.report.details import prompts_of
+from harness.report.notes import answer_times, latency_source, pace, readings
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.templating import visible
-from harness.report.words import answer_times, figures, headline, latency_source, pace, shown
-from harness.runs.folder import csv_text, read
+from harness.report.words import figures, headline, shown
+from harness.runs.folder import Run, csv_text, read
 from harness.runs.records import Episode, Latency, Score, Times
 
 V2 = prompts.load("v2")
@@ -432,10 +432,9 @@ def test_the_source_of_latency_in_words(latency, words):
     assert latency_source(latency) == words
 
 
-def test_what_answers_took_in_words():
-    assert answer_times({}) == "unknown, since no answer was asked alone"
-    told = answer_times({"ego": Times(240, 0.0312, 0.0281, 0.0403), "merge": Times(1, 0.2, 0.2, 0.2)})
-    assert told == "ego 31 ms (5 to 95 %: 28 to 40; n = 240), fusion 200 ms (n = 1)"
+def whose_answers_took(run, **times):
+    """The run, with other times of its own answers."""
+    return Run(run, msgspec.structs.replace(read(run).manifest, answer_times=times))
 
 
 def test_prefill_and_decode_in_words(run):
@@ -443,39 +442,32 @@ def test_prefill_and_decode_in_words(run):
     first = Times(240, 0.021, 0.02, 0.03, (0.0205, 0.0215), (0.029, 0.031))
     ego = Times(240, 0.042, 0.03, 0.05, first_token=first, token=Times(240, 0.0005, 0.0004, 0.0006))
     helper = msgspec.structs.replace(ego, n=241)
-    manifest = msgspec.structs.replace(
-        read(run).manifest, answer_times={"ego": ego, "helper": helper, "merge": Times(1, 0.2, 0.2, 0.2)}
-    )
+    timed = whose_answers_took(run, ego=ego, helper=helper, merge=Times(1, 0.2, 0.2, 0.2))
     of_both = [
         "TTFT 21.0 [20.5, 21.5] ms, p95 30.0 [29.0, 31.0], n = 240",
         "TPOT 0.50 ms, p95 0.60, n = 240",
     ]
-    assert list(pace(manifest)) == [
+    assert list(pace(timed)) == [
         "ego: 50 % of the median answer is prefill (batch 1, measured where it ran)",
         *(f"  ego {line}" for line in of_both),
         *(f"  helper {line}" for line in of_both),
     ]
-    assert all(len(line) <= 80 for line in pace(manifest))
-    assert list(pace(msgspec.structs.replace(manifest, answer_times={}))) == []
+    assert all(len(line) <= 80 for line in pace(timed))
+    assert list(pace(whose_answers_took(run))) == []
     one = Times(1, 0.021, 0.021, 0.021)
-    alone = msgspec.structs.replace(
-        manifest, answer_times={"ego": Times(1, 0.04, 0.04, 0.04, first_token=one)}
-    )
+    alone = whose_answers_took(run, ego=Times(1, 0.04, 0.04, 0.04, first_token=one))
     assert list(pace(alone))[1:] == ["  ego TTFT 21.0 ms, n = 1"], "one answer has no percentile"
-    fusing = msgspec.structs.replace(manifest, answer_times={"merge": ego})
-    assert next(pace(fusing)).startswith("fusion: 50 % of the median")
+    assert next(pace(whose_answers_took(run, merge=ego))).startswith("fusion: 50 % of the median")
 
 
 def test_people_read_fusion_where_files_say_merge(run):
-    """In the terminal's lines on times and on how answers were read."""
+    """In what is said of times and of how answers were read."""
     shares = {f"{kind}_rate_merge": kind == "strict" for kind in ("strict", "recovered", "failed")}
-    figures = {
-        ("all", name): Score("all", name, float(value), None, None, 8, 0, "answers")
-        for name, value in shares.items()
-    }
-    manifest = msgspec.structs.replace(read(run).manifest, answer_times={"merge": Times(1, 0.2, 0.2, 0.2)})
-    lines = [line for line in origins(manifest, figures) if line.startswith("fusion ")]
-    assert lines == [
+    fused = whose_answers_took(run, merge=Times(1, 0.2, 0.2, 0.2))
+    fused.__dict__["scores"] = [
+        Score("all", name, float(value), None, None, 8, 0, "answers") for name, value in shares.items()
+    ]
+    assert [*answer_times(fused), *readings(fused)] == [
         "fusion answers took 200.0 ms (5-95 %: 200.0 to 200.0, n = 1); not used as latency",
         "fusion answers strict / recovered / failed: 100.0 / 0.0 / 0.0 % of 8",
     ]

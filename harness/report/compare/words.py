@@ -21,8 +21,8 @@ from harness.report.compare.difference import (
 )
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
-from harness.report.findings import FIRST, of_runs
-from harness.report.words import SHOWN_FROM, as_good_as, p_value, pace
+from harness.report.findings import FIRST, Kind, findings, of_runs
+from harness.report.words import SHOWN_FROM, as_good_as, p_value
 from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
@@ -113,9 +113,9 @@ def rest(c: InCondition) -> list[Difference]:
     return [d for d in c.differences if d not in (*primary, *striking)]
 
 
-def findings(comparison: Comparison) -> list[tuple[str, str]]:
+def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     """Return how what leads changed in each condition: a sentence and its verdict."""
-    findings = []
+    outcomes = []
     for c in comparison.conditions:
         lead = leading({d.metric for d in c.differences})
         for d in [d for d in c.differences if d.metric == lead]:
@@ -127,8 +127,8 @@ def findings(comparison: Comparison) -> list[tuple[str, str]]:
                 verdict = row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
             interval = f" {row.interval}".removesuffix(" –")
             change = f"{IN_WORDS[lead]} {row.change} points{interval}: {verdict}"
-            findings.append((f"{c.condition}: {change}{p}", row.verdict))
-    return findings
+            outcomes.append((f"{c.condition}: {change}{p}", row.verdict))
+    return outcomes
 
 
 def who(side: Side) -> str:
@@ -148,7 +148,9 @@ def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
 def paces(pair: Pair) -> list[str]:
     """Return what prefill and decode take, with the run's letter."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
-    return [f"{name}: {line.strip()}" for name, run in sides for line in pace(run.manifest)]
+    return [
+        f"{name}: {finding.sentence.strip()}" for name, run in sides for finding in findings(run, Kind.PACE)
+    ]
 
 
 def caveats(pair: Pair) -> list[str]:

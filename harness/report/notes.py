@@ -1,0 +1,138 @@
+"""Where the numbers of a run or suite come from, a function a fact; `findings` has them in their order."""
+
+from collections.abc import Iterator
+from typing import get_args
+
+from harness.core.errors import printable
+from harness.core.figures import PLAIN, Unit
+from harness.runs.folder import Run
+from harness.runs.metrics import ALL, written
+from harness.runs.records import Latency, Role, Score, role_word
+from harness.runs.suite import SuiteRun
+
+Shown = Run | SuiteRun
+
+
+def pace(run: Shown) -> Iterator[str]:
+    """Yield what prefill and decode take of answers that were asked alone, a role after the other, as lines.
+
+    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own answers;
+    where it knows none of these, of those that its latency was measured with.
+    """
+    manifest = run.manifest
+    own = {role: took for role, took in manifest.answer_times.items() if took.first_token}
+    for role, took in (manifest.latency.sample | own).items():
+        first, word = took.first_token, printable(role_word(role))
+        if first is None:
+            continue
+        if first.n == took.n and took.median_s:
+            share = 100 * first.median_s / took.median_s
+            text = f"{share:.0f} % of the median answer is prefill"
+            yield f"{word}: {text} (batch 1, measured where it ran)"
+        for what, of in (("TTFT", first), ("TPOT", took.token)):
+            if of:
+                half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
+                tail = f", p95 {high}" if of.n > 1 else ""
+                yield f"  {word} {what} {half} ms{tail}, n = {of.n}"
+
+
+def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
+    """With a decimal, or two below ten, and the interval where there is one."""
+    unit = Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0)
+    return unit.interval(seconds, *ends) if ends else unit.number(seconds)
+
+
+def latency(run: Shown) -> Iterator[str]:
+    """Yield where the inference time comes from, and how long it is."""
+    yield f"latency: {latency_source(run.manifest.latency)}"
+
+
+def latency_source(latency: Latency) -> str:
+    """Return where the inference time comes from, and how long it is."""
+    source = {
+        "measured": "measured on the machine of the run, before it",
+        "card": "stated by the model card, not measured here",
+        "paper": "the paper's, not measured here",
+        "declared": "declared by the user, not measured here",
+        "device": "computed for each answer from its tokens, on a declared device",
+    }[latency.source]
+    if latency.ego_s is None or latency.fusion_s is None:
+        return f"{source} ({printable(latency.basis)})"
+    by_role = {
+        "ego": (latency.ego_s,), "helper": latency.helper_times_s(), "ego with messages": (latency.fusion_s,),
+    }  # fmt: skip
+    times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
+    return f"{times}; {source} ({printable(latency.basis)})"
+
+
+def energy(run: Shown) -> Iterator[str]:
+    """Yield what a decision takes in each condition; nothing without a device profile."""
+    for name in run.conditions:
+        total, helpers, radio = (run.score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj"))
+        if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
+            joules = PLAIN.interval(total.value, total.low, total.high)
+            yield (
+                f"{printable(name)}: {joules} J per decision, of which the helpers' inference takes "
+                f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
+            )
+
+
+def answer_times(run: Shown) -> Iterator[str]:
+    """Yield how long a role's own answers took."""
+    for role, took in run.manifest.answer_times.items():
+        low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
+        took_ms = f"{half} ms (5-95 %: {low} to {high}, n = {took.n})"
+        yield f"{printable(role_word(role))} answers took {took_ms}; not used as latency"
+
+
+def cost(run: Shown) -> Iterator[str]:
+    """Yield what the questions to a model cost."""
+    for model, cost in (run.manifest.cost or {}).items():
+        left_out = f", {cost.uncounted} of which are not in it" if cost.uncounted else ""
+        yield (
+            f"cost: {cost.amount:.4g} {printable(cost.currency)} for {cost.asked} questions to "
+            f"{printable(model, 40)}{left_out}"
+        )
+
+
+def cached(run: Shown) -> Iterator[str]:
+    """Yield how many answers the model was not asked for."""
+    if n := run.manifest.cached_answers:
+        yield f"{n} answers came from the cache (--no-cache asks the model again)"
+
+
+def readings(run: Shown) -> Iterator[str]:
+    """Yield how the answers of each role were read; shares of a suite are means over families."""
+    means = ", as means over families" if isinstance(run, SuiteRun) else ""
+    for role in get_args(Role):
+        yield from (f"{role_word(role)} {line}{means}" for line in _of_role(run, role))
+
+
+def _of_role(run: Shown, role: str) -> Iterator[str]:
+    shares = [run.score(ALL, f"{verdict}_rate_{role}") for verdict in ("strict", "recovered", "failed")]
+    if shares[0] is not None:
+        values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
+        yield f"answers strict / recovered / failed: {values} % of {shares[0].n}"
+    if divided := run.score(ALL, f"divided_rate_{role}"):
+        yield f"answers divided by their sum: {100 * (divided.value or 0):.1f} % of {divided.n}"
+    if mass := run.score(ALL, f"label_mass_{role}"):
+        yield f"read-outs: {_letters(run, role)}; mass on the letters {mass.value or 0:.2f}"
+    for when in ("at_first", "after_repair"):
+        if turn := run.score(ALL, f"valid_{when}_rate_{role}"):
+            yield f"answers valid {when.replace('_', ' ')}: {written(turn)} % of {turn.n}"
+
+
+def _letters(run: Shown, role: str) -> str:
+    """Return what a role's read-outs owe to the letters and to the order of the list of actions."""
+    share, follows = (run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter"))
+    read = "letters read once"
+    if share and follows:
+        owed = f"{100 * (share.value or 0):.0f} % follows the letter"
+        read = f"{owed}, the likeliest action in {_hits(follows)} of {follows.n}"
+    if flip := run.score(ALL, f"flip_rate_{role}"):
+        read += f"; the reversed list changes the likeliest action in {_hits(flip)} of {flip.n}"
+    return read
+
+
+def _hits(share: Score) -> int:
+    return round((share.value or 0) * share.n)
