@@ -255,6 +255,7 @@ def test_what_bounds_a_suites_numbers_stands_above_them(evaluated: Harness) -> N
     assert (
         page.index("reads no prompt") < page.index("episodes: the interval of a rate") < page.index("Under ")
     )
+    assert page.index("</table>") < page.index("latency: ego ") < page.index("as means over families.")
 
 
 def test_an_exported_suite_leads_to_the_pages_of_its_runs(evaluated: Harness) -> None:

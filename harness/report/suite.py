@@ -16,7 +16,7 @@ from harness.report import words
 from harness.report.compare.page import Place, beside
 from harness.report.document import Section, Table, document, linked
 from harness.report.drawing import colours
-from harness.report.findings import Kind, findings
+from harness.report.findings import LAST, Kind, findings
 from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.contradictions import refuse
@@ -117,6 +117,7 @@ def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> s
 
 
 def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
+    origins = ". ".join(finding.sentence for finding in findings(suite, *LAST))
     return Section(
         f"{suite.variant} on {suite.name}",
         [words.headline(suite)],
@@ -128,7 +129,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
         [_families(lines, place, lead_of(suite)), _metrics(suite)],
         warnings=[finding.sentence for finding in findings(suite, Kind.VOID)],
         caveats=[finding.sentence for finding in findings(suite, Kind.CAVEAT, Kind.LIMIT)],
-        numbers=_numbers(suite),
+        numbers=_numbers(suite), more=Markup('<p class="quiet">{}.</p>').format(origins),
     )  # fmt: skip
 
 
