@@ -246,8 +246,8 @@ class Bent(Attack):
 @pytest.mark.parametrize(
     ("way", "says"),
     [
-        ("write", "assignment destination is read-only"), ("own", "it changes the ego's own intent"),
-        ("sums", "intents that are no distributions"), ("others", "it changes what a helper says"),
+        ("write", "assignment destination is read-only"), ("own", "own of shape (3,), not (9, 3)"),
+        ("sums", "intents that are no distributions"), ("others", "it changes helpers of the ego"),
     ],
 )  # fmt: skip
 def test_a_packages_attack_says_what_an_attacker_can_or_is_one_line(

@@ -299,7 +299,7 @@ def pooled(p: Floats, weights: Floats) -> Floats:
     [
         (lambda p, w: linear_pool(p, w) * np.nan, "fused policies that are no distributions, such as [nan"),
         (lambda p, w: linear_pool(p, w) * 2, "fused policies that are no distributions, such as [1.0, 1.0"),
-        (lambda p, w: [[0.5, 0.5]], "fused policies of shape (1, 2), not (2,)"),
+        (lambda p, w: [[0.5, 0.5]], "fused policies of type list, not an array"),
         (pooled, "assignment destination is read-only"),
     ],
 )
@@ -357,7 +357,7 @@ class Bent(Fog):
     ("way", "says"),
     [
         ("integers", "ValueError: up of type int64, not bool"), ("read-only", "ValueError: assignment"),
-        ("delay", "ValueError: a delay that is negative or NaN"), ("loss", "ValueError: a loss that is no"),
+        ("delay", "ValueError: a delay that is negative"), ("loss", "ValueError: a loss that is no"),
         ("shape", "ValueError: up of shape (1,), not (3,)"), ("other", "KeyError: 'other'"),
     ],
 )  # fmt: skip

@@ -23,8 +23,9 @@ from harness.core.arrays import (
     Ints,
     any_of,
     check_distributions,
-    check_shape,
+    check_shares,
     count_of,
+    numbers,
     read_only,
 )
 from harness.core.strangers import worded
@@ -141,8 +142,8 @@ def fuse(
 def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
     """Let a rule fuse, from its memory at the episodes' first step if `state` is None.
 
-    A package's rule cannot write to what it gets. Raises UserError if it fails, or if what it returns where
-    somebody was heard is no distribution.
+    A package's rule cannot write to what it gets, nor later to what it returns. Raises UserError if it fails,
+    or if what it returns where somebody was heard is no distribution.
     """
     *batch, vehicles, actions = messages.intents.shape
     with worded(f"rule {name}", built_in=name in RULES.built_in):
@@ -150,14 +151,18 @@ def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
         memory = rule.start(tuple(batch), vehicles - 1, actions) if state is None else state
         if name in RULES.built_in:
             return rule.fuse(messages, memory)
+        memory = numbers("memory", memory, (*batch, *(np.shape(memory) or (0,))[-1:]))
         fused = rule.fuse(read_only(messages), read_only(memory))
-        check_shape("fused policies", fused.policy, (*batch, actions))
-        check_distributions("fused policies", fused.policy, any_of(messages.heard))
-        check_shape("weights", fused.weights, (*batch, vehicles))
-        check_shape("memory", fused.state, memory.shape)
-        if fused.trust is not None:
-            check_shape("trust", fused.trust, (*batch, vehicles - 1))
-    return fused
+        policy = numbers("fused policies", fused.policy, (*batch, actions))
+        check_distributions("fused policies", policy, any_of(messages.heard))
+        weights = numbers("weights", fused.weights, (*batch, vehicles))
+        check_shares("weights", weights[..., 1:], messages.heard)
+        check_shares("weights", weights[..., 0], any_of(messages.heard))
+        trust = fused.trust
+        if trust is not None:
+            trust = numbers("trust", trust, (*batch, vehicles - 1))
+            check_shares("trust", trust, messages.heard)
+        return Fused(policy, weights, numbers("memory", fused.state, memory.shape), trust)
 
 
 def _likeliest(policy: Floats, ties: TieDraws | None) -> Ints:

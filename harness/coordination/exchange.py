@@ -32,13 +32,13 @@ from harness.coordination.parts import FUSION
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ScheduleInputs, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
-from harness.core.arrays import Bools, Floats, Ints, any_of, check_shape, count_of, read_only
+from harness.core.arrays import Bools, Floats, Ints, any_of, count_of, numbers, read_only
 from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.core.strangers import worded
 from harness.radio.channel import Channel, Draws, Links
 from harness.radio.roadside import Consulted, by_unit
-from harness.radio.wrapped import delivered, heard_s, is_ours
+from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,8 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
 def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
     """Return who is asked by the point's schedule, `(..., H)`."""
     worth = _worth(point, _with_schedule_needs(point, known, intents, draws))
-    return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
+    with worded(f"schedule {point.ask.schedule}", built_in=point.ask.schedule in SCHEDULES.built_in):
+        return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
 
 
 def _ask_helpers(
@@ -207,7 +208,7 @@ def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
         return SCHEDULES[name].worth(known)
     with worded(f"schedule {name}"):
         worth = SCHEDULES[name].worth(read_only(known))
-        check_shape("worths", worth, shape, (*shape[:-1], 1))
+        worth = numbers("worths", worth, shape, (*shape[:-1], 1))
         if np.any(np.isnan(worth) & known.may_ask):
             raise ValueError("a worth that is NaN for a helper that may be asked")
     return worth
@@ -267,7 +268,7 @@ def _ask_directly(
     channel: Channel, links: Links, draws: Draws, ready: Callable[[Floats], Floats]
 ) -> Consulted:
     """Let the ego ask the helpers itself, and wait until the last slot has ended."""
-    request = channel.request(links.request_bits, draws)
+    request = broadcast(channel, links.request_bits, draws)
     ready_s = ready(heard_s(channel, request, links, draws))
     up, end_s, loss, airtime_s = delivered(channel, replace(links, ready_s=ready_s), draws)
     requested, received = any_of(links.asked), links.asked & up

@@ -61,10 +61,22 @@ def read_only(value: T) -> T:
 
 
 def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
-    """Raise ValueError unless `values` is an array of one of the shapes."""
-    shape = np.shape(values)
-    if not isinstance(values, np.ndarray) or shape not in allowed:
-        raise ValueError(f"{name} of shape {shape}, not {' or '.join(map(str, allowed))}")
+    """Raise ValueError unless `values` is an array of one of the shapes, without a mask."""
+    if not isinstance(values, np.ndarray) or isinstance(values, np.ma.MaskedArray):
+        raise ValueError(f"{name} of type {type(values).__name__}, not an array of numpy's")
+    if values.shape not in allowed:
+        raise ValueError(f"{name} of shape {values.shape}, not {' or '.join(map(str, allowed))}")
+
+
+def numbers(name: str, values: Any, *allowed: tuple[int, ...]) -> Floats:
+    """Return numbers that a package gave, as an array of one's own, which it cannot write to later.
+
+    Raises ValueError unless they are an array of one of the shapes, without a mask, and of real numbers.
+    """
+    check_shape(name, values, *allowed)
+    if values.dtype.kind not in "biuf":
+        raise ValueError(f"{name} of type {values.dtype}, not numbers")
+    return np.array(values, dtype=np.float64)
 
 
 def check_distributions(name: str, values: Floats, where: Bools) -> None:
@@ -74,3 +86,10 @@ def check_distributions(name: str, values: Floats, where: Bools) -> None:
     wrong = ~(sums_to_one & np.all(rows >= 0.0, axis=-1))
     if wrong.any():
         raise ValueError(f"{name} that are no distributions, such as {rows[wrong][0].tolist()}")
+
+
+def check_shares(name: str, values: Floats, where: Bools) -> None:
+    """Raise ValueError unless the values at `where`, of the same shape, are from 0 to 1, or NaN."""
+    wrong = values[where & ((values < 0.0) | (values > 1.0 + ROUNDING))]
+    if wrong.size:
+        raise ValueError(f"{name} that are not from 0 to 1, such as {wrong[0]:g}")

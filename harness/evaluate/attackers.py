@@ -6,14 +6,14 @@ ego faces where it alone decides: each is one vehicle that attacks whoever asks,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from harness.coordination.attacks import Attack, Turn, attackers, attacks_of
-from harness.coordination.intents import Intents
+from harness.coordination.intents import OF_EGO, WITH_EGO, Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, check_distributions, check_shape, read_only
@@ -88,7 +88,7 @@ class Attackers:
 def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
     """Let an attack act. A package's cannot write to what it gets, and says only what a message can hold.
 
-    Raises UserError if it fails, changes the ego's own intent, or lets a voice say no distribution.
+    Raises UserError if it fails, changes what is not an attacker's, or lets a voice say no distribution.
     """
     kind = type(attack)
     if kind.__module__.startswith("harness."):
@@ -96,14 +96,39 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
     with worded(f"attack {kind.__name__}"):
         after = attack.act(read_only(said), read_only(turn))
         if after.voice_of is None:
-            check_shape("intents", after.helpers, said.helpers.shape)
-            honest = ~turn.attackers
-            if not np.array_equal(after.helpers[honest], said.helpers[honest], equal_nan=True):
-                raise ValueError("it changes what a helper says that is no attacker")
+            after = replace(after, site=said.site, outlook=said.outlook, plans=said.plans)
+            _refuse_of_others(said, after, turn.attackers)
+        else:
+            check_shape("voices", after.voice_of, after.helpers.shape[:2])
+            if np.any((after.voice_of < 0) | (after.voice_of >= said.helpers.shape[1])):
+                raise ValueError("a voice of nobody who is there")
         check_distributions("intents", after.helpers, after.valid)
         if not np.array_equal(after.own, said.own, equal_nan=True):
             raise ValueError("it changes the ego's own intent")
     return after
+
+
+def _refuse_of_others(said: Intents, after: Intents, attackers: Bools) -> None:
+    """Raise ValueError if an attack changes what is the ego's, or a helper's that is no attacker."""
+    nobody = np.zeros(attackers.shape, dtype=bool)
+    before, now = ({"silent": nobody, **each.arrays(), **_claimed(each)} for each in (said, after))
+    if changed := sorted(before.keys() ^ now.keys()):
+        raise ValueError(f"it adds or leaves out {', '.join(changed)}")
+    for name, values in now.items():
+        check_shape("intents" if name == "helpers" else name, values, before[name].shape)
+        if values.dtype.kind not in ("b" if before[name].dtype == bool else "iuf"):
+            raise ValueError(f"{name} of type {values.dtype}, not {before[name].dtype}")
+        others = ~np.insert(attackers, 0, False, axis=1) if name in (*WITH_EGO, "xy_m") else ~attackers
+        if name in (*OF_EGO, "time_s", "error_m"):
+            others = np.ones(len(attackers), dtype=bool)
+        if not np.array_equal(values[others], before[name][others], equal_nan=True):
+            raise ValueError(f"it changes {name} of the ego, or of a helper that is no attacker")
+
+
+def _claimed(intents: Intents) -> dict[str, Any]:
+    """Return the arrays of what helpers claim, by name."""
+    claims = intents.claims
+    return {} if claims is None else {k: v for k, v in vars(claims).items() if isinstance(v, np.ndarray)}
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:

@@ -17,8 +17,10 @@ from harness.core.config import convert, settable, toml
 from harness.core.errors import printable, unknown
 from harness.core.files import read_once
 from harness.core.plugins import FilesAndPlugins
+from harness.core.strangers import worded
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
+from harness.radio.wrapped import is_ours
 
 # Models by name: a class, or a function of a file's parameters, its folder and their name in messages.
 # Physical models are slow to import, so a model is imported only when a profile names it.
@@ -84,7 +86,8 @@ class Profiles(FilesAndPlugins[Channel]):
         """Return all that decides what the channel does, as plain values."""
         parameters = asdict(self[name])
         plain = {**asdict(self.profile(name)), "parameters": parameters}
-        record: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
+        with worded(f"channel profile {printable(name)}", built_in=is_ours(self[name])):
+            record: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
         return record
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import ByLink, Delivery, Draws, Links, Physical, Site, Unit
-from harness.radio.wrapped import Wrapped, delivered, heard_s, innermost
+from harness.radio.wrapped import Wrapped, broadcast, delivered, heard_s, innermost
 
 EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
 
@@ -47,7 +47,7 @@ class Relay(Wrapped):
         )
         heard = there.up & links.asked & has_request
         copies = draws.of(".roadside-ego")
-        copy = self.channel.request(links.payload_bits, replace(copies, given=copies.packet))
+        copy = broadcast(self.channel, links.payload_bits, replace(copies, given=copies.packet))
         to_ego = replace(links, site=at_unit.select(EGO))
         copied = heard & (
             copies.packet[..., 1] >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
@@ -109,14 +109,14 @@ def by_unit(
         return link_loss(channel, ego_link.where, to_ego, size_bits)[..., 0]
 
     wanted = np.any(links.asked, axis=-1)
-    to_unit = channel.request(2 * bits, draws)
+    to_unit = broadcast(channel, 2 * bits, draws)
     reached = wanted & (request_draw >= lost(2 * bits))
-    ask = channel.request(bits, to_helpers)
+    ask = broadcast(channel, bits, to_helpers)
     unit_s = heard_s(channel, to_unit, ego_link, to_ego.first)
     ready_s = ready(unit_s + delay_s + heard_s(channel, ask, helper_links, to_helpers))
     asked = links.asked & reached[..., None]
     replies = delivered(channel, replace(helper_links, asked=asked, ready_s=ready_s), to_helpers)
-    back = channel.request(bits, replace(to_ego, given=back_draw[..., None]))
+    back = broadcast(channel, bits, replace(to_ego, given=back_draw[..., None]))
     back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").first)[..., 0]
     latest_s = left_s - back_s
     sent = reached & (latest_s >= unit_s[..., 0])

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.core.arrays import Floats, Ints, check_shape, read_only
+from harness.core.arrays import Floats, Ints, check_shape, numbers, read_only
 from harness.radio.channel import REQUEST, Broadcast, ByLink, Channel, Delivery, Draws, Links, Physical, Site
 
 
@@ -51,29 +51,47 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
     """
     if is_ours(channel):
         return channel.deliver(links, draws)
-    delivery = Delivery(*channel.deliver(read_only(links), read_only(draws)))
+    up, delay_s, loss, airtime_s = channel.deliver(read_only(links), read_only(draws))
     asked, shape = links.asked, links.asked.shape
-    check_shape("up", delivery.up, shape)
-    if delivery.up.dtype != bool:
-        raise ValueError(f"up of type {delivery.up.dtype}, not bool")
-    check_shape("delays", delivery.delay_s, shape)
-    if not np.all(delivery.delay_s[asked] >= 0.0):
-        raise ValueError("a delay that is negative or NaN for a helper that was asked")
-    check_shape("losses", delivery.loss, shape, (*shape[:-1], 1))
-    if np.any(((delivery.loss < 0.0) | (delivery.loss > 1.0)) & asked):
-        raise ValueError("a loss that is no probability")
-    check_shape("airtimes", delivery.airtime_s, shape)
-    if np.any(delivery.airtime_s[asked] < 0.0):
-        raise ValueError("a negative airtime")
-    return delivery
+    check_shape("up", up, shape)
+    if up.dtype != bool:
+        raise ValueError(f"up of type {up.dtype}, not bool")
+    delay_s = numbers("delays", delay_s, shape)
+    if not np.all((delay_s[asked] >= 0.0) & (delay_s[asked] < np.inf)):
+        raise ValueError("a delay that is negative, infinite or NaN for a helper that was asked")
+    loss = numbers("losses", loss, shape, (*shape[:-1], 1))
+    if not np.all(((loss >= 0.0) & (loss <= 1.0)) | ~asked):
+        raise ValueError("a loss that is no probability for a helper that was asked")
+    airtime_s = numbers("airtimes", airtime_s, shape)
+    if np.any((airtime_s[asked] < 0.0) | np.isinf(airtime_s[asked])):
+        raise ValueError("an airtime that is negative or infinite for a helper that was asked")
+    return Delivery(np.array(up), delay_s, loss, airtime_s)
 
 
-def heard_s(channel: Channel, broadcast: Broadcast, links: Links, draws: Draws) -> Floats:
+def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast:
+    """Let a channel say when a request is heard, with the same care as `delivered`.
+
+    Raises ValueError for a time that is negative or infinite; NaN is one that is unknown.
+    """
+    if is_ours(channel):
+        return channel.request(bits, draws)
+    times = channel.request(bits, read_only(draws))
+    heard_s, airtime_s = (np.array(each, dtype=float) for each in (times.heard_s, times.airtime_s))
+    for each in (heard_s, airtime_s):
+        if np.any((each < 0.0) | np.isinf(each)):
+            raise ValueError("a request whose time is negative or infinite")
+    return Broadcast(heard_s, airtime_s)
+
+
+def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) -> Floats:
     """Return when each receiver has a broadcast, `(..., H)`, or `(..., 1)` if all have it at once."""
     model = innermost(channel)
     if isinstance(model, ByLink):
-        return model.latencies_s(links.where, draws, REQUEST)
-    return np.asarray(broadcast.heard_s)[..., None]
+        if is_ours(model):
+            return model.latencies_s(links.where, draws, REQUEST)
+        times_s = model.latencies_s(read_only(links.where), read_only(draws), REQUEST)
+        return numbers("latencies", times_s, links.where.sight.shape)
+    return np.asarray(request.heard_s)[..., None]
 
 
 @dataclass(frozen=True)

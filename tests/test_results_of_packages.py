@@ -1,0 +1,172 @@
+"""What packages' rules, channels and attacks return is held to what it must be, and is copied."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from harness.coordination.attacks import Attack, Turn
+from harness.coordination.consensus import Fused, Messages
+from harness.coordination.coordinate import _by_rule
+from harness.coordination.intents import Intents
+from harness.coordination.rules import RULES
+from harness.core.errors import UserError
+from harness.evaluate.attackers import _acted
+from harness.radio.channel import Broadcast, Delivery, Draws, Links
+from harness.radio.profiles import CHANNELS
+from harness.radio.wrapped import broadcast, delivered
+
+P = np.full((2, 2), 0.5)
+HEARD = np.ones((2, 1), dtype=bool)
+MESSAGES = Messages(np.full((2, 2, 2), 0.5), P, HEARD, np.ones((2, 1)), P, np.ones((2, 1)))
+NOW = Broadcast(0.0, 0.0)
+FUSED = Fused(P, P, np.zeros((2, 3)), np.ones((2, 1)))
+DRAWS = Draws(np.zeros((2, 1, 2)), np.zeros((2, 1)))
+ONE = np.ones((2, 1))
+LINKS = Links(HEARD, ONE, ONE, ONE, HEARD, HEARD)
+DELIVERED = Delivery(HEARD, *np.ones((3, 2, 1)))
+SAID = Intents(P, np.full((2, 2, 2), 0.5), np.ones((2, 2), dtype=bool), np.ones((2, 3)), 2 * P, 2 * P,
+               np.ones((2, 3)))  # fmt: skip
+TURN = Turn(SAID, np.array([[True, False]] * 2), SAID.helpers, np.empty((2, 0, 2, 2)), np.zeros((2, 2)))
+
+
+@dataclass(frozen=True)
+class Rule:
+    result: Fused
+    memory: Any = None
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Any:
+        return np.zeros((*batch, 3)) if self.memory is None else self.memory
+
+    def fuse(self, messages: Messages, state: Any) -> Fused:
+        return self.result
+
+
+@dataclass(frozen=True)
+class Radio:
+    result: Delivery = DELIVERED
+    asked: Broadcast = NOW
+    writes: bool = False
+    table: Any = None
+
+    def request(self, bits: Any, draws: Draws) -> Broadcast:
+        if self.writes:
+            draws.link[...] = 1.0
+        return self.asked
+
+    def deliver(self, links: Links, draws: Draws) -> Delivery:
+        return self.result
+
+
+@dataclass(frozen=True)
+class Lie(Attack):
+    lie: Callable[[Intents], Intents] = lambda sent: sent
+
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return self.lie(sent)
+
+
+def fused(monkeypatch: pytest.MonkeyPatch, rule: Rule) -> Fused:
+    monkeypatch.setitem(RULES._loaded, "mine", rule)
+    return _by_rule("mine", MESSAGES, None)
+
+
+def masked(values: Any) -> Any:
+    return np.ma.masked_array(values, mask=True)
+
+
+@pytest.mark.parametrize(
+    ("rule", "says"),
+    [
+        (Rule(FUSED._replace(policy=masked(7 * P))), "fused policies of type MaskedArray"),
+        (Rule(FUSED._replace(policy=cast("Any", P.tolist()))), "fused policies of type list"),
+        (Rule(FUSED._replace(policy=P.astype(complex))), "fused policies of type complex128"),
+        (Rule(FUSED._replace(weights=P.astype(str))), "weights of type <U"),
+        (Rule(FUSED._replace(weights=P * np.inf)), "weights that are not from 0 to 1, such as inf"),
+        (Rule(FUSED._replace(weights=-P)), "weights that are not from 0 to 1, such as -0.5"),
+        (Rule(FUSED._replace(trust=np.full((2, 1), 7.0))), "trust that are not from 0 to 1, such as 7"),
+        (Rule(FUSED._replace(trust=np.full((2, 1), None))), "trust of type object"),
+        (Rule(FUSED, np.zeros(3)), r"memory of shape \(3,\), not \(2, 3\)"),
+        (Rule(FUSED, np.zeros(())), r"memory of shape \(\), not \(2, 0\)"),
+    ],
+)
+def test_what_a_rule_returns_is_held_to_what_it_must_be(
+    rule: Rule, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UserError, match=f"^rule mine fails .ValueError: {says}"):
+        fused(monkeypatch, rule)
+
+
+def test_what_a_rule_writes_later_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may have one array for all conditions, whose memories would be one."""
+    result = Fused(P.copy(), P.copy(), np.zeros((2, 3)), np.ones((2, 1)))
+    taken = fused(monkeypatch, Rule(result))
+    before = [np.array(each) for each in taken]
+    for each in result:
+        each[...] = 0.25
+    assert all(np.array_equal(a, b) for a, b in zip(taken, before, strict=True))
+
+
+def test_ints_and_float32_are_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = fused(monkeypatch, Rule(FUSED._replace(policy=np.eye(2, dtype=int), weights=P.astype("f4"))))
+    assert [each.dtype for each in taken] == [np.float64] * 4
+
+
+@pytest.mark.parametrize(
+    ("result", "says"),
+    [
+        (DELIVERED._replace(up=masked(HEARD)), "up of type MaskedArray"),
+        (DELIVERED._replace(delay_s=np.full((2, 1), np.inf)), "a delay that is negative, infinite or NaN"),
+        (DELIVERED._replace(delay_s=np.full((2, 1), 1.0, object)), "delays of type object"),
+        (DELIVERED._replace(loss=masked(np.full((2, 1), 9.0))), "losses of type MaskedArray"),
+        (DELIVERED._replace(loss=np.full((2, 1), np.nan)), "a loss that is no probability"),
+        (DELIVERED._replace(airtime_s=np.full((2, 1), np.inf)), "an airtime that is negative or infinite"),
+    ],
+)
+def test_what_a_channel_delivers_is_held_to_what_it_must_be(result: Delivery, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        delivered(Radio(result), LINKS, DRAWS)
+
+
+def test_a_channel_cannot_write_to_the_draws_of_others_when_it_is_asked_for_a_request() -> None:
+    """All conditions share them."""
+    with pytest.raises(ValueError, match="read-only"):
+        broadcast(Radio(writes=True), 1.0, DRAWS)
+    for time_s in (-1.0, np.inf):
+        with pytest.raises(ValueError, match="a request whose time is negative or infinite"):
+            broadcast(Radio(asked=Broadcast(0.0, time_s)), 1.0, DRAWS)
+    assert np.isnan(broadcast(Radio(asked=Broadcast(np.nan, 0)), 1.0, DRAWS).heard_s)
+
+
+def test_a_channel_whose_parameters_no_file_can_hold_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CHANNELS._loaded, "mine", Radio(table=np.zeros(3)))
+    with pytest.raises(UserError, match=r"^channel profile mine fails \(TypeError: Encoding objects"):
+        CHANNELS.record("mine")
+
+
+@pytest.mark.parametrize(
+    ("lie", "says"),
+    [
+        (lambda s: replace(s, distance_m=0 * s.distance_m), "it changes distance_m of the ego, or of a hel"),
+        (lambda s: replace(s, inference_s=0 * s.inference_s), "it changes inference_s of the ego, or of a "),
+        (lambda s: replace(s, silent=np.ones((2, 2), dtype=bool)), "it changes silent of the ego, or of a "),
+        (lambda s: replace(s, valid=~s.valid), "it changes valid of the ego, or of a helper that is no att"),
+        (lambda s: replace(s, silent=s.valid.tolist()), "silent of type list"),
+        (lambda s: replace(s, helpers=masked(7 * s.helpers)), "intents of type MaskedArray"),
+        (lambda s: replace(s, text_bytes=s.range_m), "it adds or leaves out text_bytes"),
+        (lambda s: replace(s, voice_of=np.full((2, 2), 9)), "a voice of nobody who is there"),
+    ],
+)
+def test_an_attack_changes_what_is_its_own(lie: Callable[[Intents], Intents], says: str) -> None:
+    with pytest.raises(UserError, match=f"^attack Lie fails .ValueError: {says}"):
+        _acted(Lie(lie=lie), SAID, TURN)
+
+
+def test_an_attacker_may_be_silent_far_away_and_late() -> None:
+    far = _acted(Lie(lie=lambda s: replace(
+        s, silent=np.array([[True, False]] * 2), range_m=np.add(s.range_m, [9.0, 0.0]),
+        inference_s=np.add(s.inference_s, [0.0, 9.0, 0.0]),
+    )), SAID, TURN)  # fmt: skip
+    assert far.range_m[0].tolist() == [10.0, 1.0]
