@@ -401,6 +401,8 @@ def test_answers_of_a_strangers_server_are_not_those_of_ones_own(
         assert asked_at([better], file) == "good", "the user says that both serve the same"
         assert asked_at([evil], file) == "evil"
         assert len(better.asked) == 1
+        monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", better.url)
+        assert asked_at([better], file) == "better", "the user says no more of what was kept of the other"
 
 
 def test_an_answer_is_kept_where_one_server_gave_it(file: Path) -> None:

@@ -152,15 +152,18 @@ def _completion(kept: dict[str, Any]) -> Completion:
     return done
 
 
-def _sources(servers: Sequence[str]) -> dict[str, str]:
-    """Return under what the answers of each of several servers are kept, by its address.
+def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
+    """Return under what the answers of each of several servers are kept, by its address, and what is taken.
 
-    That is the address, or `same` if the user says of all that they serve the same.
+    That is the address; or, if the user says of all that they serve the same, the pattern that it fits. Then
+    answers of all patterns of today are taken, and of no others: another day's said nothing of these servers.
     """
-    patterns = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
-    if all(any(fnmatchcase(server, pattern) for pattern in patterns) for server in servers):
-        return dict.fromkeys(servers, "same")
-    return {server: server for server in servers}
+    listed = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
+    fitting = {server: next((p for p in listed if fnmatchcase(server, p)), None) for server in servers}
+    same = {server: f"same as {pattern}" for server, pattern in fitting.items() if pattern is not None}
+    if servers and len(same) == len(fitting):
+        return same, [f"same as {pattern}" for pattern in listed]
+    return {server: server for server in servers}, servers
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
@@ -181,12 +184,11 @@ class Cached:
         self._file: CompletionFile | None = CompletionFile(file)
         self.window = window(backend)
         self._doubt = doubt(backend)
-        self._sources = _sources(several(backend))
+        self._sources, taken = _sources(several(backend))
         # What an answer is kept under, by its source; None where the identity says who answers
         self._identities: dict[str | None, Mapping[str, Any]] = {None: self._identity}
         if self._sources:
-            named = dict.fromkeys(self._sources.values())
-            self._identities = {source: {**self._identity, "source": source} for source in named}
+            self._identities = {source: {**self._identity, "source": source} for source in taken}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         prompts = self.backend.rendered(requests)
