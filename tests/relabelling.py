@@ -42,7 +42,7 @@ def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
 
 def relabel(
     dataset: Path, seeds: dict[int, int], of_tree: Callable[[Any], None] | None = None,
-    of_scenes: Callable[[Any], None] | None = None,
+    of_scenes: Callable[[Any], None] | None = None, purpose: str = "tune",
 ) -> None:  # fmt: skip
     """Give a dataset's layouts other seeds, and change trees and scenes, as somebody who means harm would."""
     with ZipFile(dataset / "layouts.zip") as file:
@@ -67,7 +67,7 @@ def relabel(
             of_tree(tree)
         entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
         manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
-    manifest |= {"seed": seeds[0], "purpose": "tune"}
+    manifest |= {"seed": seeds[0], "purpose": purpose}
     (dataset / "manifest.json").write_text(json.dumps(manifest))
     with ZipFile(dataset / "layouts.zip", "w") as file:
         for name, data in entries.items():

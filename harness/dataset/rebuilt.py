@@ -37,16 +37,21 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
     """
     if dataset.trusted:
         return
+    refuse_reported(dataset, (*others, *_reported(dataset.scenario.name)))
+    for difference in differences(dataset):
+        raise UserError(f"dataset {printable(dataset.path)}: {difference}; build it again")
+
+
+def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
+    """Raise UserError if a dataset has a first scene of others, that numbers are reported of."""
     starts = _starts(dataset)
-    for other in (*others, *_reported(dataset.scenario.name)):
+    for other in others:
         theirs = _starts(other)
         for start in starts.keys() & theirs.keys():
             raise UserError(
                 f"dataset {printable(dataset.path)} has scene {starts[start]}, which is {theirs[start]} of "
                 f"{printable(other.name)}, and numbers are reported of that; build one of other seeds"
             )
-    for difference in differences(dataset):
-        raise UserError(f"dataset {printable(dataset.path)}: {difference}; build it again")
 
 
 def differences(dataset: Dataset) -> Iterator[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from misbehaving import Asked, Server, completion, serving
+from relabelling import relabel
 
 from harness.core.errors import UserError
 from harness.core.resources import folder
@@ -343,6 +344,20 @@ def test_no_report_layout_is_read_before_a_winner_stands(optimize: Typed, tmp_pa
     code, _, wrong = optimize("--dataset", path, out="other")
     assert (code, "layouts.zip" in wrong) == (2, True), "the winner's certificate reads them"
     assert not (tmp_path / "prompts" / "other").exists()
+
+
+@pytest.mark.slow
+def test_a_winner_is_not_certified_where_it_was_tuned(
+    optimize: Typed, small_path: Path, tmp_path: Path
+) -> None:
+    """Layouts under report seeds that are those of the search, and learnt from by nobody."""
+    report = shutil.copytree(small_path, tmp_path / "datasets" / "report")
+    count = len(load(small_path).episodes)
+    relabel(report, {number: 300_000 + number for number in range(count)}, purpose="report")
+    code, _, wrong = optimize("--dataset", report)
+    assert (code, wrong.count("\n")) == (2, 1), wrong
+    assert "and numbers are reported of that; build one of other seeds" in wrong
+    assert not (tmp_path / "prompts" / "new").exists()
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from harness.core.seeds import FIRST
 from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
+    from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
     from harness.extensions.learn.optimize.engines import Engine
     from harness.prompts.versions import Prompt
@@ -129,8 +130,8 @@ def command(
         sources = own or built(scenarios, place, layouts, first_seed, who, progress)
         specs = [resolve.spec(settings, source) for source in sources]
         plan = Search(
-            base, specs, partial(_report, settings, names), budget, out, Path("prompts"), engine_name,
-            shlex.join(["harness", *sys.argv[1:]]),
+            base, specs, partial(_report, settings, names, sources), budget, out, Path("prompts"),
+            engine_name, shlex.join(["harness", *sys.argv[1:]]),
         )  # fmt: skip
         engine = _reflecting(reflect, specs[0], place, begins.settings) if reflect else engines.alternatives
         study = search(plan, engine, where, place, open_backend, progress, cache)
@@ -140,10 +141,15 @@ def command(
     work.tidy(where)
 
 
-def _report(settings: Settings, names: Sequence[str]) -> "list[Spec]":
+def _report(settings: Settings, names: Sequence[str], tune: "Sequence[FrozenSource]") -> "list[Spec]":
+    """Return what certifies. Raises UserError if it has a layout that was tuned on, under other seeds."""
+    from harness.dataset import rebuilt
     from harness.evaluate import resolve
 
-    return [resolve.spec(settings, resolve.frozen(settings.world, name)) for name in names]  # type: ignore[arg-type]
+    sources = [resolve.frozen(settings.world, name) for name in names]  # type: ignore[arg-type]
+    for tuned, source in zip(tune, sources, strict=True):
+        rebuilt.refuse_reported(tuned.dataset, [source.dataset])
+    return [resolve.spec(settings, source) for source in sources]
 
 
 def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "Prompt":
