@@ -57,6 +57,14 @@ def test_another_number_of_probabilities_is_refused() -> None:
         Answers(written([msgspec.structs.replace(ANSWER, scene="a", viewer="v")]), 5)
 
 
+@pytest.mark.parametrize(
+    "intent", [(-1.0, 1.0, 1.0), (0.8, 0.9, 0.3), (0.0, 0.0, 0.0), (1e308, 1e308, 1e308)]
+)
+def test_an_intent_that_is_no_distribution_is_refused(intent: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match=r"answer a/v has an intent that is no distribution"):
+        Answers(written([msgspec.structs.replace(ANSWER, scene="a", viewer="v", intent=intent)]), 3)
+
+
 METRES = st.floats(-1e6, 1e6) | st.sampled_from([-0.0, -0.04, 0.05, 0.25, 12.35])
 SHARES = st.floats(0.0, 1.0) | st.sampled_from([0.005, 0.045, 0.1, 0.125, 0.995])
 SAYS = st.fixed_dictionaries({"evidence": st.none() | NAMES, "risk": st.none() | NAMES, "confidence": SHARES})

@@ -8,7 +8,7 @@ from io import BytesIO
 import msgspec
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import ROUNDING, Floats
 from harness.runs.records import Answer
 
 _ANSWER = msgspec.json.Decoder(Answer)
@@ -44,6 +44,10 @@ class Answers:
             for answer in _ANSWER.decode_lines(line):  # one; none in a blank line
                 if answer.intent is not None and len(answer.intent) != actions:
                     raise ValueError(f"answer {answer.id} has {len(answer.intent)} probabilities")
+                if answer.intent and not (
+                    min(answer.intent) >= 0 and abs(sum(answer.intent) - 1) <= ROUNDING
+                ):
+                    raise ValueError(f"answer {answer.id} has an intent that is no distribution")
                 if answer.heard and answer.role != "merge":
                     raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:

@@ -23,7 +23,7 @@ from harness.extensions.calibration.calibrations import (
     check_seeds,
     question_of,
 )
-from harness.runs.folder import Run, dataset_of, read
+from harness.runs.folder import Run, check_scenes, dataset_of, read
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
 
@@ -83,6 +83,7 @@ def calibrate(
     first, last = int(forest.seeds.min()), int(forest.seeds.max())
     check_seeds(name, first, last)
     rebuilt.refuse(data)
+    check_scenes(run, data)
     fitted = [each for role in ("ego", "helper") if (each := _of_role(run, role, forest, level))]
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")

@@ -1,6 +1,7 @@
 """Calibration: what is fitted on tune layouts, and what it makes of answers."""
 
 import json
+import shutil
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -186,6 +187,19 @@ def test_report_layouts_and_a_name_that_is_taken_are_refused(
     assert (
         "unknown --level" in harness("model", "calibrate", proxy_run, "--level", "l9", "--out", "z.toml")[2]
     )
+
+
+def test_an_answer_in_a_scene_that_the_dataset_has_not_is_one_line(
+    proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path, unrebuilt: None
+) -> None:
+    run = shutil.copytree(proxy_run, tmp_path / "run")
+    line, *_ = (run / "answers.jsonl").read_text().splitlines()
+    scene = json.loads(line)["scene"]
+    with (run / "answers.jsonl").open("a") as file:
+        file.write(line.replace(scene, "00009-0-000000000000") + "\n")
+    code, _, error = harness("model", "calibrate", run, "--dataset", small_path, "--out", "mine.toml")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "has scene '00009-0-000000000000', which its dataset has not" in error
 
 
 @pytest.mark.slow
