@@ -93,7 +93,9 @@ def argument(card: Card) -> str:
         return card.name
     if card.server:
         return f"{card.server.urls[0]}#{card.weights}"
-    return f"replay:{card.weights}" if card.engine == "replay" else card.weights or card.name
+    if card.engine == "replay":
+        return f"replay:{card.weights}"
+    return card.adapter or card.weights or card.name
 
 
 def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:

@@ -13,6 +13,7 @@ from harness.cli.options import as_command
 from harness.cli.progress import bar
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
+from harness.core.strangers import worded
 from harness.runs.exports import EXPORTS, Export, Option, options_of
 
 # Words of the command's own options.
@@ -154,7 +155,8 @@ def command(
             extras.need(option, *(module for module in extras.OPTIONAL if module in format.needs))
             own = {f"--{name}": each for name, each in options_of(format).items()}
             rest = {_word(flag): value for flag, value in typed.items() if own.get(flag) is further[flag]}
-            with bar(format.doing):
+            ours = type(format).__module__.startswith("harness.")
+            with bar(format.doing), worded(f"format {option}", built_in=ours):
                 written = [format.write(source, file, dataset, **rest)]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"

@@ -4,6 +4,7 @@ An extension adds such remarks by `adds={"remarks": {"name": "module:OBJECT"}}`.
 page: each is about one decision point, or leads to some.
 """
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Protocol, runtime_checkable
@@ -45,7 +46,7 @@ def sentences(runs: Runs) -> list[Markup]:
     said: list[Markup] = []
     for name in REMARKS:
         try:
-            said += REMARKS.ask(name, lambda remarks: list(remarks.sentences(runs)))
+            said += REMARKS.ask(name, lambda remarks: [escape(each) for each in remarks.sentences(runs)])
         except Failed as error:
             said.append(escape(visible(str(error))))
     return said
@@ -59,6 +60,13 @@ def left_out(run: Run) -> LeftOut:
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:
         with suppress(Failed):
-            for scene, some in REMARKS.ask(name, lambda remarks: remarks.left_out(run)).items():
+            for scene, some in REMARKS.ask(name, lambda remarks: _plain(remarks.left_out(run))).items():
                 joined.setdefault(scene, []).extend(some)
     return joined
+
+
+def _plain(stated: LeftOut) -> LeftOut:
+    """Return the same. Raises what stands for a failure if a page cannot hold it."""
+    plain = {scene: [dict(each) for each in some] for scene, some in stated.items()}
+    json.dumps(plain, allow_nan=False)
+    return plain

@@ -190,9 +190,12 @@ def _table(stated: Mapping[str, Any]) -> Any:
     if not isinstance(table, Mapping):
         return table  # for the reader to refuse
     said = _flat(table)
+    card = stated.get("model")
+    places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
     for name, there in _flat(beside).items():
         typed = said.get(name, there)
-        if typed != there and not (name in TYPED and _may_be(typed, there)):
+        is_place = name == "model" and typed is not None and typed in places
+        if typed != there and not (name in TYPED and (is_place or _may_be(typed, there))):
             both = f"{printable(said[name], 60)}, and beside them it is {printable(there, 60)}"
             raise ValueError(f"its settings have {name} {both}")
     return _with(SETTINGS, table)

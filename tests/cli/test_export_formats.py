@@ -55,6 +55,16 @@ def test_a_package_adds_a_format_as_an_option_with_further_ones() -> None:
 
 
 @pytest.mark.usefixtures("names")
+def test_a_format_that_fails_is_one_line(proxy_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Names, "write", lambda *given, **options: [][0])
+    usual: dict[str, Any] = {"as_jsonl": False, "out": None, "junit": None, "dataset": None, "as_csv": False}
+    with pytest.raises(
+        UserError, match=r"^format --names-of fails \(IndexError: list index out of range at "
+    ):
+        export.command(run=proxy_run, names_of=Path("names"), most=None, all=False, **usual)
+
+
+@pytest.mark.usefixtures("names")
 def test_a_format_gets_what_was_typed_of_its_options(proxy_run: Path, tmp_path: Path) -> None:
     file = tmp_path / "names"
     usual: dict[str, Any] = {"as_jsonl": False, "out": None, "junit": None, "dataset": None}

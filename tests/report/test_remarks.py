@@ -59,6 +59,32 @@ def test_what_one_says_stands_though_another_fails(runs: Runs, monkeypatch: pyte
     assert remarks.left_out(runs.runs[0])["00000-0"] == [{"item": "v1"}] * 2
 
 
+class Odd:
+    """Raises as it is shown, and has things beside answers that no page can hold."""
+
+    def __init__(self, beside: Any) -> None:
+        self.beside = beside
+
+    def __str__(self) -> str:
+        raise ValueError("no text")
+
+    def sentences(self, runs: Runs) -> list[Any]:
+        return [self]
+
+    def left_out(self, run: Run) -> Any:
+        return self.beside
+
+
+@pytest.mark.parametrize(
+    "beside", [None, {"00000-0": 5}, {"00000-0": [{"shift": float("nan")}]}, {"a": [{"b": {1}}]}]
+)
+def test_what_no_page_can_hold_is_left_out(beside: Any, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked(monkeypatch, odd=Odd(beside), mine=Says())
+    said = [text for text in remarks.sentences(runs) if "said" in text or "odd" in text]
+    assert said == ["odd: its package failed: no text", "<b>said</b> of 1"]
+    assert remarks.left_out(runs.runs[0]) == {"00000-0": [{"item": "v1"}]}
+
+
 def test_a_broken_file_of_the_run_is_an_error(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
     asked(monkeypatch, mine=Fails(UserError("its file is broken")))
     for ask in (lambda: remarks.sentences(runs), lambda: remarks.left_out(runs.runs[0])):
