@@ -235,6 +235,7 @@ def test_hostile_text_stays_text(client: TestClient, reports: Path) -> None:
         reports / name,
         tags=["<script>tag</script>", "\u202egat"],
         model={"name": "</table><script>", "engine": "proxy"},
+        settings={},  # which would have to say the same
     )
     page = client.get('/?q="><script>').text + (listed := client.get("/").text)
     tags: list[tuple[str, dict[str, str | None]]] = []
