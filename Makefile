@@ -33,8 +33,8 @@ results: .venv/dev ## docs/results.md and its picture: hours on a CPU; RESULTS="
 # Two workers; a test over its tier's limit of CPU seconds fails: CONTRIBUTING.md, "A cheap test".
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 
-quick: .venv/dev ## nine tests of ten in a minute: all that are neither slow nor exhaustive
-	$(PYTEST) -m "not slow and not exhaustive" --hypothesis-profile quick --cpu-limit 0.5
+quick: .venv/dev ## nine tests of ten in a minute: neither slow nor exhaustive, nor of extensions that stayed
+	$(PYTEST) --changed -m "not slow and not exhaustive" --hypothesis-profile quick --cpu-limit 0.5
 
 test: check browser ## every check, and every test that is not exhaustive
 	$(PYTEST) -m "not exhaustive" --cpu-limit 6

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from _pytest.runner import runtestprotocol
+from changes import stayed
 from evaluating import run, spec_of
 from former import SCENARIO
 from hypothesis import settings
@@ -64,10 +65,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--cpu-limit", type=float, metavar="S", help=what)
     share = f"of the exhaustive tests, the K-th of {SHARES} shares"
     parser.addoption("--share", type=int, metavar="K", help=share)
+    concerned = "leave out tests of an extension where neither it nor the core differs from main"
+    parser.addoption("--changed", action="store_true", help=concerned)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out files of which no test is run, with the packages that they import."""
+    if collection_path.is_dir() and config.getoption("changed"):
+        return True if stayed(collection_path, config.rootpath) else None
     if collection_path.suffix != ".py" or not collection_path.name.startswith("test_"):
         return None
     chosen, source = config.getoption("markexpr"), text(collection_path)
