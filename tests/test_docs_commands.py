@@ -240,7 +240,7 @@ def difference(shown: str, printed: str) -> str:
 
 
 @pytest.fixture
-def reader(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Harness:
+def reader(harness: Harness, monkeypatch: pytest.MonkeyPatch, svg_alone: None) -> Harness:
     """The command as a reader types it, who sees stdout and stderr in one place."""
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
     from harness.extensions.media.stills import stills

@@ -36,6 +36,8 @@ from harness.report.notes import pace
 from harness.runs import folder
 from harness.runs.records import Latency, Times
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 LANGUAGE_MODEL = "swarm-tiny"
 ROWS = ("decisions.parquet", "episodes.csv", "summary.csv")
 

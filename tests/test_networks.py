@@ -18,6 +18,8 @@ from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 from harness.radio.networks import names, network
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 MINE = """
 description = "Mine."
 source = "my desk"

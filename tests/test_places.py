@@ -13,6 +13,8 @@ from reading import packed
 from harness.report.compare.page import beside
 from harness.runs.folder import read
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 Typed = Callable[..., tuple[int, str, str]]
 CANARY = "canary-in-a-folder"
 SECRET = "letmein"

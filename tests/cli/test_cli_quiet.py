@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 Said = tuple[int, str, str]
 DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
 

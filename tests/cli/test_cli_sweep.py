@@ -11,6 +11,8 @@ from evaluating import spec_of
 
 from harness.dataset.load import Dataset
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 Said = tuple[int, str, str]
 
 

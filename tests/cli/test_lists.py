@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 Typed = Callable[..., tuple[int, str, str]]
 # What is listed, by which command, what else it must have, and a command that needs the wrong one.
 LISTS = {

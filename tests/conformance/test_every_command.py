@@ -38,6 +38,8 @@ IMPORTED = """
 import os, gymnasium
 from highway_env.envs import MergeEnv
 from highway_env.vehicle.behavior import IDMVehicle
+
+pytestmark = pytest.mark.usefixtures("svg_alone")
 open(os.environ["CANARY_FILE"], "a").write("imported\\n")
 class Car(IDMVehicle): pass
 class Canary(MergeEnv): pass
@@ -227,7 +229,7 @@ PLAIN: dict[str, str] = {
     "sweep_episodes": "10", "study schedule learn out": "written.toml", "run export out": "written/file",
     "report out": "written/page.html",
 }  # fmt: skip
-DEAR = ("prompt examples", "study closed-loop", "study paper")  # 2 CPU s and more, whatever they are given
+DEAR = ("prompt examples", "study closed-loop", "study contents", "study paper")  # whatever they are given
 ALWAYS = {"run export": ["--csv"], "study fidelity": ["base/run"], "dataset build": ["--no-audit"]}
 
 

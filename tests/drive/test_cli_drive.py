@@ -6,6 +6,8 @@ import pytest
 
 from harness.runs import folder
 
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
 
 @pytest.mark.slow
 def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):

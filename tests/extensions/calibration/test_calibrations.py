@@ -20,6 +20,8 @@ from harness.extensions.calibration.fitting import TEMPERATURES, fit
 from harness.runs.folder import read
 from harness.world import scenarios
 
+pytestmark = pytest.mark.usefixtures("svg_alone", "unrebuilt")
+
 Typed = Callable[..., tuple[int, str, str]]
 
 
