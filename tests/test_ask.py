@@ -58,7 +58,7 @@ def n_answers(folder: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [frozen(4), LiveSource(1_000_000, 2)], ids=["frozen", "closed loop"])
+@pytest.mark.parametrize("source", [frozen(2), LiveSource(1_000_000, 1)], ids=["frozen", "closed loop"])
 def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
     names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
     for ask in ("all", "used"):
@@ -170,7 +170,7 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
 @pytest.mark.parametrize("ask", ["used", "all"])
 def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    evaluate(spec(frozen(2), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
+    evaluate(spec(frozen(1), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
     watched = Watched()
     list(ReplayedRun(tmp_path / "run", progress=watched).walked(STUDIED[:1], (0,)))
     owed, text, *others = watched.events

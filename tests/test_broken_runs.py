@@ -253,11 +253,11 @@ def test_whatever_the_manifest_says_the_run_is_read_or_refused_in_a_line(
 def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_that_is_read_compared(
     closed_loop: bool, tmp_path: Path
 ) -> None:
-    """Of a run with one condition; where it was driven, at what is said of its world."""
+    """Every other value of a run with one condition; where it was driven, what is said of its world."""
     run = made_up(tmp_path / "run", closed_loop=closed_loop, points=(POINTS["6g"],), episodes=1, steps=1)
     stated = json.loads((run / "run.json").read_text())
     compared = 0
-    for at in places(stated):
+    for at in [*places(stated)][:: 1 if closed_loop else 2]:
         if at[0] == "settings" or (closed_loop and at[0] != "world"):  # the table has tests of its own
             continue
         fresh = True
@@ -266,7 +266,7 @@ def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_th
             assert said.replace("\n", "").isprintable()
             compared += is_read and fresh
             fresh = fresh and not is_read
-    assert compared > (1 if closed_loop else 40)
+    assert compared > (1 if closed_loop else 20)
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 3, 5, 10**9])

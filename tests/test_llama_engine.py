@@ -254,7 +254,7 @@ def in_mode(request: Request, answer: Any) -> Request:
     messages = request.messages
     if answer == "readout":
         messages = readout.asked(messages, request.actions)
-    return replace(request, answer=answer, messages=messages, max_tokens=64)
+    return replace(request, answer=answer, messages=messages, max_tokens=32)
 
 
 @pytest.mark.parametrize("answer", ["json", "constrained", "readout"])

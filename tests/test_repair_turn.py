@@ -192,7 +192,7 @@ def test_a_hostile_answer_is_one_turn_for_the_model_that_ships(small: Dataset) -
     [sent] = model.rendered(backend.requests[-1:])  # type: ignore[attr-defined]
     ids = tokenizer.encode(sent, add_special_tokens=False).ids
     assert (ids.count(begins), ids.count(ends)) == (5, 4), "system, user, assistant, user; and it is asked"
-    assert model.complete(backend.requests[-1:])[0].error is None
+    assert model.complete([backend.requests[-1].alike(max_tokens=4)])[0].error is None
 
 
 def test_what_is_wrong_is_quoted_as_text_too(small: Dataset) -> None:

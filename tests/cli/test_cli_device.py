@@ -22,8 +22,8 @@ Said = tuple[int, str, str]
 def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the model that ships, each answer asked alone."""
     out = tmp_path_factory.mktemp("runs") / "alone"
-    points = (POINTS["single-local"],)
-    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, ask="all", limit=1), out)
+    points = (POINTS["6g"],)
+    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, limit=1), out)
     return out
 
 

@@ -63,6 +63,7 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unrebuilt")
 def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     out_folder = tmp_path / "two-v1"
     code, out, _ = harness(

@@ -35,7 +35,7 @@ def test_together_is_as_alone(scenario):
 @pytest.mark.parametrize("name", ["occluded-intersection", "roundabout-entries"])
 def test_a_few_together_are_as_alone(name):
     """Straight lanes and a circle, and traffic that comes to a stop."""
-    drive_apart_and_together(scenarios.get(name), worlds=4)
+    drive_apart_and_together(scenarios.get(name), worlds=3)
 
 
 def drive_apart_and_together(scenario, worlds):

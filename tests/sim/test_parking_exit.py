@@ -74,7 +74,7 @@ def test_it_waits_for_who_meets_it_and_for_nobody_who_comes_long_after_or_the_ot
 @pytest.mark.slow
 def test_a_danger_hits_an_ego_that_does_not_know_of_it():
     dangerous = [seed for seed, found in LAYOUTS.items() if found.danger]
-    for seed in dangerous[:3]:
+    for seed in dangerous[:2]:
         assert drive(SCENARIO, "cruise", seed).partner == LAYOUTS[seed].danger_id
         assert drive(SCENARIO, "full-view", seed).success
 

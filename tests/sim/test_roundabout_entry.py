@@ -89,7 +89,7 @@ def test_where_it_goes_decides_and_its_indicator_tells():
 @pytest.mark.slow
 @pytest.mark.parametrize("sector", ["left", "oncoming"])
 def test_a_danger_hits_an_ego_that_does_not_know_of_it(sector):
-    for seed in seeds(sector)[:2]:
+    for seed in seeds(sector)[:1]:
         assert drive(SCENARIO, "cruise", seed).partner == LAYOUTS[seed].danger_id
         assert drive(SCENARIO, "full-view", seed).success
 

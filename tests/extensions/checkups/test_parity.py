@@ -27,7 +27,7 @@ from harness.extensions.checkups.parity import PASSES, Finding, compare
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
-PROMPTS = 2
+PROMPTS = 1
 
 
 @pytest.fixture(scope="module")
