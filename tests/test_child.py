@@ -78,6 +78,7 @@ def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child.close()
 
 
+@pytest.mark.exhaustive
 def test_an_exit_is_a_death_too(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     assert [c.error for c in child.complete([ask("exit")])] == ["engine died: exit code 3"]
@@ -187,7 +188,11 @@ def interruptible() -> Iterator[None]:
 
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
-    "blow", [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.exhaustive)]
+    "blow",
+    [
+        signal.SIGKILL,
+        *(pytest.param(each, marks=pytest.mark.exhaustive) for each in (signal.SIGINT, signal.SIGTERM)),
+    ],
 )
 def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Signals) -> None:
     """Ctrl-C goes to all processes of a terminal: the engine's hears nothing, and says nothing."""

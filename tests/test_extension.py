@@ -12,6 +12,7 @@ import pytest
 from corpus import ACTIONS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -232,8 +233,7 @@ def test_a_version_says_what_it_adds_and_has_room_for_it(copied: Path) -> None:
         assert valid(shape, json.dumps(plainest(answer_schema(**shape._asdict()))))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+@pytest.mark.parametrize("engine", some(["transformers"], exhaustive=["llama-cpp"]))
 def test_a_real_model_fills_in_what_a_version_adds(engine: str, copied: Path) -> None:
     pytest.importorskip({"transformers": "torch", "llama-cpp": "llama_cpp"}[engine])
     mine = versions.load("mine", copied)

@@ -10,6 +10,7 @@ import pytest
 from evaluating import all_scenes, run, same_decisions, spec_of, with_ego
 from former import SCENARIO
 from run_on_disk import answers_of
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Completion, Letters, Request
@@ -126,8 +127,7 @@ def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, smal
     assert any(sure)
 
 
-@pytest.mark.slow
-@LETTERS
+@pytest.mark.parametrize("letters", some(["cyclic"], exhaustive=["raw"]))
 def test_a_run_and_its_replay_count_it_and_decide_as_without(
     letters: Letters, small: Dataset, tmp_path: Path
 ) -> None:
@@ -189,14 +189,15 @@ def test_helpers_are_flipped_where_they_read_out() -> None:
         assert helpers[0].settings().get("flip", False) == flips
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [("eval", "--limit", "1"), ("drive", "--episodes", "1")])
+@pytest.mark.parametrize(
+    "command", some([(("eval", "--limit", "1"),)], exhaustive=[(("drive", "--episodes", "1"),)])
+)
 def test_the_terminal_says_how_often_beside_the_letter(
     command: tuple[str, ...], harness: Callable[..., Said], tmp_path: Path
 ) -> None:
-    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    pytest.importorskip("torch", reason="needs the transformers extra")
     code, out, err = harness(
-        *command, "--model", "swarm-tiny", "--prompt", "v4", "--answer", "readout", "--flip",
+        *command, "--model", "swarm-tiny:transformers", "--prompt", "v4", "--answer", "readout", "--flip",
         "--seeds", "0:1", "--condition", "single-local", "--out", str(tmp_path / "run"),
     )  # fmt: skip
     assert code == 0, err

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from misbehaving import Asked, completion, read_out, serving
+from tiers import some
 
 from harness import cli
 from harness.backends import cards
@@ -119,8 +120,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
+@pytest.mark.parametrize("engine", some(["transformers"], exhaustive=["llama-cpp"]))
 def test_a_check_shows_prompt_tokens_thinking_and_a_decision_in_each_way_of_answering(
     engine: str, tiny: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,19 +62,20 @@ READERS = {
 }
 
 
-# A run of each kind, and one of each commit; a page of the others is in `make exhaustive`.
-REPORTED = ("356ad2b/drive", "356ad2b/proxy", "8cccefb/mixed", "0103f23/attack")
+# A run of each kind, and one of each commit. Of the others `run check` reads all that there is, and the
+# other commands do in `make exhaustive`.
+SOME = ("356ad2b/drive", "356ad2b/proxy", "8cccefb/mixed", "0103f23/attack")
+
+
+def tier(run: str, command: str) -> tuple[pytest.MarkDecorator, ...]:
+    if run not in SOME and command != "check":
+        return (pytest.mark.exhaustive,)
+    return (pytest.mark.slow,) if command == "report" else ()
 
 
 @pytest.mark.parametrize(
     ("run", "command"),
-    [
-        *((run, command) for run in RUNS for command in READERS if command != "report"),
-        *(
-            pytest.param(run, "report", marks=pytest.mark.slow if run in REPORTED else pytest.mark.exhaustive)
-            for run in RUNS
-        ),
-    ],
+    [pytest.param(run, command, marks=tier(run, command)) for run, command in product(RUNS, READERS)],
 )
 def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None:
     code, _, error = harness(*READERS[command].format(run=HERE / run).split())
@@ -107,6 +108,7 @@ USUAL = {
 }
 
 
+@pytest.mark.usefixtures("svg_alone")
 @pytest.mark.parametrize(
     ("run", "command"),
     [

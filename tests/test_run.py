@@ -71,7 +71,7 @@ def test_the_batch_size_changes_no_byte_of_the_proxys_run(
         pytest.param(1, 99, 1, marks=pytest.mark.exhaustive),
         pytest.param(3, 99, 1, marks=pytest.mark.slow),
         pytest.param(1, 99, 2, marks=pytest.mark.exhaustive),
-        pytest.param(9, 1, 1, marks=pytest.mark.slow),
+        pytest.param(9, 1, 1, marks=pytest.mark.exhaustive),
         pytest.param(1, 1, 2, marks=pytest.mark.slow),
     ],
 )
@@ -124,13 +124,12 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:
     data, runs, tables = load(small_path, limit=1), {}, {}
-    for batch_size in (1, 3, 64):
+    for batch_size in (1, 3):
         spec = tiny_spec(tiny, data, batch_size=batch_size)
         done = walked(spec, open_backend(spec.ego.card, device="cpu", dtype="float32", batch_size=batch_size))
         runs[batch_size], tables[batch_size] = without_company(list(done.answers)), done.decisions.table
-    assert runs[1] == runs[3] == runs[64]
+    assert runs[1] == runs[3]
     assert tables[1].equals(tables[3])
-    assert tables[1].equals(tables[64])
     assert {a.finish_reason for a in runs[1]} >= {"length", "error"}
     assert len({a.raw for a in runs[1]}) > 5, "answers that are all alike would show no order"
 

@@ -12,6 +12,7 @@ import pytest
 from evaluating import FILES, run, same_files, spec_of, walked, with_ego
 from killed_run import PLACES, TREES_AT_ONCE, WALKS_AT_ONCE, at, killed_at, spec_to_kill
 from run_on_disk import answers_of
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
@@ -76,8 +77,10 @@ def test_killed_at_any_time_and_resumed_it_is_the_same_run(
         _becomes_whole(out, killed / "whole", to_kill)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("place", PLACES)
+SOME = ("between two parts", "while a part is written", "while the work is cleared away")
+
+
+@pytest.mark.parametrize("place", some(SOME, exhaustive=[place for place in PLACES if place not in SOME]))
 def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
     place: str, whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path
 ) -> None:

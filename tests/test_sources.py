@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from reading import details
+from tiers import some
 
 from harness import cli
 from harness.core.errors import UserError
@@ -117,8 +118,7 @@ def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -
         assert found.sha256 == agent["prompt"]["sha256"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gone", ["edited", "deleted"])
+@pytest.mark.parametrize("gone", some(["deleted"], exhaustive=["edited"]))
 def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, harness: Typed) -> None:
     assert harness("report", "reports/run", "--full")[0] == 0
     page = Path("reports/run/report.html")

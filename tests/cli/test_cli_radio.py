@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
+from tiers import some
 
 from harness.cli.terminal import attributes
 from harness.coordination.operating_point import named_point
@@ -102,13 +103,7 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
         assert point["round_trip"]["value"] <= point["crossing"]["value"]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.exhaustive if name == "mode2" else pytest.mark.slow)
-        for name in PHYSICAL
-    ],
-)
+@pytest.mark.parametrize("name", some(PHYSICAL[:1], exhaustive=PHYSICAL[1:]))
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(
     harness: Callable[..., Said], name: str
 ) -> None:

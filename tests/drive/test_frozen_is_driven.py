@@ -16,6 +16,7 @@ import former
 import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
+from tiers import some
 
 from harness.coordination.contents import OF_HELPERS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
@@ -105,13 +106,7 @@ def test_what_the_tree_says_is_what_driving_gives(
 CONFLICTS = ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet")
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        *(pytest.param(model, marks=pytest.mark.slow) for model in ("cruise", "full-view", "proxy")),
-        *(pytest.param(model, marks=pytest.mark.exhaustive) for model in ("brake", "local-view")),
-    ],
-)
+@pytest.mark.parametrize("model", some(["cruise", "proxy"], exhaustive=["full-view", "brake", "local-view"]))
 def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset, model: str) -> None:
     """Of each decision and episode, on a tree that is built today; the shipped ones are older."""
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}

@@ -17,7 +17,7 @@ from harness.world.scenario import Scenario
 
 SCENES = [f"{name}:agent_share=1" for name in scenarios.names() if scenarios.get(name).seats]
 TWO = "all-way-crossing:agent_share=1"
-FEW = (TWO, "platoon-merge:agent_share=1")
+FEW = (TWO,)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def remembered(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]
     return DRIVEN[key]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
     [by_policy] = remembered(scenarios.get(TWO), [2])
     assert tuple(by_policy) == policies.POLICIES
