@@ -22,6 +22,7 @@ from harness.evaluate.asking import EGO, requests
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import scenes_of
 from harness.evaluate.run import evaluate
+from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.report.decisions import failures
 from harness.report.page import render
@@ -131,24 +132,31 @@ def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
     assert scores["6g", "arrived_rate"] == pytest.approx(mean)
 
 
-@pytest.mark.slow
-def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def beside_few() -> Spec:
+    """Two episodes, in one of which nobody beside the ego decides."""
     points = named_point("6g"), named_point("6g:schedule=always,content=plan,consensus=auction")
     source = LiveSource(200_003, 2, "all-way-crossing:agent_share=0.2")
-    spec = replace(live_spec_of(prompt="v4", seeds=(0,)), source=source, points=points)
-    run(spec, tmp_path / "together")
-    there = load(tmp_path / "together")
+    return replace(live_spec_of(prompt="v4", seeds=(0,)), source=source, points=points)
+
+
+@pytest.mark.slow
+def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(tmp_path: Path) -> None:
+    run(beside_few(), tmp_path / "run")
+    there = load(tmp_path / "run")
     assert (there.episodes.groupby("episode").agents.first() == [1, 2]).all()
     assert there.decisions.agent.notna().all()
     assert len(there.agents) == there.episodes.agents.sum()
 
+
+@pytest.mark.exhaustive
+def test_episodes_of_one_agent_and_of_two_are_driven_together_as_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(beside_few(), tmp_path / "together")
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
-    run(spec, tmp_path / "each")
-    assert {name: (tmp_path / "each" / name).read_bytes() for name in FILES} == {
-        name: (tmp_path / "together" / name).read_bytes() for name in FILES
-    }
+    run(beside_few(), tmp_path / "each")
+    for name in FILES:
+        assert (tmp_path / "each" / name).read_bytes() == (tmp_path / "together" / name).read_bytes()
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
     assert two == one
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
     spec = live_spec_of(episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,))
     name = f"{NAME},perfect_knowledge=true"
@@ -204,10 +204,10 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, text):
 
 @pytest.mark.slow
 def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path):
-    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
+    pytest.importorskip("torch", reason="needs the transformers extra")
     point = named_point("6g:consensus=ego-prompt")
     of = live_spec_of(
-        "swarm-tiny", episodes=1, points=(point,), seeds=(0,), first_seed=FROM_LEFT,
+        "swarm-tiny:transformers", episodes=1, points=(point,), seeds=(0,), first_seed=FROM_LEFT,
         latency="paper",
     )  # fmt: skip
     run(of, tmp_path / "run")

@@ -456,7 +456,7 @@ def test_its_dataset_is_sound_and_pins_its_configuration(folder):
         load(changed)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_equal_builds_are_equal_bytes(folder, tmp_path):
     """The manifest has the digests of all bytes of each layout."""
     build(scenarios.get(f"{OWN}:decisions=2,helpers=2"), tmp_path / "breakdown", 1, 0, 1, lambda done: None)

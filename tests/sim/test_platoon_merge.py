@@ -121,7 +121,7 @@ def test_a_car_on_the_left_lane_is_nobodys_business():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(EGO, structs.replace(OTHER, x_m=-50.0)))) == "SLOWER"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
     met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]

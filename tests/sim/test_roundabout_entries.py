@@ -173,7 +173,7 @@ def test_an_agent_has_cleared_where_it_has_left_the_ring_past_the_next_entry(arm
     assert path.arc_m[reached.argmax()] == pytest.approx(goal_m)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
     met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]

@@ -149,6 +149,7 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
     assert danger.tolist() == [1.0, 0.0, 0.0]
 
 
+@pytest.mark.exhaustive
 def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
     """Played again in the simulator, action by action, from the start."""
     for each in few:
