@@ -36,7 +36,7 @@ EXTENSIONS = Path(cli.__file__).parents[1] / "extensions"  # without them the co
 Once = Callable[[str, Callable[[Path], object]], Path]
 
 # A loaded machine is no failure, and what CI finds must be there to be found again.
-settings.register_profile("harness", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("harness", deadline=None, derandomize="CI" in os.environ, max_examples=50)
 settings.register_profile("quick", settings.get_profile("harness"), max_examples=20)
 settings.load_profile("harness")
 
