@@ -298,7 +298,7 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     extension = known.extensions()[name]
     assert ENTRIES[known.GROUP][name] == f"{PACKAGES}{name}:EXTENSION"
     for group, names in (
-        (known.COMMANDS, extension.commands),
+        (known.COMMANDS, [*extension.commands, *extension.spellings, *extension.short]),
         (known.STUDIES, extension.studies),
         (known.NAMES, extension.adds.get("python", {})),
     ):
@@ -336,6 +336,14 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
+def in_the_core(core: Path, folder: Path, code: str) -> "subprocess.CompletedProcess[str]":
+    """Run Python code in a process whose `harness` has no extensions, with the packages of this one."""
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(core), *sys.path])}, check=True,
+    )  # fmt: skip
+
+
 @pytest.mark.slow
 def test_the_core_writes_the_same_run_without_extensions(
     core: Path, two_path: Path, harness: Typed, tmp_path: Path
@@ -349,14 +357,24 @@ def test_the_core_writes_the_same_run_without_extensions(
     assert in_process([core], tmp_path, "--help")[0] == 0
 
 
-@pytest.mark.parametrize("command", ["serve"])
-def test_a_command_that_is_gone_says_what_it_was_part_of(core: Path, tmp_path: Path, command: str) -> None:
-    code, out, err = in_process([core], tmp_path, *command.split())
-    assert (code, out) == (2, "")
-    extension = ENTRIES[known.COMMANDS][command].rpartition(".")[2]
-    assert err.startswith(
-        f"harness: `harness {command}` is part of the extension {extension}, which is not installed in "
+def test_whatever_is_typed_of_an_extension_that_is_gone_says_what_it_was_part_of(
+    core: Path, tmp_path: Path
+) -> None:
+    """Old and short spellings, too."""
+    code = (
+        "import sys\nfrom harness.__main__ import main\n"
+        f"for words in {[*ENTRIES[known.COMMANDS]]!r}:\n"
+        "    sys.argv = ['harness', *words.split()]\n"
+        "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
     )
+    done = in_the_core(core, tmp_path, code)
+    said = done.stderr.splitlines()
+    assert done.stdout.split() == ["2"] * len(said)
+    for (command, place), line in zip(ENTRIES[known.COMMANDS].items(), said, strict=True):
+        group_too = command.startswith("benchmark ")
+        typed = "benchmark" if group_too else command
+        part = f"is part of the extension {place.rpartition('.')[2]}, which is not installed in "
+        assert line.startswith(f"harness: `harness {typed}` {part}")
 
 
 @pytest.mark.parametrize("name", ENTRIES[known.NAMES])
@@ -367,10 +385,7 @@ def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
         f"import harness\nprint(dir(harness))\ntry:\n    harness.{name}\n"
         "except harness.UserError as error:\n    print(error)\nassert not hasattr(harness, 'absent')\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(core)}, check=True,
-    )  # fmt: skip
+    done = in_the_core(core, tmp_path, code)
     names, said = done.stdout.splitlines()
     assert f"'{name}'" not in names
     extension = ENTRIES[known.NAMES][name].rpartition(".")[2]
