@@ -7,25 +7,19 @@ installs it: `need` checks before long work, and `without` builds the error of a
 from importlib.util import find_spec
 
 from harness.core.errors import UserError
+from harness.core.plugins import Plugins
 
 # The package and its extra, by the module that is imported.
-OPTIONAL = {
+OPTIONAL = Plugins[tuple[str, str]]("swarmdrive.extras", tuple, {
     "highway_env": ("highway-env", "sim"),
     "matplotlib": ("matplotlib", "report"),
     "PIL": ("pillow", "report"),
-    "sklearn": ("scikit-learn", "audit"),
-    "inspect_ai": ("inspect-ai", "inspect"),
-    "imageio_ffmpeg": ("imageio-ffmpeg", "video"),
     "ray": ("ray", "ray"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "sparrow_decider": ("sparrow-decider", "sparrow"),
     "torch": ("torch", "transformers"),
     "transformers": ("transformers", "transformers"),
-    "gepa": ("gepa", "gepa"),
-    "mlflow": ("mlflow-skinny", "mlflow"),
-    "trackio": ("trackio", "trackio"),
-    "wandb": ("wandb", "wandb"),
-}
+})  # fmt: skip
 
 
 def install(extra: str) -> str:

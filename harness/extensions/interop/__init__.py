@@ -4,9 +4,21 @@ from harness.core.extensions import Extension
 
 _HERE = "harness.extensions.interop"
 
+# The package of each program, and its extra.
+INSPECT = ("inspect-ai", "inspect")
+MLFLOW = ("mlflow-skinny", "mlflow")
+TRACKIO = ("trackio", "trackio")
+WANDB = ("wandb", "wandb")
+
 EXTENSION = Extension(
     name="interop",
     adds={
+        "extras": {
+            "inspect_ai": f"{_HERE}:INSPECT",
+            "mlflow": f"{_HERE}:MLFLOW",
+            "trackio": f"{_HERE}:TRACKIO",
+            "wandb": f"{_HERE}:WANDB",
+        },
         "exports": {"inspect": f"{_HERE}.exports:INSPECT"},
         "hooks": {
             "mlflow": f"{_HERE}.trackers.mlflow:TRACKER",

@@ -4,6 +4,8 @@ from harness.core.extensions import Extension
 
 _HERE = "harness.extensions.learn"
 
+GEPA = ("gepa", "gepa")
+
 EXTENSION = Extension(
     name="learn",
     commands={
@@ -15,6 +17,7 @@ EXTENSION = Extension(
     studies={"optimize": "optimize"},
     adds={
         "exports": {"sft": f"{_HERE}.training.exports:SFT", "dpo": f"{_HERE}.training.exports:DPO"},
+        "extras": {"gepa": f"{_HERE}:GEPA"},
         "python": {"environment": f"{_HERE}.rewards.python_api:environment"},
     },
 )
