@@ -24,7 +24,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, sayable, unknown
 from harness.core.files import bytes_of, text_of
 
-DISTILLED = "training.json"  # stands beside weights that were distilled here
+TAUGHT = "training.json"  # stands beside weights that were taught here
 SERVED = ("http", "https", "openai")  # what a served model begins with, before a colon
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
@@ -284,8 +284,8 @@ def _thinking(checkpoint: Path) -> Thinking:
 
 
 def _letters(weights: Path) -> Letters | None:
-    """Return `raw` for what was distilled here: its training used one order of the letters."""
-    return "raw" if (weights / DISTILLED).is_file() else None
+    """Return `raw` for what was taught here: its training used one order of the letters."""
+    return "raw" if (weights / TAUGHT).is_file() else None
 
 
 def _vision(text: str, checkpoint: Path) -> Vision | None:

@@ -52,14 +52,14 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "study": "Vary settings: sweeps, contents, attacks, schedules, grids.",
+    "study": "Vary settings: sweeps, contents, attacks, schedules.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
-    "run": "List finished runs; check, merge, export or film them.",
-    "model": "List, download, test and train models; list on-board computers.",
+    "run": "List finished runs; check, merge or export them.",
+    "model": "List and download models; list on-board computers.",
     "model device": "List on-board computers, show or check one, or measure energy.",
-    "prompt": "List prompts; show, check, compare, improve or release them.",
+    "prompt": "List prompts; show, compare, release them; parse answers.",
     "dataset": "Build, check, show, rank, export datasets; list scenarios.",
-    "dataset scenario": "List scenarios, show one, drive or audit it.",
+    "dataset scenario": "List scenarios, show or drive one.",
     "radio": "List radios, show or check one; show what messages take.",
 }
 

@@ -145,7 +145,7 @@ Tracker = Annotated[
     list[str] | None,
     Option(
         metavar="NAME",
-        help="Keep the run in a tracker as well: mlflow, trackio, wandb, or one that a package adds. "
+        help="Tracker that keeps the run as well; a wrong name lists those that are installed. "
         "Repeatable. Default: those in SWARMDRIVE_TRACKERS.",
         rich_help_panel=stated.OUTPUT,
     ),

@@ -96,7 +96,7 @@ class Part(Struct, frozen=True, kw_only=True):
         """Return why it cannot be played in a run, and what to do; None if it can."""
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
-        """Return what a run keeps of what it names, by folder, such as `calibrations`, and by name."""
+        """Return what a run keeps of what it names, by folder and by name."""
         return {}
 
     def before(self, intents: "Intents") -> "Intents":

@@ -1,9 +1,8 @@
-"""Locate prompts, models, channels, devices, networks, schedules, calibrations, datasets and the like.
+"""Locate prompts, models, channels, devices, networks, schedules, datasets and the like.
 
 They ship with the harness, at the checkout's top level or inside the wheel. A folder with a file
 `swarmdrive.toml` is a project: if it is the current directory, its own `prompts/`, `models/`, `channels/`,
-`devices/`, `networks/`, `schedules/`, `calibrations/` and `datasets/` are searched as well, and so is what
-extensions keep so.
+`devices/`, `networks/`, `schedules/` and `datasets/` are searched as well, and so is what extensions keep so.
 """
 
 import os

@@ -194,8 +194,8 @@ def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
     """Return what `paired_difference` does of one part, with an interval from the two of `rate_interval`.
 
-    It is wider, above all as a mean of several (`mean_of`), and stays for what was computed with it: the
-    edition v2v-safety-1.0. The ends of both intervals are combined by the correlation over episodes (Newcombe
+    It is wider, above all as a mean of several (`mean_of`), and stays for what was computed with it
+    (`runs/pinned.py`). The ends of both intervals are combined by the correlation over episodes (Newcombe
     1998, method 10; Zou and Donner 2008). The correlation includes two more pairs that differ, one each way
     (as in Bonett and Price 2012): even if all pairs agree, a few of other episodes might not. Both are `(E,)`
     or `(E, ...)`, with the same episodes; a pair in which either is NaN is excluded.

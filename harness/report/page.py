@@ -56,7 +56,7 @@ def write_report(
         progress: called with the number of scenes just packed.
         workers: who packs the scenes of a report of many; `prompts` can be pickled then.
         full: whether it also has the prompts that rules do not read, and the camera pictures of every
-            decision, not only those of models that see. `harness view` shows both of one decision at a time.
+            decision, not only those of models that see.
 
     Returns:
         The file written.

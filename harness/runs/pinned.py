@@ -1,4 +1,4 @@
-"""Differences of success as older runs state them, and as the edition v2v-safety-1.0 pins them.
+"""Differences of success as older runs state them, and as what is pinned to these computes them.
 
 Each half of each family has an interval of its own (`rate_difference`), and these are combined. Taken
 together, the same differences have a narrower one: `success.mean_difference`.

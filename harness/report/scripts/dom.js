@@ -40,7 +40,7 @@ function block(n) {
   return blocks.get(n);
 }
 
-// What `harness view` put into the page: all there is of some decisions, by scene.
+// What a server put into the page that it opened: all there is of some decisions, by scene.
 const opened = document.getElementById("opened") ? unpacked("opened").then(JSON.parse) : {};
 
 // The one way to write a number: with so many decimals and its unit; a dash where it is not known.

@@ -71,7 +71,7 @@ class List {
     this.show();
   }
 
-  // No submission: a page in a sandbox, as `harness view` shows it, has none.
+  // No submission: a page that a server shows in a sandbox has none.
   pressed(event) {
     if (event.key !== "Enter") return;
     event.preventDefault();

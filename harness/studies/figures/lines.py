@@ -38,7 +38,7 @@ def along(
 ) -> Figure:
     """Draw success along one axis a panel, several sources in one, with loss or trigger rate beside it.
 
-    Panels are parts of a study's summary. With the paper's values (`ledger.marks`), its best band of tau is
+    Panels are parts of a study's summary. With the paper's values, as in `bars`, its best band of tau is
     drawn. Conditions have their own colours, or those of `colours`; of several sources, each curve has one.
     """
     width = max(2.5 * len(panels) + 0.2, LEAST_IN)

@@ -209,7 +209,7 @@ def _base(
         raise UserError(f"--report {report:g}: give 0 to {MOST}")
     adapt = (rank or RANK if lora else None, rate or RATES[lora], dtype, REPORT if report is None else report)
     folder = Path(text or "")
-    ours = (cards.DISTILLED, "model.safetensors", "tokenizer.json")
+    ours = (cards.TAUGHT, "model.safetensors", "tokenizer.json")
     if text and not lora and all((folder / name).is_file() for name in ours):
         start: Path | None = folder
     elif text:

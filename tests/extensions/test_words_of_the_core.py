@@ -1,0 +1,120 @@
+"""The core's texts: no code, docstring, comment or page of it names what an extension has."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from harness.cli.commands import COMMANDS, GROUPS, OLD
+from harness.core.extensions import Extension, extensions
+
+HARNESS = Path(__file__).parents[2] / "harness"
+WORD = re.compile(r"[a-z]+(?:-[a-z]+)*")
+BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and ends of lines
+
+# Names of extensions that the core has for something of its own.
+ORDINARY = {
+    "attribute": "of a Python object",
+    "benchmark": "what a published dataset is tagged as",
+    "calibration": "how far probabilities are what they say, a metric",
+    "closed-loop": "the world that is driven, beside the frozen one",
+    "decide": "what vehicles do",
+    "environment": "one of highway-env, and a variable of the shell",
+    "examples": "what a prompt shows as earlier turns",
+    "failures": "episodes and answers that failed",
+    "grid": "the values of a sweep, and the episodes of a run by seed",
+    "history": "of a browser's tab",
+    "inspect": "Python's module",
+    "media": "a rule of style sheets",
+    "notes": "what is kept beside a scene, and Python's of an exception",
+    "optimize": "SciPy's module",
+    "pack": "what is sent to another process",
+    "paper": "the one whose method this is",
+    "proxy": "the rule that stands for a model",
+    "read-outs": "of a policy from a model's probabilities",
+    "seeds": "of layouts, channels and sampling",
+    "serve": "what a server does with a model",
+    "tells": "a verb",
+    "verify": "the check of a dataset",
+    "view": "what a vehicle sees",
+}
+# Messages, help and starter files that lead on to a command, which says whose it is where it is gone.
+LEADS_ON = {
+    ("backends/llama_cpp/backend.py", "model check"),
+    ("cli/dataset.py", "study fidelity"),
+    ("cli/device.py", "model doctor"),
+    ("cli/starter/README.md", "model doctor"),
+    ("cli/starter/models/my-model.toml", "model check"),
+    ("evaluate/spec.py", "prompt examples"),
+    ("evaluate/timing.py", "model check"),
+    ("prompts/examples.py", "prompt examples"),
+    ("report/caveats.py", "study fidelity"),
+    ("report/compare/pair.py", "study fidelity"),
+    ("report/scripts/decision.js", "harness view"),
+    ("report/scripts/decision.js", "run video"),
+}
+# Old folders of a study had this file in place of its manifest, and are listed.
+OLD_FOLDERS = {("runs/listing.py", "fidelity")}
+
+
+def typed(extension: Extension) -> set[str]:
+    """Return what is typed for an extension's commands, older spellings and groups included."""
+    return {*extension.commands, *extension.groups, *extension.spellings, *extension.short}
+
+
+def names(extension: Extension) -> set[str]:
+    """Return every single word that an extension gives a thing."""
+    given = {extension.name, *extension.settings, *extension.studies}
+    words = {word for path in typed(extension) for word in path.split()}
+    added = {name for table in extension.adds.values() for name in table}
+    return given | words | added
+
+
+def phrases(extension: Extension) -> Iterator[str]:
+    """Yield what is said of an extension in several words, and the marks of its studies."""
+    for command in typed(extension):
+        yield command if " " in command else f"harness {command}"
+    for kind in extension.studies:
+        yield f"{kind}.json"
+    for text in ("extension {}", "extensions.{}", "extensions/{}"):
+        yield text.format(extension.name)
+
+
+def words_of_the_core() -> set[str]:
+    """Return the words of its commands, and of its kinds of plug-ins that extensions add to."""
+    commands = {word for path in (*COMMANDS, *GROUPS, *OLD) for word in path.split()}
+    rooms = {path.name for path in HARNESS.iterdir()}
+    kinds = {kind.removesuffix("s") for extension in extensions().values() for kind in extension.adds}
+    return commands | rooms | kinds
+
+
+def texts() -> Iterator[tuple[str, str]]:
+    """Yield the core's files, each with its text in small letters."""
+    for file in sorted(HARNESS.rglob("*")):
+        path = file.relative_to(HARNESS)
+        if file.is_file() and path.parts[0] != "extensions" and file.suffix not in (".pyc", ".csv"):
+            parted = re.sub("(?<=[a-z])(?=[A-Z])", "_", file.read_text())
+            yield path.as_posix(), parted.lower()
+
+
+def found() -> Iterator[tuple[str, str]]:
+    """Yield each file of the core with a name in it that is an extension's."""
+    ours = set().union(*map(names, extensions().values())) - words_of_the_core()
+    spoken = sorted({phrase for extension in extensions().values() for phrase in phrases(extension)})
+    said = re.compile(rf"\b({'|'.join(map(re.escape, spoken))})\b")
+    for path, text in texts():
+        for name in {*WORD.findall(text)} & ours:
+            yield path, name
+        for phrase in said.findall(BETWEEN.sub(" ", text)):
+            yield path, phrase
+
+
+@pytest.mark.slow
+def test_the_core_names_nothing_of_an_extension() -> None:
+    there = set(found())
+    words = {(path, word) for path, command in LEADS_ON for word in command.split()}
+    others = there - LEADS_ON - words - OLD_FOLDERS
+    assert not {(path, name) for path, name in others if name not in ORDINARY}
+    assert there >= LEADS_ON | OLD_FOLDERS
+    assert {name for _, name in there} >= set(ORDINARY), "a word that is no exception any more"
