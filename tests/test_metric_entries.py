@@ -33,6 +33,9 @@ SURE = Metric("sure_rate", "share of decisions that are sure", Unit("%", 1, 100.
 OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"])
 FIRST = Metric("first", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], primary=True)
 NOTHING = Metric("nothing", "", Unit(), "lower")
+UNITLESS = Metric("unitless", "", None, "lower", decisions=lambda d: d["entropy_nats"])
+SIDEWAYS = Metric("sideways", "", Unit(), "sideways", decisions=lambda d: d["entropy_nats"])
+MOON = Metric("moon", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], world="moon")
 
 
 def bad(name, values):
@@ -155,6 +158,9 @@ def test_another_metric_changes_no_corrected_p(tmp_path: Path, monkeypatch: pyte
         ("odd = by_hand:PACKAGE", "'odd' .*does not load"),
         ("mine = by_hand:OTHER", "'mine' .* is the metric 'other' with 1 functions; give it the name of"),
         ("first = by_hand:FIRST", "'first' .* with 1 functions, a primary one; .* is not primary"),
+        ("unitless = by_hand:UNITLESS", "'unitless' .* has unit None; allowed: Unit; repair"),
+        ("sideways = by_hand:SIDEWAYS", "has better 'sideways'; allowed: higher, lower, neither; repair"),
+        ("moon = by_hand:MOON", "has world 'moon'; allowed: None, frozen, closed-loop; repair"),
         ("nothing = by_hand:NOTHING", "'nothing' .* with 0 functions; give it .* one function"),
     ],
 )

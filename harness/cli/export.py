@@ -157,7 +157,10 @@ def command(
             rest = {_word(flag): value for flag, value in typed.items() if own.get(flag) is further[flag]}
             ours = type(format).__module__.startswith("harness.")
             with bar(format.doing), worded(f"format {option}", built_in=ours):
-                written = [format.write(source, file, dataset, **rest)]
+                wrote: object = format.write(source, file, dataset, **rest)
+                if not (isinstance(wrote, Path) and wrote.exists()):
+                    raise ValueError("it wrote no file")
+            written = [wrote]
     except OSError as error:
         where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
         remedy = "name another file" if target else "choose another folder with --out"

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
+from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins
 from harness.runs.folder import Run
 
@@ -39,7 +40,23 @@ class Export(Protocol):
         ...
 
 
-EXPORTS: Plugins[Export] = Plugins("swarmdrive.exports", Export, {})
+class Exports(Plugins[Export]):
+    """Formats by name."""
+
+    def _load(self, name: str) -> Export:
+        format = super()._load(name)
+        options: object = getattr(format, "options", MappingProxyType({}))
+        texts = (format.help, format.doing, *(format.needs if isinstance(format.needs, tuple) else (None,)))
+        named = isinstance(options, Mapping) and all(isinstance(each, Option) for each in options.values())
+        if not (named and all(isinstance(text, str) for text in texts)):
+            raise UserError(
+                f"plug-in {printable(name)!r} ({self.group}) has a help, doing or needs that is no text, or "
+                "options that are no table of Option; repair or uninstall the package that registers it"
+            )
+        return format
+
+
+EXPORTS = Exports("swarmdrive.exports", Export, {})
 
 
 def options_of(format: Export) -> Mapping[str, Option]:

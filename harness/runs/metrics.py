@@ -117,7 +117,22 @@ class Metrics(Plugins[Metric]):
                 "entry point, of letters, digits and _, and one function, of decisions or of episodes; a "
                 "package's metric is not primary"
             )
+        for field, allowed in _STATED.items():
+            stated = getattr(metric, field)
+            if not (isinstance(stated, allowed) if isinstance(allowed, type) else stated in allowed):
+                words = allowed.__name__ if isinstance(allowed, type) else ", ".join(map(str, allowed))
+                raise UserError(
+                    f"plug-in {printable(name)!r} ({self.group}) has {field} {printable(repr(stated))}; "
+                    f"allowed: {words}; repair or uninstall the package that registers it"
+                )
         return metric
+
+
+# What a metric states beside its functions: each one's type, or the values that are allowed.
+_STATED: Mapping[str, Any] = {
+    "meaning": str, "label": str, "unit": Unit, "better": get_args(Better), "interval": ("rate", "mean"),
+    "most": float, "world": (None, *get_args(World)),
+}  # fmt: skip
 
 
 def _rate(

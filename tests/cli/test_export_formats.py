@@ -1,12 +1,14 @@
 """Formats of `harness run export` that a package adds."""
 
 import inspect
+import sys
 from collections.abc import Iterator
 from importlib import reload
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
+from packaged import register
 
 from harness.cli import export
 from harness.core.errors import UserError
@@ -62,6 +64,30 @@ def test_a_format_that_fails_is_one_line(proxy_run: Path, monkeypatch: pytest.Mo
         UserError, match=r"^format --names-of fails \(IndexError: list index out of range at "
     ):
         export.command(run=proxy_run, names_of=Path("names"), most=None, all=False, **usual)
+
+
+@pytest.mark.usefixtures("names")
+def test_a_format_that_writes_nothing_is_one_line(proxy_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Names, "write", lambda *given, **options: None)
+    usual: dict[str, Any] = {"as_jsonl": False, "out": None, "junit": None, "dataset": None, "as_csv": False}
+    with pytest.raises(UserError, match=r"^format --names-of fails \(ValueError: it wrote no file at "):
+        export.command(run=proxy_run, names_of=Path("names"), most=None, all=False, **usual)
+
+
+@pytest.mark.parametrize("odd", [{"help": 5}, {"options": None}, {"needs": None}, {"options": {"most": 3}}])
+def test_a_format_whose_words_are_none_is_one_line(
+    odd: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = f"class Odd:\n    help, doing, needs, options = 'a', 'b', (), {{}}\n    {next(iter(odd))} = "
+    source += (
+        f"{next(iter(odd.values()))!r}\n    def write(self, run, file, dataset):\n        pass\nODD = Odd()\n"
+    )
+    register(tmp_path / "site", f"[{EXPORTS.group}]\nodd = odd_format:ODD\n", odd_format=source)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.delitem(sys.modules, "odd_format", raising=False)
+    monkeypatch.setattr(EXPORTS, "_loaded", {})
+    with pytest.raises(UserError, match="that is no text, or options that are no table of Option; repair"):
+        EXPORTS["odd"]
 
 
 @pytest.mark.usefixtures("names")
