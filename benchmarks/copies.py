@@ -8,7 +8,7 @@ from msgspec import structs
 
 from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Tree
-from harness.runs import folder
+from harness.runs import folder, writer
 from harness.runs.decisions import Decisions, Labels
 from harness.runs.folder import Run
 
@@ -77,13 +77,13 @@ def repeated(run: Run, times: int, apart: int, out: Path) -> Run:
         return d.replace(scene=scenes, episode=d.whole("episode") + by)
 
     world = structs.replace(run.manifest.world, episodes=times * run.manifest.world.episodes)
-    folder.write(
+    writer.write(
         out,
         structs.replace(run.manifest, world=world),
         Decisions.concat([moved(by) for by in shifts]),
         [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
         (
-            folder.lines([structs.replace(a, scene=shifted(a.scene, by)) for a in run.answers])
+            writer.lines([structs.replace(a, scene=shifted(a.scene, by)) for a in run.answers])
             for by in shifts
         ),
         run.scores,

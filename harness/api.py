@@ -50,7 +50,7 @@ class Run(Tables):
         if scene not in self.source.decisions.scenes:
             raise unknown("decision point", scene, list(self.source.decisions.scenes))
         if isinstance(self.source.manifest.world, FrozenScenes):
-            from harness.runs.folder import check_scenes, dataset_of
+            from harness.runs.run_dataset import check_scenes, dataset_of
 
             dataset = dataset_of(self.source)
             check_scenes(self.source, dataset, [scene])

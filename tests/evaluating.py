@@ -31,7 +31,7 @@ from harness.evaluate.table import table
 from harness.evaluate.walk import Decided, walk
 from harness.prompts import versions as prompts
 from harness.report.details import prompts_of
-from harness.runs import folder
+from harness.runs import folder, writer
 from harness.runs.decisions import Decisions
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import Grid
@@ -180,7 +180,7 @@ def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path 
     made = table(parts, world.columns(), spec.actions)
     grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
     episodes = counted(grid, made, world.episodes())
-    answers = folder.ordered(asker.answers.values(), made)
+    answers = writer.ordered(asker.answers.values(), made)
     return Walked(
         parts, made, episodes, answers, Figures.of("frozen", grid, made, episodes, answers).scores()
     )

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.core.versions import FIGURES
-from harness.runs import folder, formats
+from harness.runs import folder, formats, writer
 from harness.runs.decisions import Decisions, schema
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
@@ -118,8 +118,8 @@ def damage(
     """Change each row of a run's tables, and nothing that follows from them; it need not be possible."""
     read, rows, ends, said = _rows(run, decision, episode, answer)
     decisions = _decisions(rows, read.actions, read.decisions.helpers)
-    lines = folder.lines(_all(said, Answer))
-    folder.write(run, read.manifest, decisions, _all(ends, Episode), [lines], read.scores)
+    lines = writer.lines(_all(said, Answer))
+    writer.write(run, read.manifest, decisions, _all(ends, Episode), [lines], read.scores)
 
 
 def _rows(
@@ -168,7 +168,7 @@ def _write(
     episodes = counted(grid, decisions, _all(ends, Episode))
     world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
     summary = Figures.of(world, grid, decisions, episodes, answers).scores()
-    folder.write(out, manifest, decisions, episodes, [folder.lines(answers)], summary)
+    writer.write(out, manifest, decisions, episodes, [writer.lines(answers)], summary)
     return out
 
 

@@ -30,10 +30,11 @@ from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.words import adjusted_lines, as_good_as, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
-from harness.runs.folder import csv_text, read
+from harness.runs.folder import read
 from harness.runs.metrics import ADJUSTED, BALANCED, GAIN, SUCCESS, Grid
 from harness.runs.records import Score
 from harness.runs.success import Success
+from harness.runs.writer import csv_text
 
 Typed = Callable[..., tuple[int, str, str]]
 ASKED = 50

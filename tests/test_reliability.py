@@ -18,7 +18,7 @@ from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
 from harness.report.runs import Runs
 from harness.runs.contradictions import contradictions
-from harness.runs.folder import csv_text, read
+from harness.runs.folder import read
 from harness.runs.metrics import ONE_OPTIMAL, entry
 from harness.runs.records import Score
 from harness.runs.reliability import (
@@ -37,6 +37,7 @@ from harness.runs.reliability import (
     right,
 )
 from harness.runs.summary import Figures
+from harness.runs.writer import csv_text
 
 ONE, TWO, NONE = [True, False, False], [True, True, False], [False, False, False]
 

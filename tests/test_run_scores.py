@@ -31,10 +31,10 @@ from harness.core.statistics import wilson
 from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of, requests
 from harness.evaluate.latency import inference_s
-from harness.runs.folder import csv_text
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.records import Answer, Latency, Score, Variant
+from harness.runs.writer import csv_text
 
 ALONE = OperatingPoint.of("single-local", None)
 CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter

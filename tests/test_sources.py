@@ -18,7 +18,8 @@ from harness.prompts.versions import digest
 from harness.report.compare import words
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.runs.folder import dataset_of, read
+from harness.runs.folder import read
+from harness.runs.run_dataset import dataset_of
 from harness.runs.sources import prompt_of
 
 Typed = Callable[..., tuple[int, str, str]]

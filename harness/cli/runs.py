@@ -93,7 +93,8 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
     """Check a run, print the result, and return it."""
     from harness.evaluate.recompute import AGAIN, differences, driven_otherwise, of_card
     from harness.runs.contradictions import contradictions, unchecked
-    from harness.runs.folder import dataset_of, read
+    from harness.runs.folder import read
+    from harness.runs.run_dataset import dataset_of
 
     run = read(path)
     open_points = [*unchecked(run), *of_card(run)]

@@ -48,7 +48,7 @@ from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
 from harness.evaluate.walk import walk
-from harness.runs import folder
+from harness.runs import folder, run_parts, writer
 from harness.runs import sources as kept_sources
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
@@ -139,7 +139,7 @@ def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, work
         _drive(spec, begun, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
-        _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
+        _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)))
     return sum(map(len, own_chunks))
 
 
@@ -198,7 +198,7 @@ def _walk(
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    files = folder.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    files = run_parts.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
     return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
@@ -233,7 +233,7 @@ def _frozen(
                 return _walk(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
-            n_answers = folder.answers_in(place / _folder_name(chunk))
+            n_answers = run_parts.answers_in(place / _folder_name(chunk))
             more(n_answers)
             progress(n_answers)
 
@@ -313,8 +313,8 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
         return
     for part in parts:
         answered = read_kept(part / "answers.jsonl")
-        if len(answered) < folder.answers_in(part):
-            write_whole(part.with_suffix(".jsonl"), folder.lines(list(answered.values())))
+        if len(answered) < run_parts.answers_in(part):
+            write_whole(part.with_suffix(".jsonl"), writer.lines(list(answered.values())))
             gone = part.with_name(f".{part.name}.{os.getpid()}.part")
             os.replace(part, gone)  # so that no part is ever half there
             shutil.rmtree(gone)
@@ -345,9 +345,9 @@ def _walked(
         new = _split(numbers[at[-1] if at else 0 : layouts], most)
         walk_all(new)
         parts = [place / _folder_name(chunk) for chunk in new]
-        _settle(parts, chain.from_iterable(map(folder.facts_of, parts)))
+        _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)))
         done, at = [*done, *new], [*at, layouts]
-        ended += chain.from_iterable(map(folder.ends_of, parts))
+        ended += chain.from_iterable(map(run_parts.ends_of, parts))
         grid = Grid(names, spec.seeds, tuple(numbers[:layouts]))
         if enough := until.enough(grid, grid.ordered(ended)):
             break
@@ -390,7 +390,7 @@ def _walk_missing(
     def keep(index: int, files: dict[str, bytes]) -> None:
         chunk = todo[index]
         servers.keep(place, files.pop(servers.FILE, b""))
-        folder.write_part(place / _folder_name(chunk), files)
+        run_parts.write_part(place / _folder_name(chunk), files)
         for kept in (*place.glob("answers*.jsonl"), _answered_file(place, chunk)):
             kept.unlink(missing_ok=True)
         report_new(chunk)
@@ -446,7 +446,7 @@ def _gather(
     names = tuple(condition["name"] for condition in settings["conditions"])
 
     def scored(chunk: Sequence[int], part: Path) -> tuple[list[Episode], Figures]:
-        decisions, ended, answers = folder.read_part(part, settings["actions"])
+        decisions, ended, answers = run_parts.read_part(part, settings["actions"])
         grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
         episodes = counted(grid, decisions, ended)
         return episodes, Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
@@ -483,8 +483,8 @@ def _gather(
         with suppress(UserError):  # a stranger's shard may state any command
             write_whole(out / FILE, text_of(of_words(begun.command)))
         servers.write(out, works)
-        decisions_of_all = folder.decisions_of(parts, settings["actions"])
-        folder.write(out, manifest, decisions_of_all, episodes, folder.lines_of(parts), summary, layouts)
+        decisions_of_all = run_parts.decisions_of(parts, settings["actions"])
+        writer.write(out, manifest, decisions_of_all, episodes, run_parts.lines_of(parts), summary, layouts)
     return Evaluated(out, manifest, summary)
 
 

@@ -10,7 +10,8 @@ from harness.parsing.status import Status
 from harness.report.details import BLOCK, Details, Part, Prompts, prompts_of
 from harness.report.remarks import left_out
 from harness.report.runs import Runs
-from harness.runs.folder import Run, check_scenes
+from harness.runs.folder import Run
+from harness.runs.run_dataset import check_scenes
 from harness.runs.sources import lacking
 
 AT_ONCE = 32 * BLOCK  # scenes of a part, which are in memory together

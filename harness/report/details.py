@@ -30,8 +30,9 @@ from harness.report.library import packed, picture
 from harness.report.remarks import LeftOut
 from harness.report.runs import Runs
 from harness.runs.decisions import Decisions
-from harness.runs.folder import Run, check_scenes
+from harness.runs.folder import Run
 from harness.runs.records import Answer, Episode
+from harness.runs.run_dataset import check_scenes
 from harness.runs.sources import prompt_of
 from harness.world import scenarios
 from harness.world.perception.camera import frame

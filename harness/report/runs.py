@@ -10,8 +10,9 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.contradictions import refuse
-from harness.runs.folder import Run, dataset_of, read
+from harness.runs.folder import Run, read
 from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.runs.run_dataset import dataset_of
 from harness.world import scenarios
 from harness.world.scenario import Scenario
 

@@ -20,10 +20,11 @@ from harness.report.findings import LAST, Kind, findings
 from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.contradictions import refuse
-from harness.runs.folder import Run, dataset_of
+from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import BASELINE, GAINS, entry
 from harness.runs.records import Score
+from harness.runs.run_dataset import dataset_of
 from harness.runs.suite import SuiteRun, mean
 
 WIDTH, STEP = 130, 9  # of the picture of a line: pixels from 0 to 100 %, and from a condition to the next

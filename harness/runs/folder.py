@@ -1,20 +1,15 @@
-"""Read and write a run's folder; one reader and one writer serve every world.
+"""Read a run's folder; one reader serves every world, and `writer.py` is the one writer.
 
 `answers.jsonl` has one answer a line, `decisions.parquet` one decision a row. `episodes.csv` and
 `summary.csv` follow from both. `run.json` records the run's settings and origin, and is written last.
 """
 
 import csv
-import io
-import os
-import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -22,18 +17,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 from msgspec import Struct
-from msgspec.structs import asdict
 
 from harness.core import work
 from harness.core.errors import UserError, printable
-from harness.core.files import BROKEN, bytes_of, replacing, text_of, write_whole
+from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import SUITE
 from harness.core.memory import uncollected
-from harness.dataset.load import Dataset, find, load
-from harness.dataset.verify import read_manifest
 from harness.runs import formats
 from harness.runs.answers import Answered, Answers
-from harness.runs.decisions import DecisionFiles, Decisions, arrow_file
+from harness.runs.decisions import Decisions, arrow_file
 from harness.runs.devices import Speed
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
@@ -41,13 +33,11 @@ from harness.runs.leading import ANY_TIME, PAIRED
 from harness.runs.metrics import Grid, World
 from harness.runs.records import (
     Answer,
-    AnswerFacts,
     ClosedLoop,
     Episode,
     FrozenScenes,
     Manifest,
     Score,
-    Variant,
 )
 from harness.world.parameters import MOST_DECISIONS
 
@@ -55,11 +45,7 @@ T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
 # Arrow raises NotImplementedError for a column of another type.
 _BROKEN = (*BROKEN, NotImplementedError, csv.Error)
-NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-_FACTS = msgspec.json.Decoder(AnswerFacts)
-_ENCODER = msgspec.json.Encoder()
-DEEPEST = 8  # folders of a dataset's stated path that are looked for above a run
 
 
 @dataclass(frozen=True)
@@ -186,7 +172,7 @@ class Run:
         return self.read_file(DIFFICULTY, self._layouts) if exists else ()
 
     def _layouts(self, file: Path) -> tuple[Layout, ...]:
-        layouts = _records(file, Layout)
+        layouts = records_of(file, Layout)
         dangers = {layout.episode: layout.danger for layout in layouts}
         if len(dangers) < len(layouts) or any(dangers.get(e.episode) != e.danger for e in self.episodes):
             raise ValueError("an episode is there twice, or it lacks one of the run's")
@@ -204,7 +190,7 @@ class Run:
         return min(candidates, key=lambda s: order.get(s.interval, 3), default=None)
 
     def _place(self, file: Path) -> tuple[Grid, tuple[Episode, ...]]:
-        episodes = _records(file, Episode)
+        episodes = records_of(file, Episode)
         numbers = tuple(dict.fromkeys(episode.episode for episode in episodes))
         world = self.manifest.world
         if len(numbers) != world.episodes:
@@ -219,7 +205,7 @@ class Run:
         return grid, tuple(grid.ordered(episodes))
 
     def _decisions(self, file: Path) -> Decisions:
-        decisions = Decisions.read(file, self.actions, _most_rows(self.episodes))
+        decisions = Decisions.read(file, self.actions, most_rows(self.episodes))
         decisions.codes("action", self.actions)
         if infinite := decisions.infinite():
             raise ValueError(f"{infinite} is infinite")
@@ -274,209 +260,13 @@ def read(path: Path) -> Run:
     return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(stated), Manifest)))
 
 
-def write(
-    out: Path, manifest: Manifest, decisions: Decisions | DecisionFiles, episodes: Sequence[Episode],
-    answers: Iterable[bytes], scores: Sequence[Score], layouts: Sequence[Layout] = (),
-) -> None:  # fmt: skip
-    """Write a run's files, the manifest last.
-
-    The decisions are already rounded; the lines of `answers.jsonl` come some at a time.
-    """
-    with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
-        file.writelines(answers)
-    decisions.write(out / "decisions.parquet")
-    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
-    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
-    if layouts:
-        write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
-    text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
-    write_whole(out / "run.json", text + b"\n")
-    pa.default_memory_pool().release_unused()  # a report often follows, which needs memory for its own tables
-
-
-def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer],
-    viewers: Mapping[str, Sequence[str]],
-) -> dict[str, bytes]:  # fmt: skip
-    """Return the files of a part of a run, by name; the answers may be in any order.
-
-    `viewers` has the ids of each decision point's viewers, the ego first.
-    """
-    return {
-        "decisions.parquet": decisions.encoded(),
-        "answers.jsonl": lines(ordered(answers, decisions, viewers)),
-        "episodes.csv": csv_text(Episode, episodes).encode(),
-    }
-
-
-def write_part(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write a part of a run to its own folder, which exists only once it is complete."""
-    part = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    for name, data in files.items():
-        write_whole(part / name, data)
-    os.replace(part, out)
-
-
-def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
-    """Read a part that `write_part` wrote. Raises UserError if it is broken."""
-    return whole(part, lambda part: (
-        *_read_tables(part, actions), facts_of(part),
-    ))  # fmt: skip
-
-
-def facts_of(part: Path) -> list[AnswerFacts]:
-    """Read a part's answers, without their texts. Raises UserError if it is broken."""
-    return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
-
-
-def ends_of(part: Path) -> tuple[Episode, ...]:
-    """Read how a part's episodes ended. Raises UserError if it is broken."""
-    return whole(part, lambda part: _records(part / "episodes.csv", Episode))
-
-
-def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...]]:
-    episodes = _records(part / "episodes.csv", Episode)
-    return Decisions.read(part / "decisions.parquet", actions, _most_rows(episodes)), episodes
-
-
-def _most_rows(episodes: Sequence[Episode]) -> int:
+def most_rows(episodes: Sequence[Episode]) -> int:
     """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
     return 2 * MOST_DECISIONS * sum(episode.agents or 1 for episode in episodes)
 
 
-def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
-    """Return the decisions of a run's parts."""
-    return DecisionFiles([part / "decisions.parquet" for part in parts], tuple(actions))
-
-
-def answers_in(part: Path) -> int:
-    """Return the number of answers in a part."""
-    return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
-
-
-def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
-    """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
-    for part in parts:
-        yield bytes_of(part / "answers.jsonl", "rows")
-
-
-def lines(answers: Sequence[Answer]) -> bytes:
-    """Return answers as lines of `answers.jsonl`."""
-    return _ENCODER.encode_lines(answers)
-
-
-def ordered(
-    answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
-) -> list[Answer]:
-    """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
-
-    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
-    decision point without a decision, or by nobody among its viewers, are left out.
-    """
-
-    def place(answer: Answer) -> tuple[Any, ...]:
-        first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
-        return order[answer.scene], answer.heard, answer.role == "blind", first
-
-    order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
-    reached = (answer for answer in answers if answer.scene in order)
-    return sorted((a for a in reached if a.viewer in viewers.get(a.scene, (a.viewer,))), key=place)
-
-
-def dataset_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the dataset of a run on frozen scenes, wherever it lies now, if it has the run's digest.
-
-    It is looked for where the run states, at that path seen from each folder above the run's, and by its
-    name; nowhere else if the user names its folder, `given`. Raises UserError if it is not found, has another
-    digest, or is damaged.
-    """
-    stated = run.manifest.world
-    assert isinstance(stated, FrozenScenes)
-    folders: list[Path] = []
-    for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
-        if given or _holds(path):
-            if _sha256_of(path) == stated.sha256:
-                return load(path)
-            folders.append(path)
-    repair = "restore it, give its folder to a command that has --dataset, or run again"
-    if folders:
-        sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]  # which says what is wrong with it
-        raise UserError(
-            f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made on "
-            f"(sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
-        )
-    raise UserError(
-        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "
-        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by its name; "
-        f"{repair}"
-    )
-
-
-def _datasets(run: Run, stated: FrozenScenes) -> Iterator[Path]:
-    """Yield where a run's dataset may lie."""
-    path = Path(stated.path)
-    yield path
-    with suppress(UserError):
-        yield find(stated.name)
-    # The run may have moved together with its dataset, or be read from another folder.
-    parts = [part for part in path.parts if part not in (path.anchor, "..")][-DEEPEST:]
-    for above in run.path.resolve().parents:
-        yield above / path
-        yield from (above.joinpath(*parts[at:]) for at in range(len(parts)))
-        yield above / "datasets" / stated.name
-
-
-def _sha256_of(path: Path) -> str | None:
-    """Return the digest of the dataset in a folder; None if its manifest is broken."""
-    try:
-        return read_manifest(path)[1]
-    except UserError:
-        return None
-
-
-def _holds(path: Path) -> bool:
-    try:
-        return (path / "manifest.json").is_file()
-    except (OSError, ValueError):  # a name that no file can have
-        return False
-
-
-def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:
-    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset.
-
-    With `some`, only decisions in these scenes are checked, and answers where there is no decision.
-    """
-    decided = run.decisions.scenes
-    scenes_by_file: dict[str, Iterable[str]] = {
-        "decisions.parquet": decided if some is None else (scene for scene in some if scene in decided),
-        "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
-    }
-    for file, scenes in scenes_by_file.items():
-        for scene in scenes:
-            if scene not in dataset:
-                raise UserError(
-                    f"{printable(run.path / file)} has scene {printable(scene)!r}, "
-                    "which its dataset has not; make the run again"
-                )
-
-
-def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
-    """Return records as CSV: the columns of the variant, then a column for each field; None is empty."""
-    text, records = io.StringIO(), list(records)
-    writer = csv.writer(text, lineterminator="\n")
-    variant_columns = asdict(variant) if variant else {}
-    columns = {
-        field: name for field, name in zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True)
-        if field not in formats.SPARSE or any(getattr(record, field) is not None for record in records)
-    }  # fmt: skip
-    writer.writerow([*variant_columns, *columns.values()])
-    values = attrgetter(*columns)
-    writer.writerows((*variant_columns.values(), *values(record)) for record in records)
-    return text.getvalue()
-
-
-def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
+def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
+    """Return the rows of a CSV file. Raises ValueError for a column that is missing or has gaps it may not."""
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
     parsed = pacsv.ParseOptions(newlines_in_values=True)
@@ -508,7 +298,7 @@ def _records(file: Path, kind: type[Record]) -> tuple[Record, ...]:
 
 def scores_of(file: Path) -> tuple[Score, ...]:
     """Return the figures of a `summary.csv`. Raises ValueError if one is there twice."""
-    scores = _records(file, Score)
+    scores = records_of(file, Score)
     if len({score.key for score in scores}) < len(scores):
         raise ValueError("a figure is there twice")
     return scores

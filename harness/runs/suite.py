@@ -13,12 +13,13 @@ from harness.core.files import text_of, write_whole
 from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
-from harness.runs.folder import Run, csv_text
+from harness.runs.folder import Run
 from harness.runs.leading import BALANCED, PAIRED
 from harness.runs.listing import own_name
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
 from harness.runs.success import Plays, by_condition, is_gain
+from harness.runs.writer import csv_text
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families

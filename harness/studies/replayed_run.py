@@ -35,8 +35,9 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.of_run import check_prompts, points_of, spec_of
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses
-from harness.runs.folder import dataset_of, read
+from harness.runs.folder import read
 from harness.runs.records import Answer
+from harness.runs.run_dataset import dataset_of
 from harness.runs.success import Success, alike
 from harness.runs.unanswered import tally
 from harness.studies.axes import Setting

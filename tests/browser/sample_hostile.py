@@ -4,8 +4,9 @@ from run_on_disk import configure, made_up
 
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
-from harness.runs.folder import csv_text, read
+from harness.runs.folder import read
 from harness.runs.records import FrozenScenes, Latency, Score, Times
+from harness.runs.writer import csv_text
 
 WAYS_IN = (
     "{}", '">{}', "'>{}", "</td></tr></table>{}", "</title>{}", "</style>{}", "</script>{}", "</textarea>{}",

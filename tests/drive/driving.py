@@ -16,7 +16,7 @@ from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
-from harness.runs import folder
+from harness.runs import writer
 from harness.runs.decisions import Decisions
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency
@@ -89,7 +89,7 @@ def driven(
     return Driven(
         decisions,
         counted(grid, decisions, world.episodes()),
-        folder.ordered(asker.answers.values(), decisions),
+        writer.ordered(asker.answers.values(), decisions),
     )
 
 

@@ -14,7 +14,7 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
-from harness.runs import folder, formats
+from harness.runs import formats, writer
 from harness.runs.metrics import Grid
 from harness.runs.records import Manifest
 from harness.runs.summary import Figures, counted
@@ -43,12 +43,12 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
         "cached_answers": 0, "engine_errors": 0,
         "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
     }  # fmt: skip
-    folder.write(
+    writer.write(
         out,
         msgspec.convert(formats.upgraded(msgspec.to_builtins(restated(manifest, stated))), Manifest),
         decisions,
         episodes,
-        [folder.lines(folder.ordered(answers, decisions))],
+        [writer.lines(writer.ordered(answers, decisions))],
         Figures.of("frozen", grid, decisions, episodes, answers).scores(),
     )
     return out

@@ -37,8 +37,9 @@ from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.templating import visible
 from harness.report.words import figures, headline, shown
-from harness.runs.folder import Run, csv_text, read
+from harness.runs.folder import Run, read
 from harness.runs.records import Episode, Latency, Score, Times
+from harness.runs.writer import csv_text
 
 V2 = prompts.load("v2")
 ENDED = {"single-local": 34, "v2x": 35, "6g": 47}  # successes of 50

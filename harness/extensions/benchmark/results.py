@@ -27,10 +27,11 @@ from harness.core.files import (
     replacing,
     write_whole,
 )
-from harness.runs.folder import Run, csv_text
+from harness.runs.folder import Run
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
 from harness.runs.settings import FrozenSettings, deciding
+from harness.runs.writer import csv_text
 
 FORMAT = "swarmdrive-results/1"
 CONTENTS = "results.json"

@@ -23,9 +23,10 @@ from harness.extensions.calibration.calibrations import (
     check_seeds,
     question_of,
 )
-from harness.runs.folder import Run, check_scenes, dataset_of, read
+from harness.runs.folder import Run, read
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
+from harness.runs.run_dataset import check_scenes, dataset_of
 
 TEMPERATURES = np.geomspace(COOLEST, HOTTEST, 241)  # that are tried: 2.5 % apart, and 1 among them
 DIGITS = 6  # of a prior

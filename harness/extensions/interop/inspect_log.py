@@ -21,8 +21,9 @@ from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.report.details import prompts_of
 from harness.report.page import refuse_less
-from harness.runs.folder import Run, check_scenes, dataset_of
+from harness.runs.folder import Run
 from harness.runs.records import Answer, FrozenScenes
+from harness.runs.run_dataset import check_scenes, dataset_of
 from harness.runs.sources import lacking
 
 VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect

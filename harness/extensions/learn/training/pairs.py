@@ -24,8 +24,9 @@ from harness.extensions.learn.training.answers import answer
 from harness.extensions.learn.training.lessons import Lessons, label
 from harness.extensions.learn.training.questions import question
 from harness.prompts import readout
-from harness.runs.folder import Run, check_scenes, dataset_of
+from harness.runs.folder import Run
 from harness.runs.records import BLIND, Answer, FrozenScenes
+from harness.runs.run_dataset import check_scenes, dataset_of
 from harness.runs.sources import prompt_of
 
 ROUNDING = 1e-9  # of probabilities that sum to 1

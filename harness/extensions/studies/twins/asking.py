@@ -24,9 +24,9 @@ from harness.evaluate.latency import PAPER
 from harness.evaluate.spec import Spec
 from harness.extensions.studies.twins.declared import TWINS, Twin
 from harness.extensions.studies.twins.scoring import Pair, distance, held
-from harness.runs.folder import lines
 from harness.runs.records import Answer
 from harness.runs.unanswered import Tally
+from harness.runs.writer import lines
 
 RESULT = "twins.json"
 Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twin

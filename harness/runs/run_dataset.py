@@ -1,0 +1,92 @@
+"""Find the dataset of a run, and hold the run's scenes against it."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from harness.core.errors import UserError, printable
+from harness.dataset.load import Dataset, find, load
+from harness.dataset.verify import read_manifest
+from harness.runs.folder import Run
+from harness.runs.records import (
+    FrozenScenes,
+)
+
+DEEPEST = 8  # folders of a dataset's stated path that are looked for above a run
+
+
+def dataset_of(run: Run, given: Path | None = None) -> Dataset:
+    """Return the dataset of a run on frozen scenes, wherever it lies now, if it has the run's digest.
+
+    It is looked for where the run states, at that path seen from each folder above the run's, and by its
+    name; nowhere else if the user names its folder, `given`. Raises UserError if it is not found, has another
+    digest, or is damaged.
+    """
+    stated = run.manifest.world
+    assert isinstance(stated, FrozenScenes)
+    folders: list[Path] = []
+    for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
+        if given or _holds(path):
+            if _sha256_of(path) == stated.sha256:
+                return load(path)
+            folders.append(path)
+    repair = "restore it, give its folder to a command that has --dataset, or run again"
+    if folders:
+        sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]  # which says what is wrong with it
+        raise UserError(
+            f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made on "
+            f"(sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
+        )
+    raise UserError(
+        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "
+        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by its name; "
+        f"{repair}"
+    )
+
+
+def _datasets(run: Run, stated: FrozenScenes) -> Iterator[Path]:
+    """Yield where a run's dataset may lie."""
+    path = Path(stated.path)
+    yield path
+    with suppress(UserError):
+        yield find(stated.name)
+    # The run may have moved together with its dataset, or be read from another folder.
+    parts = [part for part in path.parts if part not in (path.anchor, "..")][-DEEPEST:]
+    for above in run.path.resolve().parents:
+        yield above / path
+        yield from (above.joinpath(*parts[at:]) for at in range(len(parts)))
+        yield above / "datasets" / stated.name
+
+
+def _sha256_of(path: Path) -> str | None:
+    """Return the digest of the dataset in a folder; None if its manifest is broken."""
+    try:
+        return read_manifest(path)[1]
+    except UserError:
+        return None
+
+
+def _holds(path: Path) -> bool:
+    try:
+        return (path / "manifest.json").is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
+
+
+def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:
+    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset.
+
+    With `some`, only decisions in these scenes are checked, and answers where there is no decision.
+    """
+    decided = run.decisions.scenes
+    scenes_by_file: dict[str, Iterable[str]] = {
+        "decisions.parquet": decided if some is None else (scene for scene in some if scene in decided),
+        "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
+    }
+    for file, scenes in scenes_by_file.items():
+        for scene in scenes:
+            if scene not in dataset:
+                raise UserError(
+                    f"{printable(run.path / file)} has scene {printable(scene)!r}, "
+                    "which its dataset has not; make the run again"
+                )

@@ -1,0 +1,88 @@
+"""Write a run's folder: the tables of a finished run, and the lines of its answers."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+from msgspec.structs import asdict
+
+from harness.core.files import replacing, write_whole
+from harness.runs import formats
+from harness.runs.decisions import DecisionFiles, Decisions
+from harness.runs.difficulty import FILE as DIFFICULTY
+from harness.runs.difficulty import Layout
+from harness.runs.folder import Record
+from harness.runs.records import (
+    Answer,
+    Episode,
+    Manifest,
+    Score,
+    Variant,
+)
+
+NOBODY: Mapping[str, Sequence[str]] = MappingProxyType({})
+_ENCODER = msgspec.json.Encoder()
+
+
+def write(
+    out: Path, manifest: Manifest, decisions: Decisions | DecisionFiles, episodes: Sequence[Episode],
+    answers: Iterable[bytes], scores: Sequence[Score], layouts: Sequence[Layout] = (),
+) -> None:  # fmt: skip
+    """Write a run's files, the manifest last.
+
+    The decisions are already rounded; the lines of `answers.jsonl` come some at a time.
+    """
+    with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
+        file.writelines(answers)
+    decisions.write(out / "decisions.parquet")
+    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
+    write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
+    if layouts:
+        write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
+    text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
+    write_whole(out / "run.json", text + b"\n")
+    pa.default_memory_pool().release_unused()  # a report often follows, which needs memory for its own tables
+
+
+def lines(answers: Sequence[Answer]) -> bytes:
+    """Return answers as lines of `answers.jsonl`."""
+    return _ENCODER.encode_lines(answers)
+
+
+def ordered(
+    answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
+) -> list[Answer]:
+    """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
+
+    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
+    decision point without a decision, or by nobody among its viewers, are left out.
+    """
+
+    def place(answer: Answer) -> tuple[Any, ...]:
+        first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
+        return order[answer.scene], answer.heard, answer.role == "blind", first
+
+    order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
+    reached = (answer for answer in answers if answer.scene in order)
+    return sorted((a for a in reached if a.viewer in viewers.get(a.scene, (a.viewer,))), key=place)
+
+
+def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
+    """Return records as CSV: the columns of the variant, then a column for each field; None is empty."""
+    text, records = io.StringIO(), list(records)
+    writer = csv.writer(text, lineterminator="\n")
+    variant_columns = asdict(variant) if variant else {}
+    columns = {
+        field: name for field, name in zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True)
+        if field not in formats.SPARSE or any(getattr(record, field) is not None for record in records)
+    }  # fmt: skip
+    writer.writerow([*variant_columns, *columns.values()])
+    values = attrgetter(*columns)
+    writer.writerows((*variant_columns.values(), *values(record)) for record in records)
+    return text.getvalue()
