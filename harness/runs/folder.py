@@ -266,7 +266,7 @@ def most_rows(episodes: Sequence[Episode]) -> int:
 
 
 def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
-    """Return the rows of a CSV file. Raises ValueError if a column is missing, or has gaps it may not have."""
+    """Return the rows of a CSV file. Raises ValueError for a column that is missing or has gaps."""
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
     parsed = pacsv.ParseOptions(newlines_in_values=True)
