@@ -142,6 +142,7 @@ def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
         ("6g:on_demand=yes", "on_demand is 'yes'; it must be true or false"),
         ("6g:loss=nan", "loss is nan; it must be a probability"),
         ("6g:loss=0.1,loss=0.2", "loss is given twice"),
+        ("6g:consensus=linear:tau=0", "joined by commas, as in 6g:consensus=linear,tau=0"),
         ("6g:window=300,window_s=0.2", "window_s is given twice"),
         ("6g:consensus=vote", "unknown consensus 'vote'"),
         ("6g:messages=none", "unknown messages 'none'"),

@@ -512,6 +512,12 @@ def named_point(text: str) -> OperatingPoint:
             without_gone({field: value})
             allowed = (*typed_settings(), *SHORT, *channel_settings)
             raise unknown(f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3")
+        if ":" in value and field != "attack":
+            joined = f"{key}={value.replace(':', ',')}"
+            raise UserError(
+                f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings are "
+                f"joined by commas, as in {printable(f'{name}:{joined}')}"
+            )
         if field in settings or field in radio:
             raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
         if field not in typed_settings():
