@@ -32,13 +32,22 @@ HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", 
 ITSELF, OPENED, NOTHING = "itself", "opened", "nothing"
 
 
-def option(text: str, panel: str = "", only: str = "", listed: bool = False, same: str = ITSELF) -> Meta:
+def option(
+    text: str,
+    panel: str = "",
+    only: str = "",
+    listed: bool = False,
+    same: str = ITSELF,
+    compared: bool = True,
+) -> Meta:
     """Describe a setting: its help, its panel (by default the first), the world that alone has it.
 
     One that is `listed` is a text of several names with commas, and may be typed once for each. `same` says
-    what of it must be the same when a stopped run resumes.
+    what of it must be the same when a stopped run resumes. `compared` says whether a comparison of two runs
+    tells it, if it must be the same: not what other facts of a run tell, nor what changes no decision.
     """
-    return Meta(extra={"help": text, "panel": panel, "only": only, "listed": listed, "same": same})
+    said = {"help": text, "panel": panel, "only": only, "listed": listed}
+    return Meta(extra={**said, "same": same, "compared": compared})
 
 
 class HelperSettings(Struct, frozen=True, kw_only=True):
@@ -162,6 +171,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "one.",
             ENGINE,
             same=OPENED,
+            compared=False,
         ),
     ] = None
     prompt: Annotated[
@@ -178,6 +188,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         option(
             "Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed.",
             same=OPENED,
+            compared=False,
         ),
     ] = "0:5"
     condition: Annotated[
@@ -186,6 +197,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
             "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points.",
             same=OPENED,
+            compared=False,
         ),
     ] = ()
     control: Annotated[
@@ -197,6 +209,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             CONDITIONS,
             "frozen",
             same=OPENED,
+            compared=False,
         ),
     ] = ()
     attack: Annotated[
@@ -207,6 +220,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "Repeatable.",
             CONDITIONS,
             same=OPENED,
+            compared=False,
         ),
     ] = ()
     answer: Annotated[
@@ -259,7 +273,9 @@ class Settings(Struct, frozen=True, kw_only=True):
     batch_size: Annotated[
         int,
         option(
-            "Number of prompts in one batch; with a served model, of requests to each server at once.", ENGINE
+            "Number of prompts in one batch; with a served model, of requests to each server at once.",
+            ENGINE,
+            compared=False,
         ),
     ] = 8
     server: Annotated[
@@ -306,6 +322,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "by its tokens; use it instead of --latency.",
             LATENCY,
             same=OPENED,
+            compared=False,
         ),
     ] = None
     device_model: Annotated[
@@ -314,6 +331,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "With --device-profile: model whose row of the profile times all answers. Default: the model "
             "that gave the answer.",
             LATENCY,
+            compared=False,
         ),
     ] = None
     ask: Annotated[
@@ -323,6 +341,7 @@ class Settings(Struct, frozen=True, kw_only=True):
             "scene, which gives the same decisions and lets other conditions be scored later without the "
             "model.",
             HELPERS,
+            compared=False,
         ),
     ] = "used"
     ties: Annotated[
@@ -351,6 +370,7 @@ class Option(NamedTuple):
     panel: str
     listed: bool  # whether it may be typed several times, which are joined by commas
     same: str  # what of it is the same when a stopped run resumes
+    compared: bool  # whether a comparison of two runs tells it
 
     @property
     def flag(self) -> str:
@@ -380,7 +400,7 @@ def options(world: type[Struct]) -> list[Option]:
     """Return the options of the command that walks a world, in the order of the fields; extensions' last."""
     core = core_options(world)
     added = [
-        Option((EXTENSIONS, name), name, its.kind, its.default, its.help, "Extensions", False, ITSELF)
+        Option((EXTENSIONS, name), name, its.kind, its.default, its.help, "Extensions", False, ITSELF, True)
         for name, its in of_extensions().items()
     ]
     return core + added
@@ -412,7 +432,7 @@ def _options(
         if meta.extra["only"] in ("", only):
             name = f"helper_{field.name}" if table == "helpers" else field.name
             path = (table, field.name) if table else (field.name,)
-            said = [meta.extra[key] for key in ("help", "panel", "listed", "same")]
+            said = [meta.extra[key] for key in ("help", "panel", "listed", "same", "compared")]
             yield Option(path, name, _kind(plain), field.default, *said)
 
 
@@ -436,6 +456,12 @@ PLAIN = dict.fromkeys(
     each.name for world in WORLDS.values() for each in core_options(world)
     if len(each.path) == 1 and each.same == ITSELF
 )  # fmt: skip
+
+# What a comparison of two runs tells, by the key in `run.toml`; of worlds it tells the scenes.
+COMPARED = dict.fromkeys(
+    each.path[0] for world in WORLDS.values() for each in core_options(world)
+    if each.compared and each.same != NOTHING and each.path[0] != "world"
+) | {EXTENSIONS: None}  # fmt: skip
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:

@@ -21,7 +21,7 @@ from harness.core.multiplicity import holm
 from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
-from harness.report.compare.pair import pair
+from harness.report.compare.pair import ORDER, TOLD, pair
 from harness.runs.metrics import BALANCED, METRICS, ONE_OPTIMAL
 
 Said = tuple[int, str, str]
@@ -286,6 +286,17 @@ def test_settings_in_which_runs_differ_are_told(runs: tuple[Path, Path]) -> None
         "versions.numpy": (config["versions"]["numpy"], "9"),
         "condition.6g.tau_nats": ("0.7", "0.5"),
     }, "a setting that an older run does not have is what it was then"
+
+
+def test_settings_are_told_in_their_order() -> None:
+    others = ("extensions", "identity", "versions")
+    assert (*ORDER, *others) == TOLD
+
+
+def test_a_setting_of_an_extension_in_which_runs_differ_is_told(runs: tuple[Path, Path]) -> None:
+    config = json.loads((runs[1] / "run.json").read_text())
+    configure(runs[1], settings=config["settings"] | {"extensions": {"level": 2}})
+    assert found(runs).settings == (("extensions.level", None, "2"),)
 
 
 def test_runs_of_other_lengths_and_conditions_are_compared_where_they_meet(

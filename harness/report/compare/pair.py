@@ -21,12 +21,15 @@ from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
 from harness.runs.reliability import Judged
+from harness.runs.settings import COMPARED
 from harness.world.parameters import DIALS
 
-SETTINGS = (
+# The order in which settings are told; one that is not here comes after them.
+ORDER = (
     "model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip", "temperature",
-    "sampling_seed", "helpers", "ties", "dtype", "latency", "identity", "versions",
+    "sampling_seed", "helpers", "ties", "dtype", "latency",
 )  # fmt: skip
+TOLD = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
 
 
 def where(run: Run) -> str:
@@ -136,7 +139,8 @@ def pair(a: Path, b: Path) -> Pair:
 
 def _side(run: Run) -> Side:
     stated = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    named = {key: stated[key] for key in SETTINGS}
+    opened = {**stated["settings"], **stated}  # a model, say, is told by what was opened
+    named = {key: opened[key] for key in TOLD}
     if run.world == "closed-loop":
         parameters = stated["world"]["scenario"]["parameters"]
         named["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
