@@ -18,6 +18,8 @@ from harness.extensions.learn.rewards.values import BEST, Values, optimal
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the sim extra")
 
+pytestmark = pytest.mark.usefixtures("unrebuilt")
+
 Make = Callable[..., Any]
 
 
