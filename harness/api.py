@@ -74,15 +74,14 @@ class Run(Tables):
 
         import pandas as pd
 
-        rows = [
-            {"condition": condition}
-            | {
-                head: cell(score)
-                for head, metric in HEADLINE.items()
-                if (score := self.source.score(condition, metric))
-            }
-            for condition in self.source.conditions
-        ]
+        rows = []
+        for condition in self.source.conditions:
+            row = {"condition": condition}
+            for head, metric in HEADLINE.items():
+                score = self.source.score(condition, metric)
+                if score:
+                    row[head] = cell(score)
+            rows.append(row)
         void = [finding.sentence for finding in findings(self.source, Kind.VOID)]
         n = f"n = {crossed(len(self.source.grid.episodes), len(self.source.grid.seeds))}"
         sentences = [words.headline(self.source), *void]
@@ -112,7 +111,8 @@ class DecisionPoint:
         """The scene from above."""
         from harness.report.drawing.scene import draw
 
-        draw(self.scene, picture := BytesIO(), "svg", self.viewer)
+        picture = BytesIO()
+        draw(self.scene, picture, "svg", self.viewer)
         return picture.getvalue().decode()
 
     def _repr_html_(self) -> str:
@@ -219,7 +219,9 @@ def run(
     from harness.evaluate.spec import Source
     from harness.runs import settings
 
-    names = {kind: {each.name: each for each in settings.options(kind)} for kind in settings.WORLDS.values()}
+    names = {}
+    for world in settings.WORLDS.values():
+        names[world] = {each.name: each for each in settings.options(world)}
     frozen, driven = names.values()
     kind = settings.DriveSettings if set(options) & (driven.keys() - frozen) else settings.FrozenSettings
     for name in options:
@@ -330,7 +332,7 @@ def _several(value: str | Sequence[str]) -> Sequence[str]:
 
 def _page(sentences: Sequence[str], *parts: Markup | str) -> str:
     paragraphs = [Markup("<p>{}</p>").format(sentence) for sentence in sentences]
-    return Markup("").join([*paragraphs, *map(escape, parts)])
+    return Markup("").join(paragraphs + [escape(part) for part in parts])
 
 
 def _frame(frame: "pd.DataFrame") -> Markup:

@@ -378,11 +378,12 @@ def in_question(text: str, words: bool, objects: bool) -> str:
     which they act.
     """
     named = sorted((part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds)
-    return "&".join(
-        ":".join([name, *(setting for setting in settings if not setting.startswith("share="))])
-        for name, *settings in named
-        if (words and ATTACKS[name].in_text) or (objects and ATTACKS[name].in_objects)
-    )
+    shown = []
+    for name, *settings in named:
+        if (words and ATTACKS[name].in_text) or (objects and ATTACKS[name].in_objects):
+            others = [setting for setting in settings if not setting.startswith("share=")]
+            shown.append(":".join([name, *others]))
+    return "&".join(shown)
 
 
 def _attack(text: str) -> Attack:

@@ -112,7 +112,9 @@ class Intents:
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
         """Concatenate decisions with the same number of vehicles; none has a site, an outlook or claims."""
         arrays = [part.arrays() for part in parts]
-        joint: dict[str, Any] = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
+        joint: dict[str, Any] = {}
+        for name in arrays[0]:
+            joint[name] = np.concatenate([part[name] for part in arrays])
         return cls(**joint)
 
     def of_first(self, helpers: int) -> "Intents":

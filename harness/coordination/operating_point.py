@@ -252,7 +252,8 @@ class OperatingPoint:
         except ValueError as error:
             raise _error_of(name, error) from None
         own: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
-        others = [part for part in self.more if type(part) not in {*map(type, parts.values())}]
+        changed_kinds = {type(part) for part in parts.values()}
+        others = [part for part in self.more if type(part) not in changed_kinds]
         more = (*others, *(parts[part] for part in more_parts() if part in parts))
         return replace(self, name=name, more=more, **own)
 

@@ -294,4 +294,5 @@ def description(hint: Any) -> str | None:
     """Return the text of a type's `Meta(description=...)`."""
     texts = (meta.description for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta))
     members = get_args(hint) if get_origin(hint) in (Annotated, Union, UnionType) else ()
-    return next(filter(None, (*texts, *map(description, members))), None)
+    of_members = [description(member) for member in members]
+    return next(filter(None, [*texts, *of_members]), None)

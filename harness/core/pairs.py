@@ -3,4 +3,5 @@
 
 def pairs(text: str) -> dict[str, str]:
     """Return the names and values in `density_per_km=200,power_dbm=23`; a missing value is empty."""
-    return {key: value for key, _, value in (pair.partition("=") for pair in text.split(",") if pair)}
+    parted = [pair.partition("=") for pair in text.split(",") if pair]
+    return {key: value for key, _, value in parted}

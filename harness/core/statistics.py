@@ -231,7 +231,9 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     ("MOVER": Zou and Donner 2008), so the level is theirs. The averaged estimates are taken as fixed and not
     as a sample: the interval says nothing of another family of scenes. NaN where any estimate is.
     """
-    value, low, high = (np.array([getattr(e, end) for e in estimates]) for end in ("value", "low", "high"))
+    value = np.array([estimate.value for estimate in estimates])
+    low = np.array([estimate.low for estimate in estimates])
+    high = np.array([estimate.high for estimate in estimates])
     mean = float(np.mean(value))
     below, above = (math.hypot(*(value - end)) / len(value) for end in (low, high))
     n, n_excluded = sum(e.n for e in estimates), sum(e.n_excluded for e in estimates)

@@ -91,9 +91,8 @@ def same(
     """
     now = msgspec.json.decode(msgspec.json.encode(now))  # turns tuples into lists, as they are stored
     if differing := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
-        words = {
-            key: str(value) for key in differing if isinstance(value := stored.get(key), str | int | float)
-        }
+        before = {key: stored.get(key) for key in differing}
+        words = {key: str(value) for key, value in before.items() if isinstance(value, str | int | float)}
         short = ", ".join(f"{key} {value}" for key, value in words.items() if len(value) <= SHORT)
         what = typed() or f"another {', '.join(differing)}"
         repeated = f" ({short})" if short and what.startswith("another ") else ""

@@ -84,7 +84,8 @@ def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tu
 def _numbers(value: object) -> list[float]:
     """Return the numbers in a JSON value in order; also those in keys and texts, so that none is lost."""
     if isinstance(value, dict):
-        return [number for pair in value.items() for part in pair for number in _numbers(part)]
+        parts = [part for pair in value.items() for part in pair]
+        return [number for part in parts for number in _numbers(part)]
     if isinstance(value, list):
         return [number for item in value for number in _numbers(item)]
     if isinstance(value, str):

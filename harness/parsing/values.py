@@ -207,7 +207,7 @@ def _written(
     placeholders: tuple[str, ...], actions: tuple[str, ...]
 ) -> tuple[frozenset[str], tuple[frozenset[str], ...]]:
     """Return the placeholders of a prompt, folded, and the choices that each of them offers."""
-    offered = [*map(_choices, placeholders), _choices("|".join(RISKS)), _choices("|".join(actions))]
+    offered = [_choices(text) for text in (*placeholders, "|".join(RISKS), "|".join(actions))]
     return frozenset(map(_folded, placeholders)), tuple(offered)
 
 

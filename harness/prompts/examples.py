@@ -44,8 +44,9 @@ class Examples(Struct, frozen=True):
         """Return each role's examples of these numbers, from 1, in this order; None without any."""
         if not numbers:
             return None
-        some = {role: tuple(self.of(role)[number - 1] for number in numbers) for role in ("ego", "helper")}
-        return msgspec.structs.replace(self, **some)
+        ego = tuple(self.of("ego")[number - 1] for number in numbers)
+        helper = tuple(self.of("helper")[number - 1] for number in numbers)
+        return msgspec.structs.replace(self, ego=ego, helper=helper)
 
     @property
     def seeds(self) -> frozenset[int]:

@@ -194,7 +194,9 @@ def _success(radio: Sidelink) -> Floats:
                 radio.transmissions * same(np.abs(_DISTANCE_M[:, None] + side * interferers_m))
                 for side in (-1, 1)
             ]
-            free += weight * np.array([_none(*(side[d] * hit for side in sides)) for d in range(len(shares))])
+            one, other = sides
+            for_each = [_none(one[d] * hit, other[d] * hit) for d in range(len(shares))]
+            free += weight * np.array(for_each)
             mean_hit = shares @ hit
             free_on_average += weight * _none(*(side * mean_hit for side in sides))
     # The source multiplies the interferers' average collisions. A link's own power is the same against all of

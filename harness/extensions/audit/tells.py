@@ -124,10 +124,11 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
                 f"{count} of {len(layouts)} layouts of {scenario.name} {what}; an audit needs {FOLDS}, "
                 "give more with --layouts"
             )
-    hidden = [
-        sum(danger != NONE and any(step == k for step, _ in points) for danger, points in layouts)
-        for k in range(scenario.parameters.decisions)
-    ]
+    hidden = [0] * scenario.parameters.decisions
+    for there, points in layouts:
+        if there != NONE:
+            for at in {at for at, _ in points}:
+                hidden[at] += 1
     steps = [k for k, count in enumerate(hidden) if 2 * count >= dangers]
     rows = [
         (layout, step, danger, values)
@@ -154,11 +155,11 @@ def judge(points: HiddenPoints, sectors: tuple[str, ...]) -> tuple[dict[str, Est
     known, classes = ~np.isnan(points.numbers), np.unique(danger)
     folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(known, danger, layout))
     # Learning fails on a number that is unknown wherever a model learns.
-    varies = [
-        k
-        for k, column in enumerate(points.numbers.T)
-        if len(np.unique(column[known[:, k]])) > 1 and all(known[learnt, k].any() for learnt, _ in folds)
-    ]
+    varies = []
+    for k, column in enumerate(points.numbers.T):
+        known_where_learnt = all(known[learnt, k].any() for learnt, _ in folds)
+        if known_where_learnt and len(np.unique(column[known[:, k]])) > 1:
+            varies.append(k)
     table, names = points.numbers[:, varies], [points.names[k] for k in varies]
     trees = partial(HistGradientBoostingClassifier, max_leaf_nodes=8, early_stopping=False, random_state=0)
     models = [trees(max_iter=40).fit(table[learnt], danger[learnt]) for learnt, _ in folds]

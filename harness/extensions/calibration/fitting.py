@@ -85,7 +85,8 @@ def calibrate(
     check_seeds(name, first, last)
     rebuilt.refuse(data)
     check_scenes(run, data)
-    fitted = [each for role in ("ego", "helper") if (each := _of_role(run, role, forest, level))]
+    of_roles = [_of_role(run, role, forest, level) for role in ("ego", "helper")]
+    fitted = [each for each in of_roles if each]
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")
     corrections = {each.role: each.correction for each in fitted}

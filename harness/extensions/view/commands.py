@@ -3,7 +3,7 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -102,11 +102,13 @@ def history(
     if html:
         write(groups, html)
     if as_json:
-        echo_json([
-            {"scenes": group.of, "condition": group.condition, "metric": group.metric,
-             "runs": [_mapping(line) for line in group.lines]}
-            for group in groups
-        ] + [{"run": name, "error": str(error)} for name, error in wrong.items()])  # fmt: skip
+        records: list[dict[str, Any]] = []
+        for group in groups:
+            record = {"scenes": group.of, "condition": group.condition, "metric": group.metric}
+            records.append({**record, "runs": [_mapping(line) for line in group.lines]})
+        for name, error in wrong.items():
+            records.append({"run": name, "error": str(error)})
+        echo_json(records)
         return
     names = {g.metric: f"{g.metric}{' %' * (entry(g.metric).unit.name == '%')}" for g in groups}
     typer.echo(f"{' or '.join(names.values())} with its 95 % interval")

@@ -23,8 +23,7 @@ def everything(runs: Runs, name: str) -> dict[str, Any]:
     if not any(name in run.decisions.scenes for run in runs.runs):
         raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
     scenes = replayed(runs, [name]) if runs.live else {}
-    details = Details(
-        runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True, [*map(left_out, runs.runs)]
-    )
+    without = [left_out(run) for run in runs.runs]
+    details = Details(runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True, without)
     [[detail]] = details.blocks([name])
     return detail

@@ -100,10 +100,8 @@ def listed(folder: Path, words: str, order: str) -> str:
     how_far = extents(folder, every)
     order = order if order.removeprefix("-") in COLUMNS else NEWEST
     shown = sort([run for run in every if _has(run, words)], order)
-    links = {
-        column: urlencode({"sort": _next(column, order), **({"q": words} if words else {})})
-        for column in COLUMNS
-    }
+    asked = {"q": words} if words else {}
+    links = {column: urlencode({"sort": _next(column, order), **asked}) for column in COLUMNS}
     going = any(run.name in how_far and how_far[run.name].going for run in shown)
     return _page(
         "list.html.j2", folder=str(folder), every=len(every), runs=shown, words=words, order=order,
@@ -168,7 +166,9 @@ def style() -> str:
 
 def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
     """Return a link to the notes on a run, with its text; or to a new note on one decision point of it."""
-    where = {"path": run, **({} if scene is None else {"scene": scene})}
+    where = {"path": run}
+    if scene is not None:
+        where["scene"] = scene
     return "Notes" if scene is None else "Note on this decision", f"/notes?{urlencode(where)}"
 
 
