@@ -191,14 +191,15 @@ class Decisions:
         return self._rows[chunk][offset]
 
     def _record(self, row: Mapping[str, Any]) -> Decision:
-        messages = tuple(
-            Message(sender, *(row[f"{name}_{place}"] for name in OF_MESSAGES if name != "helper"))
-            for place in range(1, self.helpers + 1)
-            if (sender := row[f"helper_{place}"]) is not None
-        )
+        messages: list[Message] = []
+        for place in range(1, self.helpers + 1):
+            sender = row[f"helper_{place}"]
+            if sender is not None:
+                values = [row[f"{name}_{place}"] for name in OF_MESSAGES if name != "helper"]
+                messages.append(Message(sender, *values))
         plain = {name: row[name] for name in Decision.__struct_fields__ if name in COLUMNS}
         fused = tuple(row[f"fused_{action}"] for action in self.actions)
-        return Decision(**{**plain, "fused": fused, "messages": messages})
+        return Decision(**{**plain, "fused": fused, "messages": tuple(messages)})
 
     def infinite(self) -> str | None:
         """Return the name of a column with an infinite number, or None."""
@@ -358,7 +359,7 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
     if isinstance(values, Labels):
         codes = _of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
         texts = [name.encode() for name in values.names]
-        ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        ends = np.cumsum([0] + [len(text) for text in texts], dtype=np.int32)
         names = pa.StringArray.from_buffers(len(texts), pa.py_buffer(ends), pa.py_buffer(b"".join(texts)))
         return pa.DictionaryArray.from_arrays(codes, names)
     if kind == WHOLE:

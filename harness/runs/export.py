@@ -119,5 +119,6 @@ def _json(value: object) -> str | None:
 
 def _line(cells: Sequence[object]) -> str:
     """Return a line of CSV that ends in a line feed; cells with any break are quoted."""
-    csv.writer(line := StringIO(), lineterminator="\r\n").writerow(list(map(neutral, cells)))
+    line = StringIO()
+    csv.writer(line, lineterminator="\r\n").writerow([neutral(cell) for cell in cells])
     return line.getvalue()[:-2] + "\n"

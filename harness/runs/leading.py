@@ -29,7 +29,10 @@ def leading(*names: Container[str]) -> str:
 
 def lead_of(*runs: Scored) -> str:
     """Return the metric by which runs are read together: balanced success where all of them state it."""
-    return leading(*({score.metric for score in run.scores if score.value is not None} for run in runs))
+    stated = []
+    for run in runs:
+        stated.append({score.metric for score in run.scores if score.value is not None})
+    return leading(*stated)
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:

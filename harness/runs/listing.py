@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import TextIOWrapper
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -186,10 +187,13 @@ def _means(summaries: Sequence[Rows]) -> Rows:
     from harness.core.statistics import Estimate, mean_of  # imported here because it is slow
 
     keys, ends = ("condition", "metric", "interval"), ("value", "ci_low", "ci_high")
-    by_key = [{tuple(row[key] for key in keys): row for row in rows} for rows in summaries]
-    shared = [key for key in by_key[0] if all(key in rows for rows in by_key)]
+    key_of = itemgetter(*keys)
+    by_key = []
+    for summary in summaries:
+        by_key.append({key_of(row): row for row in summary})
+    shared = set(by_key[0]).intersection(*by_key[1:])
     means = list[dict[str, str]]()
-    for key in shared:
+    for key in (key for key in by_key[0] if key in shared):
         of_families = list[Estimate]()
         for rows in by_key:
             value, low, high = (float(rows[key][end] or "nan") for end in ends)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -479,7 +480,7 @@ class Grid:
     def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
         """Return the episodes in the order of the cells. Raises ValueError unless each is there once."""
         by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
-        cells = [(c, s, e) for c in self.conditions for s in self.seeds for e in self.episodes]
+        cells = [*product(self.conditions, self.seeds, self.episodes)]
         if len(by_cell) != len(episodes) or set(by_cell) != set(cells):
             raise ValueError("not every episode is there once in every condition and seed")
         return [by_cell[cell] for cell in cells]

@@ -33,9 +33,9 @@ def differences(
     n = len(set().union(*(set(of_a[0].tolist()) for of_a, _ in common)))
     if not n:
         return
-    values_a, values_b = (
-        known_mean(np.array([_percentiles(pair[side], weights) for pair in common]), 0) for side in (0, 1)
-    )
+    of_a = [_percentiles(of_one, weights) for of_one, _ in common]
+    of_b = [_percentiles(of_other, weights) for _, of_other in common]
+    values_a, values_b = known_mean(np.array(of_a), 0), known_mean(np.array(of_b), 0)
     for percent, x, y in zip(PERCENTILES, values_a, values_b, strict=True):
         estimate = Estimate(float(y[0] - x[0]), *_ends(y - x, n), n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate

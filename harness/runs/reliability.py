@@ -81,7 +81,8 @@ class Judged:
         """Join parts of so many episodes each, one after the other."""
         starts = np.cumsum([0, *sizes[:-1]])
         episode = [part.episode + start for part, start in zip(parts, starts, strict=True)]
-        sure, hits = (np.concatenate([getattr(part, name) for part in parts]) for name in ("sure", "right"))
+        sure = np.concatenate([part.sure for part in parts])
+        hits = np.concatenate([part.right for part in parts])
         return cls(sure, hits, np.concatenate(episode))
 
     def bins(self) -> Ints:
@@ -144,7 +145,9 @@ def estimates(
     resamples are all alike has an interval of no width, which rounding may have left out.
     """
     known = [figure for figure in figures if _known(figure, judged, older)]
-    values = [[figure(*sums) for figure in known] for sums in _sums(judged, episodes)] if known else []
+    values = []
+    for sums in _sums(judged, episodes) if known else ():
+        values.append([figure(*sums) for figure in known])
     found = iter(_estimate(parts, judged, episodes, older) for parts in zip(*values, strict=True))
     return [next(found) if figure in known else _unknown(episodes) for figure in figures]
 
@@ -159,7 +162,8 @@ def difference(a: Judged, b: Judged, figure: Figure, episodes: int) -> tuple[flo
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
     if not (_known(figure, a) and _known(figure, b)):
         return math.nan, math.nan, _unknown(episodes)
-    of_a, of_b = (np.concatenate([figure(*sums) for sums in _sums(side, episodes)]) for side in (a, b))
+    of_a = np.concatenate([figure(*sums) for sums in _sums(a, episodes)])
+    of_b = np.concatenate([figure(*sums) for sums in _sums(b, episodes)])
     return float(of_a[0]), float(of_b[0]), _estimate([of_b - of_a], a, episodes)
 
 

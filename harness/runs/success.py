@@ -117,7 +117,8 @@ class Success:
 
     def _mean(self, estimate: Callable[[Bools], Estimate]) -> Estimate:
         parts = self.parts
-        return mean_of([*map(estimate, parts)]) if len(parts) > 1 else estimate(parts[0])
+        estimates = [estimate(part) for part in parts]
+        return mean_of(estimates) if len(estimates) > 1 else estimates[0]
 
 
 def by_condition(

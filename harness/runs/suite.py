@@ -52,7 +52,9 @@ class SuiteRun:
         """The first run's manifest with the counts of all runs, without times, which differ by run."""
         manifests = [run.manifest for run in self.runs.values()]
         counts = ("cached_answers", "engine_errors", "retries")
-        totals = {name: sum(getattr(m, name) for m in manifests) for name in counts}
+        totals = {}
+        for name in counts:
+            totals[name] = sum(getattr(manifest, name) for manifest in manifests)
         latency = msgspec.structs.replace(manifests[0].latency, sample={})
         cost = Cost.joined(manifests) or msgspec.UNSET
         return msgspec.structs.replace(manifests[0], latency=latency, answer_times={}, cost=cost, **totals)
@@ -84,7 +86,9 @@ class SuiteRun:
 
     def _means(self) -> Iterator[Score]:
         first, *rest = self.runs.values()
-        others_by_key = [{s.key: s for s in run.scores} for run in rest]
+        others_by_key = []
+        for run in rest:
+            others_by_key.append({s.key: s for s in run.scores})
         for s in first.scores:
             if s.interval != "seed means" and all(s.key in scores for scores in others_by_key):
                 of_families = [s, *(scores[s.key] for scores in others_by_key)]

@@ -82,14 +82,17 @@ class Figures:
     def joined(cls, parts: Sequence["Figures"]) -> "Figures":
         """Join the figures of parts of a run, which differ in their episodes."""
         episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
+        values = {}
+        for name in parts[0].values:
+            values[name] = np.concatenate([part.values[name] for part in parts], axis=2)
+        by_condition = zip(*[part.latency_ms for part in parts], strict=True)
+        judged_by_condition = zip(*[part.judged for part in parts], strict=True)
+        sizes = [len(part.grid.episodes) for part in parts]
         return cls(
             replace(parts[0].grid, episodes=episodes),
-            {name: np.concatenate([part.values[name] for part in parts], axis=2) for name in parts[0].values},
-            [np.concatenate(each) for each in zip(*(part.latency_ms for part in parts), strict=True)],
-            [
-                Judged.joined(each, [len(part.grid.episodes) for part in parts])
-                for each in zip(*(part.judged for part in parts), strict=True)
-            ],
+            values,
+            [np.concatenate(each) for each in by_condition],
+            [Judged.joined(each, sizes) for each in judged_by_condition],
             list(chain.from_iterable(part.answers for part in parts)),
         )
 
@@ -177,8 +180,11 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
 
     Intervals are over episodes, since the answers of one episode are not independent.
     """
-    pairs = {role: [(a, episode) for a, episode in answers if a.role == role] for role in ROLES}
-    by_role = {role: tuple(zip(*pairs[role], strict=True)) for role in ROLES if pairs[role]}
+    by_role = {}
+    for role in ROLES:
+        pairs = [(answer, episode) for answer, episode in answers if answer.role == role]
+        if pairs:
+            by_role[role] = tuple(zip(*pairs, strict=True))
     for metric in METRICS.values():
         if metric.answers and metric.role in by_role:
             role_answers, numbers = by_role[metric.role]

@@ -80,11 +80,10 @@ class Tables:
         import pandas as pd
 
         answers, actions = list(self.source.answers), self.config["actions"]
-        columns = {
-            name: [answer.cell(name) for answer in answers]
-            for name in (*Answer.__struct_fields__, *TURNS)
-            if name not in ("heard", "repairs", "intent", "message", "first", "extension")
-        }
+        columns = {}
+        for name in (*Answer.__struct_fields__, *TURNS):
+            if name not in ("heard", "repairs", "intent", "message", "first", "extension"):
+                columns[name] = [answer.cell(name) for answer in answers]
         unknown = (np.nan,) * len(actions)
         intents = np.array([answer.intent or unknown for answer in answers]).reshape(-1, len(actions))
         table = pd.DataFrame({
@@ -92,8 +91,9 @@ class Tables:
             "heard": ["+".join(answer.heard) for answer in answers],
             "repairs": [" ".join(answer.repairs) for answer in answers],
             **{f"intent_{action}": intents[:, place] for place, action in enumerate(actions)},
-            **{key: [(answer.message or {}).get(key) for answer in answers] for key in MESSAGE},
         })  # fmt: skip
+        for key in MESSAGE:
+            table[key] = [(answer.message or {}).get(key) for answer in answers]
         table = table.astype(dict.fromkeys(table.columns[table.isna().all()], float))
         places = self.decisions[[*PLACE, "agent"]].rename(columns={"agent": "decider"})
         if places.decider.isna().all():  # only the ego decides

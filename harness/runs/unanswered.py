@@ -61,7 +61,7 @@ class Tally:
 
     def counts(self) -> str:
         """Return how many questions got no answer, by role; empty if all did."""
-        counts = [(n, self.asked[r], who) for r, who in _WHO.items() if (n := self.unanswered[r])]
+        counts = [(self.unanswered[r], self.asked[r], who) for r, who in _WHO.items() if self.unanswered[r]]
         return ", ".join(f"{n} of {asked} questions to {who}" for n, asked, who in counts)
 
 

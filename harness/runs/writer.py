@@ -78,10 +78,11 @@ def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | N
     text, records = io.StringIO(), list(records)
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}
-    columns = {
-        field: name for field, name in zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True)
-        if field not in formats.SPARSE or any(getattr(record, field) is not None for record in records)
-    }  # fmt: skip
+    columns = {}
+    for field, name in zip(kind.__struct_fields__, kind.__struct_encode_fields__, strict=True):
+        is_sparse = field in formats.SPARSE
+        if not is_sparse or any(getattr(record, field) is not None for record in records):
+            columns[field] = name
     writer.writerow([*variant_columns, *columns.values()])
     values = attrgetter(*columns)
     writer.writerows((*variant_columns.values(), *values(record)) for record in records)
