@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from harness.cli import app, main
 from harness.coordination.operating_point import named_point
+from harness.core import extras
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource
 from harness.extensions.media.stills import find, stills
@@ -126,15 +127,13 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     out, tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "folder.gif").mkdir()
-    without = [p for p in sys.path if not (Path(p) / "imageio_ffmpeg").is_dir()]
     for name, says in (
         ("x.avi", "end it in .gif or .mp4"),
         ("folder.gif", "is a folder; name a file in it"),
         ("x.mp4", ".mp4 needs imageio-ffmpeg, which is not installed; run `pip install 'swarmdrive-harness["),
     ):
         if name == "x.mp4":
-            monkeypatch.setattr(sys, "path", without)
-            monkeypatch.delitem(sys.modules, "imageio_ffmpeg", raising=False)
+            monkeypatch.setattr(extras, "find_spec", lambda name: None)
         code, said, error = typed(monkeypatch, capsys, "run", "video", out, 0, "--out", tmp_path / name)
         assert (code, said, error.count("\n")) == (2, "", 1)
         assert says in error
