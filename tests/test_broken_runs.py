@@ -19,7 +19,7 @@ from harness.core.errors import UserError
 from harness.report.compare import text
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
-from harness.runs import folder
+from harness.runs import folder, formats
 
 READERS: dict[str, Callable[[Path], object]] = {
     "decisions.parquet": lambda run: folder.read(run).decisions,
@@ -184,6 +184,18 @@ def test_settings_that_say_otherwise_than_what_stands_beside_them(
     stated = json.loads((run / "run.json").read_text())
     (run / "run.json").write_text(json.dumps({**stated, "settings": {**stated["settings"], **settings}}))
     assert said in refused(run, "run.json")
+
+
+@pytest.mark.parametrize(
+    ("typed", "name", "may_be"),
+    [
+        ("env:highway-v0:decisions=3:config={\"a\":1,\"b\":2}", "env:highway-v0:config={\"a\":1}", True),
+        ("env:highway-v0", "env:u-turn-v0", False), ("crossing:ambient=fog", "crossing", True),
+        ("crossing:ambient=fog", "merge", False), ("proxy,a/b", "proxy,b", True), ("proxy", "proxy,b", False),
+    ],
+)  # fmt: skip
+def test_what_was_typed_may_open_what_is_called_so(typed: str, name: str, may_be: bool) -> None:
+    assert formats._may_be(typed, name) == may_be
 
 
 @pytest.mark.parametrize("table", [None, [], "all", 3])
