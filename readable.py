@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 CEILINGS = ROOT / "readable.toml"
-LONGEST = 100
+LONGEST, SHOWN = 100, 30  # characters of a line; places that are listed
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 RULES = {
     "nested": "a comprehension inside another, or one of three clauses",
@@ -93,7 +93,7 @@ def main() -> int:
         there, ceiling = places.get((rule, room), []), ceilings.get((rule, room), 0)
         if len(there) > ceiling:
             print(f"harness/{room}: {RULES[rule]}: {len(there)} places, and at most {ceiling}:")
-            print(*(f"  {place}" for place in there), sep="\n")
+            print(*(f"  {place}" for place in there[:SHOWN]), sep="\n")
         elif len(there) < ceiling:
             print(f"harness/{room}: {rule}: {len(there)} of {ceiling}; type `python readable.py --lower`")
         differing += len(there) != ceiling

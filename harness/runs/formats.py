@@ -207,7 +207,7 @@ def _may_be(typed: Any, names: Any) -> bool:
         return typed is None or names is None
     if "://" in typed or typed.startswith("replay:"):
         return True
-    if typed.startswith("env:"):  # an environment has its name behind a colon, and commas in its settings
+    if typed.startswith("env:"):  # whose name stands behind a colon, and settings have commas
         return typed.split(":")[:2] == names.split(":")[:2]
     each_name = names.split(",")
     each_typed = typed.split(",", len(each_name) - 1)
