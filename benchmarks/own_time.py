@@ -41,7 +41,7 @@ from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.prompts.template import Template
-from harness.runs import folder as folders
+from harness.runs import run_parts
 from harness.runs.folder import read
 from harness.world.scene_graph import SceneGraph
 
@@ -58,7 +58,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "lay out": [(Asker, "laid_out")],
     "coordinate": [(walk, "exchange"), (walk, "fuse")],
     "keep": [(KeptAnswers, "append")],
-    "table": [(run, "table"), (folders, "part_files"), (folders, "write_part")],
+    "table": [(run, "table"), (run_parts, "part_files"), (run_parts, "write_part")],
     "score": [(run, "_gather")],
 }  # fmt: skip
 OTHERS = ("proxy", "copies")
