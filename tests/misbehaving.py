@@ -50,15 +50,15 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, play: Play, listed: Play) -> None:
+    def __init__(self, play: Play, listed: Play, path: str) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.play, self.listed = play, listed
+        self.play, self.listed, self.path = play, listed, path
         self.asked: list[Asked] = []
         self.lock = threading.Lock()
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_address[1]}/v1"
+        return f"http://127.0.0.1:{self.server_address[1]}{self.path}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that hangs up is no news."""
@@ -118,9 +118,14 @@ def read_out(*likeliest: tuple[str, float]) -> dict[str, Any]:
     return made
 
 
+def usual(asked: Asked) -> None:
+    """List two models."""
+    asked.reply(LISTED)
+
+
 @contextmanager
-def serving(play: Play, listed: Play = lambda asked: asked.reply(LISTED)) -> Iterator[Server]:
-    server = Server(play, listed)
+def serving(play: Play, listed: Play = usual, path: str = "/v1") -> Iterator[Server]:
+    server = Server(play, listed, path)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:

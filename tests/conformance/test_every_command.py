@@ -31,6 +31,7 @@ from harness.prompts import versions
 
 Said = tuple[int, str, str]
 SECRET = "sk-canary-0123456789"
+STRANGE = "/stranger"
 MODULE = "canary_module"
 ENV = f"env:{MODULE}:canary-v0"
 TRAFFIC = f'env:merge-v0:config={{"other_vehicles_type":"{MODULE}.Car"}}'
@@ -283,11 +284,15 @@ def base(small: Dataset, small_path: Path, tmp_path_factory: pytest.TempPathFact
 @pytest.fixture(scope="module")
 def theirs() -> Iterator[Server]:
     """The stranger's server, which nobody may ask: it would answer."""
-    with serving(lambda asked: asked.reply(completion("{}")), listed) as server:
+    with serving(lambda asked: asked.reply(completion("{}")), listed, f"{STRANGE}/v1") as server:
         yield server
 
 
 def listed(asked: Asked) -> None:
+    if not asked.path.startswith(STRANGE):
+        # A pool of another worker's test waits for its server, whose port this server was given since.
+        asked.reply({}, 404)
+        return
     asked.handler.server.asked.append(asked)
     asked.reply({"data": [{"id": "m"}]})
 
