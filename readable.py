@@ -1,7 +1,8 @@
-"""Hold how code reads to ceilings that only fall: `python readable.py`, and `--lower` where there are fewer.
+"""Hold how code reads to ceilings that only fall:
+`python readable.py`, and `--lower` where there are fewer.
 
-`readable.toml` has, by rule and room of `harness/`, how many places break it; a room that is not there has
-none. CONTRIBUTING.md says what the rules are for.
+`readable.toml` has, by rule and room of `harness/`, how many places break it; a room that is not
+there has none. CONTRIBUTING.md says what the rules are for.
 """
 
 import ast
@@ -13,13 +14,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 CEILINGS = ROOT / "readable.toml"
-LONGEST, SHOWN = 100, 30  # characters of a line; places that are listed
+SHOWN = 30  # places that are listed
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 RULES = {
     "nested": "a comprehension inside another, or one of three clauses",
     "spread": "`*map(…)`, or `**(… if … else …)`",
     "walrus": "`:=` outside the test of an if or while",
-    "long": f"a line of more than {LONGEST} characters",
     "unformatted": "`fmt: skip` or `fmt: off`",
 }
 Place = tuple[str, int]  # a rule, and the line that breaks it
@@ -28,8 +28,6 @@ Place = tuple[str, int]  # a rule, and the line that breaks it
 def broken(source: str) -> Iterator[Place]:
     """Yield each rule that a file breaks, and the line where it does."""
     for number, line in enumerate(source.splitlines(), 1):
-        if len(line) > LONGEST:
-            yield "long", number
         if "# fmt: skip" in line or "# fmt: off" in line:
             yield "unformatted", number
     tree = ast.parse(source)
@@ -87,7 +85,9 @@ def main() -> int:
     if sys.argv[1:] == ["--lower"]:
         return _lower(places)
     stated = tomllib.loads(CEILINGS.read_text())
-    ceilings = {(rule, room): count for rule, rooms in stated.items() for room, count in rooms.items()}
+    ceilings = {
+        (rule, room): count for rule, rooms in stated.items() for room, count in rooms.items()
+    }
     differing = 0
     for rule, room in sorted({*places, *ceilings}):
         there, ceiling = places.get((rule, room), []), ceilings.get((rule, room), 0)
@@ -95,7 +95,10 @@ def main() -> int:
             print(f"harness/{room}: {RULES[rule]}: {len(there)} places, and at most {ceiling}:")
             print(*(f"  {place}" for place in there[:SHOWN]), sep="\n")
         elif len(there) < ceiling:
-            print(f"harness/{room}: {rule}: {len(there)} of {ceiling}; type `python readable.py --lower`")
+            print(
+                f"harness/{room}: {rule}: {len(there)} of {ceiling}; type `python readable.py "
+                f"--lower`"
+            )
         differing += len(there) != ceiling
     return int(differing > 0)
 

@@ -5,9 +5,9 @@
     python requirements.py rebuild llama-cpp-python .venv/bin/python
     .venv/bin/python requirements.py write                  # what .venv has; needs uv
 
-The lock file's groups say which installs need them; all need `base`. torch stands in its first line alone:
-its build differs by machine (CPU or CUDA), so it is named by its release. Building a wheel fetches its
-build tools.
+The lock file's groups say which installs need them; all need `base`. torch stands in its first line
+alone: its build differs by machine (CPU or CUDA), so it is named by its release. Building a wheel
+fetches its build tools.
 """
 
 import re
@@ -39,10 +39,14 @@ def install(name: str, python: str, *options: str) -> None:
 
 
 def packages(name: str, python: str, *options: str) -> None:
-    """Install the locked packages of one of `INSTALLS` for an interpreter, each checked by its digest."""
+    """Install the locked packages of one of `INSTALLS` for an interpreter,
+    each checked by its digest.
+    """
     groups = re.split(r"^# (.*)\n", LOCK.read_text(), flags=re.MULTILINE)[1:]
     needs = (
-        text for head, text in zip(groups[::2], groups[1::2], strict=True) if {"base", name} & {*head.split()}
+        text
+        for head, text in zip(groups[::2], groups[1::2], strict=True)
+        if {"base", name} & {*head.split()}
     )
     _hashed(python, "".join(needs), *options)
 
@@ -72,9 +76,12 @@ def write() -> None:
     by_install = {name: needed(extras) for name, extras in INSTALLS.items()}
     for package in sorted(set().union(*by_install.values()) - {"torch"}):
         names = [name for name, packages in by_install.items() if package in packages]
-        groups["base" if "base" in names else " ".join(names)].append(f"{package}=={version(package)}")
+        groups["base" if "base" in names else " ".join(names)].append(
+            f"{package}=={version(package)}"
+        )
     parts = [
-        f"# Written by requirements.py; by its release alone: torch=={version('torch').partition('+')[0]}\n"
+        f"# Written by requirements.py; by its release alone: "
+        f"torch=={version('torch').partition('+')[0]}\n"
     ]
     compiles = [
         *(
@@ -97,7 +104,9 @@ def write() -> None:
 
 
 def needed(extras: tuple[str, ...]) -> set[str]:
-    """Return the names of all packages that the project needs with some extras, on this Python and system."""
+    """Return the names of all packages that the project needs with some extras,
+    on this Python and system.
+    """
     met: set[tuple[str, str]] = set()
     pending = [(PROJECT, extra) for extra in ("", *extras)] + [(name, "") for name in BUILDS]
     while pending:
@@ -120,4 +129,6 @@ def _requirements(package: str, extra: str) -> Iterator[tuple[str, str]]:
 
 
 if __name__ == "__main__":
-    {"install": install, "packages": packages, "rebuild": rebuild, "write": write}[sys.argv[1]](*sys.argv[2:])
+    {"install": install, "packages": packages, "rebuild": rebuild, "write": write}[sys.argv[1]](
+        *sys.argv[2:]
+    )

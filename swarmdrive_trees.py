@@ -1,7 +1,8 @@
 """Decisions in driving with exact rewards, as a taskset of verifiers: `eval swarmdrive-trees`.
 
-A module of its own beside the package, since verifiers finds a taskset by the name of a module. A task is one
-decision: the chat of a viewer, and the worth of every action, which the model never sees.
+A module of its own beside the package, since verifiers finds a taskset by the name of a module. A
+task is one decision: the chat of a viewer, and the worth of every action, which the model never
+sees.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,9 @@ __all__ = ["SwarmdriveTrees"]
 
 
 class DecisionsConfig(vf.TasksetConfig):  # type: ignore[misc] # verifiers counts as untyped
-    """Which decisions; the fields are arguments of `harness.environment`, and `per_level` of `rows`."""
+    """Which decisions; the fields are arguments of `harness.environment`,
+    and `per_level` of `rows`.
+    """
 
     scenario: str | None = None
     seeds: str | int = "train"
@@ -55,7 +58,9 @@ class DecisionData(vf.TaskData):  # type: ignore[misc]
 
 
 class DecisionTask(vf.Task[DecisionData, vf.State, vf.TaskConfig]):  # type: ignore[misc]
-    """Rewards the worth of the action that an answer drives, less that of one that is always taken."""
+    """Rewards the worth of the action that an answer drives,
+    less that of one that is always taken.
+    """
 
     @vf.reward  # type: ignore[untyped-decorator]
     async def advantage(self, trace: vf.Trace) -> float:
@@ -71,7 +76,9 @@ class SwarmdriveTrees(vf.Taskset[DecisionTask, DecisionsConfig]):  # type: ignor
     """The decisions of layouts that may be learnt from."""
 
     def load(self) -> Iterator[DecisionTask]:
-        options = self.config.model_dump(include=DecisionsConfig.__annotations__.keys() - {"per_level"})
+        options = self.config.model_dump(
+            include=DecisionsConfig.__annotations__.keys() - {"per_level"}
+        )
         for n, row in enumerate(harness.environment(**options).rows(self.config.per_level)):
             system, *asked = row.pop("prompt")
             # Of a level that has few decisions some are there several times.

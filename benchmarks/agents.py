@@ -1,13 +1,15 @@
-"""What a swarm is worth: every vehicle decides, with what they may hear of each other, by scene and model.
+"""What a swarm is worth: every vehicle decides, with what they may hear of each other,
+by scene and model.
 
     python benchmarks/agents.py [--only TEXT] [--layouts N] [--out reports/agents]
                                 [--page benchmarks/measured/agents.md] [OPTIONS]
 
-Drives each scene that has seats on report layouts: with all of its vehicles as agents, with the ego alone,
-and with the first model also with a share of them, and beside it plans each layout for all agents together.
-Further options, such as `--device cuda`, go to `harness drive`. What is finished is read and not made again;
-a stopped one goes on with the same command, and several with a TEXT of their own may run side by side. Then
-it writes the tables of the page, of all that is there, between its marks.
+Drives each scene that has seats on report layouts: with all of its vehicles as agents, with the ego
+alone, and with the first model also with a share of them, and beside it plans each layout for all
+agents together. Further options, such as `--device cuda`, go to `harness drive`. What is finished
+is read and not made again; a stopped one goes on with the same command, and several with a TEXT of
+their own may run side by side. Then it writes the tables of the page, of all that is there, between
+its marks.
 """
 
 import json
@@ -47,7 +49,8 @@ FIGURES = {
     "latency, ms": "latency_proxy_ms",
 }
 SHARES = (0.25, 0.5, 0.75)
-Plans = Mapping[int, bool]  # by layout seed, whether there is a joint plan in which everybody arrives
+# by layout seed, whether there is a joint plan in which everybody arrives
+Plans = Mapping[int, bool]
 
 
 class Driver(NamedTuple):
@@ -95,14 +98,21 @@ def main() -> None:
         said = json.loads(file.read_bytes()) if file.exists() else None
         plans[scene] = solved(said) if said else {}
         ended[scene] = searched(said) if said else ""
-    tables = (*overall(made, plans, ended), *by_halves(made), *details(made, plans), *by_share(made))
+    tables = (
+        *overall(made, plans, ended),
+        *by_halves(made),
+        *details(made, plans),
+        *by_share(made),
+    )
     text = "\n\n".join(tables)
     print(text)
     if given.page:
         write_tables(given.page, text)
 
 
-def drive(driver: Driver, scene: str, share: float, layouts: int, out: Path, further: Sequence[str]) -> None:
+def drive(
+    driver: Driver, scene: str, share: float, layouts: int, out: Path, further: Sequence[str]
+) -> None:
     """Drive a scene's report layouts in which this share of the vehicles decide."""
     points = [word for name in conditions(share).values() for word in ("--condition", name)]
     who = ("--model", driver.model, "--prompt", driver.prompt, "--answer", driver.answer)
@@ -125,7 +135,8 @@ def jointly(scene: str, layouts: int) -> str:
 def solved(said: dict[str, Any]) -> Plans:
     """Return whether a joint plan brings everybody to its goal, by layout seed."""
     return {
-        seed: seed not in said["unsolved"] for seed in range(said["seed"], said["seed"] + said["episodes"])
+        seed: seed not in said["unsolved"]
+        for seed in range(said["seed"], said["seed"] + said["episodes"])
     }
 
 
@@ -135,18 +146,23 @@ def searched(said: dict[str, Any]) -> str:
     return f" (best found; best in {n - open_n} of {n})" if open_n else f" (best in all {n})"
 
 
-def overall(made: Sequence[Driven], plans: Mapping[str, Plans], ended: Mapping[str, str]) -> Iterator[str]:
+def overall(
+    made: Sequence[Driven], plans: Mapping[str, Plans], ended: Mapping[str, str]
+) -> Iterator[str]:
     """Yield a table of success, with a row for each scene and model."""
     rows = dict[tuple[str, str], dict[str, str]]()
     for each in (each for each in made if each.share in (0, 1)):
         success = {
-            name: estimate(each.run, point, "success_rate") for name, point in conditions(each.share).items()
+            name: estimate(each.run, point, "success_rate")
+            for name, point in conditions(each.share).items()
         }
         layouts = {"n": str(len(each.run.grid.episodes))}
         rows.setdefault((each.scene, each.driver.model), layouts).update(success)
     ways = ("n", *ALONE, *CONDITIONS)
     best = {
-        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) + ended[scene] if plan else DASH
+        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) + ended[scene]
+        if plan
+        else DASH
         for scene, plan in plans.items()
     }
     yield "**Success %**, of the ego where it alone decides, and else of all agents:"
@@ -167,14 +183,17 @@ def details(made: Sequence[Driven], plans: Mapping[str, Plans]) -> Iterator[str]
         yield f"**{each.scene}, {each.driver.model}**, n = {n} layouts × {seeds} channel seeds:"
         rows = [
             (
-                name, estimate(run, point, "success_rate"),
+                name,
+                estimate(run, point, "success_rate"),
                 DASH if point == silent else more(success(run, point), success(run, silent)),
                 more(success(run, point), plans[each.scene]),
                 *(estimate(run, point, metric) for metric in FIGURES.values()),
             )
             for name, point in CONDITIONS.items()
-        ]  # fmt: skip
-        yield markdown(("they hear", "success %", "above nothing", "above the plan", *FIGURES), rows)
+        ]
+        yield markdown(
+            ("they hear", "success %", "above nothing", "above the plan", *FIGURES), rows
+        )
 
 
 def by_halves(made: Sequence[Driven]) -> Iterator[str]:
@@ -182,7 +201,9 @@ def by_halves(made: Sequence[Driven]) -> Iterator[str]:
     rows = []
     for each in (each for each in made if each.share == 1 and each.driver == DRIVERS[0]):
         dangers = {episode.layout_seed: episode.danger != "none" for episode in each.run.episodes}
-        halves = [{layout for layout in dangers if dangers[layout] == half} for half in (True, False)]
+        halves = [
+            {layout for layout in dangers if dangers[layout] == half} for half in (True, False)
+        ]
         silence = success(each.run, CONDITIONS["nothing"])
         row = {"scene": each.scene, "n": ", ".join(str(len(half)) for half in halves)}
         for name in list(CONDITIONS)[1:]:
@@ -190,7 +211,10 @@ def by_halves(made: Sequence[Driven]) -> Iterator[str]:
             row[name] = ", ".join(more(part(heard, half), silence) for half in halves)
         rows.append(row)
     if rows:
-        yield f"**Above nothing by halves**, {DRIVERS[0].model}: with a danger, without; *n* layouts of each:"
+        yield (
+            f"**Above nothing by halves**, {DRIVERS[0].model}: with a danger, without; *n* layouts "
+            "of each:"
+        )
         yield markdown(tuple(rows[0]), [tuple(row.values()) for row in rows])
 
 
@@ -211,7 +235,10 @@ def by_share(made: Sequence[Driven]) -> Iterator[str]:
         if each.driver == DRIVERS[0] and each.share
     ]
     if rows:
-        yield f"**How many decide**, {DRIVERS[0].model}: success of all agents, by the share that are agents:"
+        yield (
+            f"**How many decide**, {DRIVERS[0].model}: success of all agents, by the share that "
+            "are agents:"
+        )
         yield markdown(("scene", "agents", "nothing", "intents"), rows)
 
 
@@ -234,7 +261,9 @@ def success(run: Run, condition: str) -> dict[int, float]:
 
 def more(own: Mapping[int, float], other: Mapping[int, float]) -> str:
     """Return by how many points one success is above another, over the layouts that both have."""
-    pair = np.array([(own[layout], other[layout]) for layout in own if layout in other], dtype=float)
+    pair = np.array(
+        [(own[layout], other[layout]) for layout in own if layout in other], dtype=float
+    )
     return shown(paired_difference([pair[:, 0] - pair[:, 1]]), sign="+") if len(pair) else DASH
 
 

@@ -1,11 +1,14 @@
-"""Real answers of a model to every prompt version, in both roles and at several temperatures, as a corpus.
+"""Real answers of a model to every prompt version, in both roles and at several temperatures,
+as a corpus.
 
-    python benchmarks/answer_corpus.py MODEL.gguf answers.jsonl [--questions 60] [--most 250] [--tokens 96]
+    python benchmarks/answer_corpus.py MODEL.gguf answers.jsonl [--questions 60] [--most 250]
+    [--tokens 96]
 
-Each question is asked about a moment of a tune layout and answered once at temperature 0, and twice each at
-0.5 and 1; these five go through the engine together, which reads their prompt once. Answers are appended as
-they come and those that are there are not asked again, so a stopped run goes on with the same command.
-`tests/golden/real-answers.jsonl.xz` was made by it; `tests/test_real_answers.py` pins how each is parsed.
+Each question is asked about a moment of a tune layout and answered once at temperature 0, and twice
+each at 0.5 and 1; these five go through the engine together, which reads their prompt once. Answers
+are appended as they come and those that are there are not asked again, so a stopped run goes on
+with the same command. `tests/golden/real-answers.jsonl.xz` was made by it;
+`tests/test_real_answers.py` pins how each is parsed.
 """
 
 import argparse
@@ -38,7 +41,9 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("model")
     arguments.add_argument("out", type=Path)
-    arguments.add_argument("--questions", type=int, default=60, help="questions to each prompt and role")
+    arguments.add_argument(
+        "--questions", type=int, default=60, help="questions to each prompt and role"
+    )
     arguments.add_argument("--most", type=int, default=250, help="answers to ask for in this run")
     arguments.add_argument("--tokens", type=int, default=96, help="most tokens of an answer")
     given = arguments.parse_args()
@@ -55,7 +60,10 @@ def main() -> None:
             for one, completion in zip(asked, backend.complete(asked), strict=True):
                 if completion.error:
                     raise SystemExit(f"{one.id}: {completion.error}")
-                record = described(one) | {"finish_reason": completion.finish_reason, "text": completion.text}
+                record = described(one) | {
+                    "finish_reason": completion.finish_reason,
+                    "text": completion.text,
+                }
                 file.write(json.dumps(record, ensure_ascii=False) + "\n")
         count += len(asked)
         print(f"{len(there) + count} answers", flush=True)
@@ -65,24 +73,31 @@ def described(request: Request) -> dict[str, object]:
     """What was asked, as the corpus says it."""
     scenario, version, role = request.id.split("/")[:3]
     return {
-        "id": f"{request.id}/{request.temperature:g}-{request.sample}", "scenario": scenario,
-        "prompt": version, "role": role, "temperature": request.temperature, "actions": request.actions,
+        "id": f"{request.id}/{request.temperature:g}-{request.sample}",
+        "scenario": scenario,
+        "prompt": version,
+        "role": role,
+        "temperature": request.temperature,
+        "actions": request.actions,
         "reasons_first": request.reasons_first,
-    }  # fmt: skip
+    }
 
 
 def questions(card: Card, count: int) -> Iterator[list[Request]]:
-    """Yield each question with its draws: every prompt and role once, then those with examples again.
+    """Yield each question with its draws:
+    every prompt and role once, then those with examples again.
 
-    A model that is shown examples answers in many forms, and one that is not mostly in prose: each fifth time
-    is enough for that.
+    A model that is shown examples answers in many forms, and one that is not mostly in prose:
+    each fifth time is enough for that.
     """
     for number in range(count):
         for version in prompts.names():
             prompt = prompts.load(version)
             if number % 5 and not prompt.examples:
                 continue
-            scenario = SCENARIOS[0 if version in prompts.OF_A_CROSSING or prompt.examples else number % 3]
+            scenario = SCENARIOS[
+                0 if version in prompts.OF_A_CROSSING or prompt.examples else number % 3
+            ]
             source = LiveSource(FIRST_SEED + number, 1, f"{scenario}:{SCENES}")
             agent = Agent(card, prompt, image="none" if prompt.image else "own")
             spec = Spec(agent, source, tuple(POINTS.values()), (0,))

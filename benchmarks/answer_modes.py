@@ -1,18 +1,20 @@
-"""Decisions a second of each answer mode, against a plain `generate` loop and lm-evaluation-harness.
+"""Decisions a second of each answer mode,
+against a plain `generate` loop and lm-evaluation-harness.
 
-    python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8] [--repeats 1]
-    python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4
-    python benchmarks/answer_modes.py --model smollm2-135m --modes readout cyclic --prompts 8
+    python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8]
+    [--repeats 1] python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16
+    --prompts 4 python benchmarks/answer_modes.py --model smollm2-135m --modes readout cyclic
+    --prompts 8
 
-All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is transformers'
-`generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on the rendered prompts
-(left out where `lm_eval` is not installed). `--shape` takes random weights of a Qwen3's shape and Qwen's
-vocabulary: such weights never stop, so every free answer is given the tokens of a JSON answer. `readout`
-reads its letters once, `cyclic` over all cyclic orders. Without `json` among the modes there are no
-baselines. CPU seconds of
-this process (wall on CUDA), the median of repeats in turn; what llama.cpp does in its own process is its
-answers' wall time. The limit has the matrix products alone, of each prompt's tokens after what all begin with
-and of the answer's, at the rate of one such product. At batch 1 a second limit is nearer: each pass reads all
+All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is
+transformers' `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on
+the rendered prompts (left out where `lm_eval` is not installed). `--shape` takes random weights of
+a Qwen3's shape and Qwen's vocabulary: such weights never stop, so every free answer is given the
+tokens of a JSON answer. `readout` reads its letters once, `cyclic` over all cyclic orders. Without
+`json` among the modes there are no baselines. CPU seconds of this process (wall on CUDA), the
+median of repeats in turn; what llama.cpp does in its own process is its answers' wall time. The
+limit has the matrix products alone, of each prompt's tokens after what all begin with and of the
+answer's, at the rate of one such product. At batch 1 a second limit is nearer: each pass reads all
 weights, so it takes as long as the product of one row with each of them.
 """
 
@@ -62,12 +64,16 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--model", default="swarm-tiny")
     arguments.add_argument("--shape", choices=sorted(shapes.SHAPES))
-    arguments.add_argument("--tokenizer", type=Path, help="tokenizer.json or GGUF with Qwen's vocabulary")
+    arguments.add_argument(
+        "--tokenizer", type=Path, help="tokenizer.json or GGUF with Qwen's vocabulary"
+    )
     arguments.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     arguments.add_argument("--device", default="cpu")
     arguments.add_argument("--dtype", default="float32")
     arguments.add_argument("--prompts", type=int, default=32)
-    arguments.add_argument("--alone", type=int, help="how many of the prompts are asked one at a time")
+    arguments.add_argument(
+        "--alone", type=int, help="how many of the prompts are asked one at a time"
+    )
     arguments.add_argument("--batch-size", type=int, default=8)
     arguments.add_argument("--threads", type=int, default=1)
     arguments.add_argument("--repeats", type=int, default=1)
@@ -97,11 +103,13 @@ def main() -> None:
         ours, aim = rates[f"{mode}, batch {given.batch_size}"], AIMS.get(mode)
         aimed = f", aim {aim:g} of (b)" if aim else ""
         print(
-            f"{mode}: limit {limit:.2f} decisions/s{compared(limit)}{aimed}; reached {ours / limit:.2f} of it"
+            f"{mode}: limit {limit:.2f} decisions/s{compared(limit)}{aimed}; reached "
+            f"{ours / limit:.2f} of it"
         )
         streamed, alone = limits_at_one[mode], rates[f"{mode}, batch 1"]
         print(
-            f"{mode}, batch 1: limit by reading weights {streamed:.2f}; reached {alone / streamed:.2f} of it"
+            f"{mode}, batch 1: limit by reading weights {streamed:.2f}; reached "
+            f"{alone / streamed:.2f} of it"
         )
     if {"readout", "cyclic"} <= {*given.modes}:
         for size in (f"batch {n}" for n in dict.fromkeys((1, given.batch_size))):
@@ -142,10 +150,14 @@ def asked_of(card: Card, mode: str, count: int, most: int | None) -> list[Reques
 def measure(
     card: Card, given: argparse.Namespace
 ) -> tuple[dict[str, float], dict[str, Any], dict[str, float]]:
-    """Rates of transformers, plain, by lm-evaluation-harness and by ours; and the limits of each mode."""
+    """Rates of transformers, plain, by lm-evaluation-harness and by ours;
+    and the limits of each mode.
+    """
     most = JSON_TOKENS if given.shape else None
     asked = {mode: asked_of(card, mode, given.prompts, most) for mode in given.modes}
-    backend = open_backend(card, device=given.device, dtype=given.dtype, batch_size=given.batch_size)
+    backend = open_backend(
+        card, device=given.device, dtype=given.dtype, batch_size=given.batch_size
+    )
     chat, engine = backend.chat, backend.engine  # type: ignore[attr-defined]
     work: dict[str, Callable[[], Any]] = {}
     alone = given.alone or given.prompts
@@ -174,9 +186,12 @@ def measure(
 
 
 def passes(backend: Any, asked: Sequence[Request]) -> float:
-    """Mean number of times that an answer at batch 1 reads all weights: prompt, and each further token."""
+    """Mean number of times that an answer at batch 1 reads all weights:
+    prompt, and each further token.
+    """
     tokens = [
-        1 if r.orders else c.completion_tokens for r, c in zip(asked, backend.complete(asked), strict=True)
+        1 if r.orders else c.completion_tokens
+        for r, c in zip(asked, backend.complete(asked), strict=True)
     ]
     return sum(tokens) / len(tokens)
 
@@ -234,7 +249,8 @@ def limit(backend: Any, asked: Sequence[Request], flops_per_s: float) -> tuple[f
     a_context = 4 * config.num_hidden_layers * config.num_attention_heads * config.head_dim
     flops = 0
     for request, completion in zip(asked, backend.complete(asked), strict=True):
-        # The last token of an answer is never read; of several orders, each has a distribution of its own.
+        # The last token of an answer is never read; of several orders, each has a distribution of
+        # its own.
         end = completion.prompt_tokens + completion.completion_tokens - 1
         chosen = completion.completion_tokens * (1 + len(request.orders))
         flops += 2 * weights * (end - known) + a_context * sum(range(known + 1, end + 1))
@@ -273,9 +289,12 @@ def plain(model: Any, chat: Any, texts: Sequence[str], asked: Sequence[Request])
         ids = torch.tensor([chat.encode(text)], device=model.device)
         with torch.inference_mode():
             model.generate(
-                ids, attention_mask=torch.ones_like(ids), do_sample=False, max_new_tokens=request.max_tokens,
+                ids,
+                attention_mask=torch.ones_like(ids),
+                do_sample=False,
+                max_new_tokens=request.max_tokens,
                 pad_token_id=0,
-            )  # fmt: skip
+            )
 
 
 def lm_eval(
@@ -287,7 +306,9 @@ def lm_eval(
         from lm_eval.models.huggingface import HFLM
     except ImportError:
         return None
-    wrapped = HFLM(pretrained=model, tokenizer=chat.tokenizer.hub, batch_size=batch_size, max_length=2048)
+    wrapped = HFLM(
+        pretrained=model, tokenizer=chat.tokenizer.hub, batch_size=batch_size, max_length=2048
+    )
     arguments = {"until": ["<|im_end|>"], "do_sample": False, "max_gen_toks": asked[0].max_tokens}
     instances = [
         Instance(request_type="generate_until", doc={}, arguments=(text, arguments), idx=i)

@@ -3,9 +3,9 @@
     python benchmarks/answers.py [--only TEXT] [--layouts N] [--out reports/answers]
                                  [--page benchmarks/measured/answers.md]
 
-It evaluates each of `ASKED` in each of its modes on report layouts, alone and with helpers under `6g`, and
-writes the table of the page between its marks. What is finished is read and not made again; a stopped one
-goes on with the same command.
+It evaluates each of `ASKED` in each of its modes on report layouts, alone and with helpers under
+`6g`, and writes the table of the page between its marks. What is finished is read and not made
+again; a stopped one goes on with the same command.
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,8 +43,16 @@ def main() -> None:
     for asked, modes in wanted.items():
         found = {m: Families.read(given.out / asked._replace(answer=m).name) for m in modes}
         lines += written(asked, {mode: runs for mode, runs in found.items() if runs})
-    heads = ("model · prompt · mode", "n", "alone", "6g", "6g over alone", "over read-out, alone",
-             "failed, ego", "on the letters")  # fmt: skip
+    heads = (
+        "model · prompt · mode",
+        "n",
+        "alone",
+        "6g",
+        "6g over alone",
+        "over read-out, alone",
+        "failed, ego",
+        "on the letters",
+    )
     text = markdown(heads, lines)
     print(text)
     if given.page:
@@ -52,7 +60,9 @@ def main() -> None:
 
 
 def written(asked: Row, found: Mapping[str, Families]) -> Iterator[list[str]]:
-    """Yield a model's lines: balanced success, what helpers add, and what the text says of the mode."""
+    """Yield a model's lines: balanced success, what helpers add,
+    and what the text says of the mode.
+    """
     for mode, runs in found.items():
         base = found.get("readout")
         beside: Estimate | None = runs.over(base, BASELINE) if base and mode != "readout" else None

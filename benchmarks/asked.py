@@ -1,12 +1,13 @@
-"""Requests, prompt tokens and CPU time of whole runs: all helpers asked, or only those that are used.
+"""Requests, prompt tokens and CPU time of whole runs:
+all helpers asked, or only those that are used.
 
     python benchmarks/asked.py [--models proxy swarm-tiny smollm2-135m] [--only TEXT]
                                [--episodes 10] [--seeds 0:5]
 
-Each model evaluates the first layouts of the shipped dataset under `single-local` alone and under the usual
-conditions, and drives as many layouts under the usual conditions, with `--ask all` and `--ask used` in turn;
-the completion cache is off. CPU time is that of the command and its children, the page included. The last
-column says whether the two runs' decisions are the same.
+Each model evaluates the first layouts of the shipped dataset under `single-local` alone and under
+the usual conditions, and drives as many layouts under the usual conditions, with `--ask all` and
+`--ask used` in turn; the completion cache is off. CPU time is that of the command and its children,
+the page included. The last column says whether the two runs' decisions are the same.
 """
 
 import argparse
@@ -37,7 +38,15 @@ def main() -> None:
     arguments.add_argument("--episodes", type=int, default=10)
     arguments.add_argument("--seeds", default="0:5")
     given = arguments.parse_args()
-    heads = ("of the ego", "of helpers", "prompt tokens", "CPU s", "used / all: requests", "tokens", "CPU")
+    heads = (
+        "of the ego",
+        "of helpers",
+        "prompt tokens",
+        "CPU s",
+        "used / all: requests",
+        "tokens",
+        "CPU",
+    )
     print("| model | world | asked |", " | ".join(heads), "| same decisions |")
     print("|---" * (len(heads) + 4) + "|")
     measured = []
@@ -47,18 +56,48 @@ def main() -> None:
                 if given.only not in world:
                     continue
                 typed = [str(given.episodes) if part == "N" else part for part in command]
-                typed += ["--model", model, "--seeds", given.seeds, "--no-cache", "--quiet", "--out", "OUT"]
-                rows = {ask: _measured([*typed, "--ask", ask], Path(work) / ask) for ask in reversed(ASKS)}
+                typed += [
+                    "--model",
+                    model,
+                    "--seeds",
+                    given.seeds,
+                    "--no-cache",
+                    "--quiet",
+                    "--out",
+                    "OUT",
+                ]
+                rows = {
+                    ask: _measured([*typed, "--ask", ask], Path(work) / ask)
+                    for ask in reversed(ASKS)
+                }
                 tables = [folder.read(Path(work) / ask / "run").decisions.table for ask in ASKS]
                 same = bool(tables[0].equals(tables[1]))
                 for ask, row in rows.items():
                     ratios = ["", "", "", ""]
                     if ask == "used":
-                        pairs = [(row[key], rows["all"][key]) for key in ("requests", "tokens", "cpu_s")]
-                        ratios = [*(f"{a / b:.2f}" if b else "" for a, b in pairs), "yes" if same else "no"]
-                    cells = (row["ego"], row["helper"], row["tokens"] or "", f"{row['cpu_s']:.1f}", *ratios)
-                    print(f"| `{model}` | {world} | {ask} |", " | ".join(map(str, cells)), "|", flush=True)
-                    measured.append({"model": model, "world": world, "asked": ask, "same": same, **row})
+                        pairs = [
+                            (row[key], rows["all"][key]) for key in ("requests", "tokens", "cpu_s")
+                        ]
+                        ratios = [
+                            *(f"{a / b:.2f}" if b else "" for a, b in pairs),
+                            "yes" if same else "no",
+                        ]
+                    cells = (
+                        row["ego"],
+                        row["helper"],
+                        row["tokens"] or "",
+                        f"{row['cpu_s']:.1f}",
+                        *ratios,
+                    )
+                    print(
+                        f"| `{model}` | {world} | {ask} |",
+                        " | ".join(map(str, cells)),
+                        "|",
+                        flush=True,
+                    )
+                    measured.append(
+                        {"model": model, "world": world, "asked": ask, "same": same, **row}
+                    )
     print(json.dumps(measured))
 
 

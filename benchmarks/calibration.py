@@ -1,12 +1,13 @@
 """What calibrating a model's answers does: probabilities, trigger, bits, latency and success.
 
-    python benchmarks/calibration.py [--only TEXT] [--layouts N]
-                                     [--out reports/calibration] [--page benchmarks/measured/calibration.md]
+    python benchmarks/calibration.py [--only TEXT] [--layouts N] [--out reports/calibration] [--page
+                                     benchmarks/measured/calibration.md]
 
-For each row of `ROWS` it evaluates the model on tune layouts of `SCENES`, fits L0, L1 and both there
-(`harness model calibrate`), and evaluates it on report layouts of the same scenes as it answers and by each
-fit. All conditions share answers and draws, and differences are paired by layout. It writes the tables of
-the page between its marks. What is finished is read and not made again.
+For each row of `ROWS` it evaluates the model on tune layouts of `SCENES`, fits L0, L1 and both
+there (`harness model calibrate`), and evaluates it on report layouts of the same scenes as it
+answers and by each fit. All conditions share answers and draws, and differences are paired by
+layout. It writes the tables of the page between its marks. What is finished is read and not made
+again.
 """
 
 import os
@@ -34,9 +35,13 @@ TUNE_LAYOUTS = 60
 LEVELS = get_args(Level)
 POINTS_PLAYED = ALONE, HELPED = "single-local", "6g"
 HONEST = (
-    "optimal_action_rate", "optimal_brier", "optimal_nll_nats", "entropy_nats",
-    "calibration_error_one_optimal", "coverage_at_5_risk_one_optimal",
-)  # fmt: skip
+    "optimal_action_rate",
+    "optimal_brier",
+    "optimal_nll_nats",
+    "entropy_nats",
+    "calibration_error_one_optimal",
+    "coverage_at_5_risk_one_optimal",
+)
 ECE = HONEST.index("calibration_error_one_optimal")
 COSTS = ("trigger_rate", "bits_per_episode", "latency_proxy_ms", BALANCED)
 UNITS = (PERCENT, Unit(factor=1e-3), Unit(), PERCENT, PERCENT)
@@ -72,8 +77,16 @@ def main() -> None:
     (given.out / MARKER).touch()
     os.chdir(given.out)  # a project, whose calibrations are found
     if not Path("tune/manifest.json").exists():
-        harness("dataset", "build", SCENES, "--episodes", str(given.layouts or TUNE_LAYOUTS), "--no-audit",
-                "--out", "tune")  # fmt: skip
+        harness(
+            "dataset",
+            "build",
+            SCENES,
+            "--episodes",
+            str(given.layouts or TUNE_LAYOUTS),
+            "--no-audit",
+            "--out",
+            "tune",
+        )
     runs = [(row, evaluated(row, given.layouts)) for row in ROWS if given.only in row.name]
     text = "\n\n".join([probabilities(runs), cooperation(runs)])
     print(text)
@@ -94,9 +107,21 @@ def evaluated(row: Row, layouts: int | None) -> Run:
             file = Path(FOLDER, f"{fit_of(row, level)}.toml")
             if not file.exists():
                 run = f"{row.name}/tune"
-                harness("model", "calibrate", run, "--dataset", "tune", "--level", level, "--out", str(file))
-        corrected = [f"{point}:calibration={fit_of(row, level)}"
-                     for level, point in product(LEVELS, POINTS_PLAYED)]  # fmt: skip
+                harness(
+                    "model",
+                    "calibrate",
+                    run,
+                    "--dataset",
+                    "tune",
+                    "--level",
+                    level,
+                    "--out",
+                    str(file),
+                )
+        corrected = [
+            f"{point}:calibration={fit_of(row, level)}"
+            for level, point in product(LEVELS, POINTS_PLAYED)
+        ]
         evaluate(row, "report", [*POINTS_PLAYED, *corrected], layouts)
     return read(Path(row.name, "report"))
 
@@ -106,13 +131,30 @@ def evaluate(row: Row, purpose: str, conditions: Sequence[str], layouts: int | N
     out = Path(row.name, purpose)
     if not (out / "run.json").exists():
         harness(
-            "eval", "--model", row.model, "--prompt", row.prompt, "--answer", row.answer,
+            "eval",
+            "--model",
+            row.model,
+            "--prompt",
+            row.prompt,
+            "--answer",
+            row.answer,
             *(("--letters", row.letters) if row.letters else ()),
             *(("--limit", str(layouts)) if layouts else ()),
-            "--dataset", "tune" if purpose == "tune" else REPORT, "--seeds", SEEDS, "--ties", "drawn",
-            "--ask", "all", "--latency", "paper", "--quiet", "--out", str(out),
+            "--dataset",
+            "tune" if purpose == "tune" else REPORT,
+            "--seeds",
+            SEEDS,
+            "--ties",
+            "drawn",
+            "--ask",
+            "all",
+            "--latency",
+            "paper",
+            "--quiet",
+            "--out",
+            str(out),
             *(word for condition in conditions for word in ("--condition", condition)),
-        )  # fmt: skip
+        )
 
 
 def variants(row: Row, point: str) -> Iterator[tuple[str, str]]:
@@ -131,13 +173,27 @@ def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
             scores = [run.score(condition, name) for name in HONEST]
             texts = [shown(s, entry(s.metric).unit) if s else "–" for s in scores]
             *_, change = reliability.difference(
-                of_condition[ALONE], of_condition[condition], reliability.calibration_error,
+                of_condition[ALONE],
+                of_condition[condition],
+                reliability.calibration_error,
                 len(run.grid.episodes),
-            )  # fmt: skip
+            )
             texts.insert(ECE, str(len(of_condition[condition].sure)))
-            rows.append([row.name, words, *texts, "–" if condition == ALONE else shown(change, POINTS)])
-    head = ("alone", "calibration", "optimal action %", "Brier", "NLL nats", "entropy nats",
-            "one optimal action, n", "ECE %", "coverage %", "change of ECE, points")  # fmt: skip
+            rows.append(
+                [row.name, words, *texts, "–" if condition == ALONE else shown(change, POINTS)]
+            )
+    head = (
+        "alone",
+        "calibration",
+        "optimal action %",
+        "Brier",
+        "NLL nats",
+        "entropy nats",
+        "one optimal action, n",
+        "ECE %",
+        "coverage %",
+        "change of ECE, points",
+    )
     return markdown(head, rows)
 
 
@@ -153,9 +209,20 @@ def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
             places = run.conditions.index(condition), run.conditions.index(HELPED)
             change = changed(values, places)
             n = str(len(run.grid.episodes))
-            rows.append([row.name, words, n, *texts, "–" if condition == HELPED else shown(change, POINTS)])
-    head = (HELPED, "calibration", "layouts", "asks %", "kbit an episode", "latency ms", "balanced success %",
-            "the same alone %", "change under 6g, points")  # fmt: skip
+            rows.append(
+                [row.name, words, n, *texts, "–" if condition == HELPED else shown(change, POINTS)]
+            )
+    head = (
+        HELPED,
+        "calibration",
+        "layouts",
+        "asks %",
+        "kbit an episode",
+        "latency ms",
+        "balanced success %",
+        "the same alone %",
+        "change under 6g, points",
+    )
     return markdown(head, rows)
 
 
@@ -163,7 +230,9 @@ def changed(values: Mapping[str, Floats], places: tuple[int, int]) -> Estimate:
     """Return by how much balanced success is higher in the first condition, paired by layout."""
     first, second = places
     halves = entry(BALANCED).halves
-    return difference(BALANCED, [(values[half][first].T, values[half][second].T) for half in halves])
+    return difference(
+        BALANCED, [(values[half][first].T, values[half][second].T) for half in halves]
+    )
 
 
 if __name__ == "__main__":

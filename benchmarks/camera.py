@@ -1,11 +1,12 @@
-"""CPU milliseconds of a camera's frame, and whether one of the shipped scenes shows who is not reported.
+"""CPU milliseconds of a camera's frame,
+and whether one of the shipped scenes shows who is not reported.
 
 The limit is filling the frame: each of its pixels is written once, from a table of colours.
 
     python benchmarks/camera.py [--scenes 200] [--whole]
 
-`--whole` takes every decision point on the reference drivers' courses (some minutes); else so many of each
-dataset, drawn.
+`--whole` takes every decision point on the reference drivers' courses (some minutes);
+else so many of each dataset, drawn.
 """
 
 import argparse
@@ -40,25 +41,34 @@ def main() -> None:
         dataset = load(find(name))
         took, leaks = measured(dataset, drawn(dataset, None if given.whole else given.scenes))
         median = statistics.median(took)
-        rows.append({"dataset": name, "ms": median, "limit_ms": limit_ms, "n": len(took), "leaks": leaks})
+        rows.append(
+            {"dataset": name, "ms": median, "limit_ms": limit_ms, "n": len(took), "leaks": leaks}
+        )
         print(f"{name:<28}{median:>11.1f}{median / limit_ms:>9.1f}{len(took):>9}{leaks:>7}")
     slowest = max(rows, key=lambda row: row["ms"])
     what = f"a camera's frame, the slowest of {len(rows)} datasets"
     aim = f"≤ {AIM_MS:g}"
-    finish([Row(what, slowest["ms"], "ms", slowest["n"], limit_ms, aim=aim)], aim_ms=AIM_MS, frames=rows)
+    finish(
+        [Row(what, slowest["ms"], "ms", slowest["n"], limit_ms, aim=aim)],
+        aim_ms=AIM_MS,
+        frames=rows,
+    )
 
 
 def drawn(dataset: Dataset, most: int | None) -> list[Scene]:
     """Decision points on the reference drivers' courses."""
     ids = list(dataset.courses())
     if most is not None:
-        ids = [ids[n] for n in sorted(np.random.default_rng(0).permutation(len(ids))[:most].tolist())]
+        ids = [
+            ids[n] for n in sorted(np.random.default_rng(0).permutation(len(ids))[:most].tolist())
+        ]
     return list(dataset.scenes(ids))
 
 
 def measured(dataset: Dataset, scenes: list[Scene]) -> tuple[list[float], int]:
     """CPU milliseconds of each frame, and how many vehicles own pixels that no sensor reports."""
-    frame(dataset.scenario, scenes[0].state, scenes[0].viewers[0])  # the map of the ground is made once
+    # the map of the ground is made once
+    frame(dataset.scenario, scenes[0].state, scenes[0].viewers[0])
     took, leaks = [], 0
     for scene in scenes:
         state = scene.state

@@ -1,11 +1,12 @@
-"""What one needless SLOWER costs in layouts without a danger, from which `harmless_allowance_s` follows.
+"""What one needless SLOWER costs in layouts without a danger,
+from which `harmless_allowance_s` follows.
 
     python benchmarks/caution.py [--layouts 200] [--scenes SCENES] [--scenarios NAME ...]
 
-It drives full-view through those of so many tune layouts of each scenario, as SCENES has them drawn and
-judged. At each decision at which it does not slow down, an ego takes SLOWER instead and then drives as
-full-view does. The table has by how much later it reaches the goal, and how often that is more than is
-allowed.
+It drives full-view through those of so many tune layouts of each scenario, as SCENES has them drawn
+and judged. At each decision at which it does not slow down, an ego takes SLOWER instead and then
+drives as full-view does. The table has by how much later it reaches the goal, and how often that is
+more than is allowed.
 """
 
 import argparse
@@ -28,7 +29,8 @@ SLOWER = ALWAYS["brake"]
 
 
 def costs_s(scenario: Scenario, seeds: Sequence[int]) -> Floats:
-    """Return how much later full-view reaches its goal with a SLOWER at each decision, (E, K), in seconds.
+    """Return how much later full-view reaches its goal with a SLOWER at each decision,
+    (E, K), in seconds.
 
     Inf stands for never, NaN where full-view slows down too, is at its end, or fails.
     """
@@ -69,7 +71,10 @@ def main() -> None:
     arguments.add_argument("--scenarios", nargs="+", default=scenarios.witnessed())
     given = arguments.parse_args()
     layouts, scenes = given.layouts, given.scenes
-    print(f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds later")
+    print(
+        f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds "
+        "later"
+    )
     print(f"{'scenario':22} decision    n   0 %    5 %   50 %  100 %   late, % [95 % interval]")
     for name in given.scenarios:
         scenario = scenarios.get(f"{name}:{scenes}")

@@ -1,12 +1,13 @@
-"""CPU seconds and peak memory of whole commands, in turn with those of another checkout if one is given.
+"""CPU seconds and peak memory of whole commands,
+in turn with those of another checkout if one is given.
 
     python benchmarks/commands.py [--repeats 3] [--against CHECKOUT] [--copies 14] [--only TEXT]
 
-CPU is user and system time of the process and its children; memory is that of the largest process. The other
-checkout (a commit of before, say, from `git worktree add`) runs with this interpreter's packages. `--copies`
-also evaluates the shipped dataset so many times over, each copy with other episode numbers and layout seeds;
-0 leaves that out. `--only` runs the commands whose name has that text. Medians, and the least; every command
-runs once before it counts, so caches are warm.
+CPU is user and system time of the process and its children; memory is that of the largest process.
+The other checkout (a commit of before, say, from `git worktree add`) runs with this interpreter's
+packages. `--copies` also evaluates the shipped dataset so many times over, each copy with other
+episode numbers and layout seeds; 0 leaves that out. `--only` runs the commands whose name has that
+text. Medians, and the least; every command runs once before it counts, so caches are warm.
 """
 
 import argparse
@@ -71,11 +72,19 @@ def main() -> None:
             "run ls": ["run", "ls", "RUNS"],
             "study paper": ["study", "paper", "--quiet", "--out", "STUDY"],
             "study sweep, 100 points": [
-                "study", "sweep", "RUN", "--over", "tau", "--grid", "0.1:1.09:0.01", "--quiet",
-                "--out", "STUDY",
+                "study",
+                "sweep",
+                "RUN",
+                "--over",
+                "tau",
+                "--grid",
+                "0.1:1.09:0.01",
+                "--quiet",
+                "--out",
+                "STUDY",
             ],
             TRUST: ["study", "trust", "RUN", "--quiet", "--out", "STUDY"],
-        }  # fmt: skip
+        }
         if given.only in MANY and given.copies:
             large = copied(given.copies, work / "large")
             commands[MANY] = [*proxy, "--dataset", str(large)]
@@ -104,13 +113,18 @@ def main() -> None:
                     rows.append(Row(f"`harness {name}`, CPU", cpu_s, "s", len(each), aim=aim))
                     rows.append(Row(f"`harness {name}`, peak memory", peak_mb, "MB", len(each)))
                 measured[f"{name}, {checkout}"] = {
-                    "cpu_s": cpu_s, "least_s": least_s, "peak_mb": peak_mb, "n": len(each),
-                }  # fmt: skip
+                    "cpu_s": cpu_s,
+                    "least_s": least_s,
+                    "peak_mb": peak_mb,
+                    "n": len(each),
+                }
     finish(rows, **measured)
 
 
 def run(checkout: Path, command: list[str], runs: Path) -> tuple[float, float]:
-    """CPU seconds and peak memory in MB of one command; its run stays in `runs` for `ls` and `sweep`."""
+    """CPU seconds and peak memory in MB of one command;
+    its run stays in `runs` for `ls` and `sweep`.
+    """
     runs.mkdir(exist_ok=True)
     if "OUT" in command:
         shutil.rmtree(runs / "run", ignore_errors=True)
@@ -159,12 +173,17 @@ def copied(copies: int, out: Path) -> Path:
     for schema in shipped.glob("*.schema.json"):
         shutil.copy(schema, out)
     files = {
-        name: sha256_bytes((out / name).read_bytes()) for name in manifest["files"] if (out / name).exists()
+        name: sha256_bytes((out / name).read_bytes())
+        for name in manifest["files"]
+        if (out / name).exists()
     }
     manifest |= {
-        "name": out.name, "episodes": episodes * copies, "nodes": manifest["nodes"] * copies, "files": files,
+        "name": out.name,
+        "episodes": episodes * copies,
+        "nodes": manifest["nodes"] * copies,
+        "files": files,
         "trees_sha256": trees,
-    }  # fmt: skip
+    }
     (out / "manifest.json").write_text(canonical_json(manifest))
     return out
 

@@ -2,9 +2,9 @@
 
     python benchmarks/constants.py [--layouts 240] [--scenarios NAME ...]
 
-It drives so many layouts of each, as they are drawn and judged under either version of the limits, in some
-minutes. It prints what each action clears; without options it writes `harness/world/constants.csv`, from
-which the driver `constant` takes its action.
+It drives so many layouts of each, as they are drawn and judged under either version of the limits,
+in some minutes. It prints what each action clears; without options it writes
+`harness/world/constants.csv`, from which the driver `constant` takes its action.
 """
 
 import argparse
@@ -29,11 +29,22 @@ VERSIONS = {
     1: {"limits": "1", "witnesses": "any", "radio_share": "0", "perception": "1"},
     2: {"limits": "2", "witnesses": "each", "radio_share": "0.25", "perception": "2"},
 }
-HEADS = ("scenario", "limits", "action", "cleared", "layouts", "harmless_cleared", "harmless", "first_seed")
+HEADS = (
+    "scenario",
+    "limits",
+    "action",
+    "cleared",
+    "layouts",
+    "harmless_cleared",
+    "harmless",
+    "first_seed",
+)
 
 
 def cleared(scenario: Scenario, layouts: int) -> tuple[Bools, dict[str, Bools]]:
-    """Return which of the first tune layouts have a danger, and in which each action succeeds, (layouts,)."""
+    """Return which of the first tune layouts have a danger,
+    and in which each action succeeds, (layouts,).
+    """
     drivers, p = [*scenario.actions, PRIVILEGED], scenario.parameters
     dangerous: list[bool] = []
     success: dict[str, list[bool]] = {action: [] for action in scenario.actions}
@@ -53,7 +64,9 @@ def cleared(scenario: Scenario, layouts: int) -> tuple[Bools, dict[str, Bools]]:
 def scenario_of(name: str, limits: int) -> Scenario:
     """Return a scenario whose layouts are drawn and judged by a version of the limits."""
     dials = scenarios.get(name).dials
-    settings = ",".join(f"{dial}={value}" for dial, value in VERSIONS[limits].items() if dial in dials)
+    settings = ",".join(
+        f"{dial}={value}" for dial, value in VERSIONS[limits].items() if dial in dials
+    )
     return scenarios.get(f"{name}:{settings}")
 
 

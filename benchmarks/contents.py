@@ -1,13 +1,15 @@
-"""Intent or objects? What each content of messages is worth to a planner and to models, and at what cost.
+"""Intent or objects? What each content of messages is worth to a planner and to models,
+and at what cost.
 
-    python benchmarks/contents.py [--limit N] [--layouts N] [--dataset D] [--only TEXT]
-                                  [--out reports/contents] [--page benchmarks/measured/intent-or-objects.md]
+    python benchmarks/contents.py [--limit N] [--layouts N] [--dataset D] [--only TEXT] [--out
+                                  reports/contents] [--page
+                                  benchmarks/measured/intent-or-objects.md]
 
 For each row of `ROWS` it evaluates the model on report layouts of the shipped datasets, plays
-`harness study contents` on the run, and drives the same layouts in closed loop, where the time of a second
-inference counts. It writes the tables of the page between its marks. What is finished is read and not made
-again; a stopped one goes on with the same command. With `--limit`, language models are
-asked on fewer layouts of each family, and each table says on how many.
+`harness study contents` on the run, and drives the same layouts in closed loop, where the time of a
+second inference counts. It writes the tables of the page between its marks. What is finished is
+read and not made again; a stopped one goes on with the same command. With `--limit`, language
+models are asked on fewer layouts of each family, and each table says on how many.
 """
 
 import sys
@@ -30,7 +32,15 @@ from harness.report.document import Table
 from harness.runs.folder import read
 from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode
 from harness.runs.success import Success, alike
-from harness.studies.contents import BASE, NOTHING, Outcome, folders, models, panels_of, run_contents
+from harness.studies.contents import (
+    BASE,
+    NOTHING,
+    Outcome,
+    folders,
+    models,
+    panels_of,
+    run_contents,
+)
 from harness.studies.contents_page import contents_study
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
@@ -46,7 +56,8 @@ class Asked(NamedTuple):
     row: Row
     rule: bool = False  # whether it costs nothing to ask, so that no limit applies
     drives: bool = True  # whether it drives as well
-    panels: Sequence[str] = ()  # the conditions that are played as they are, instead of the usual points
+    # the conditions that are played as they are, instead of the usual points
+    panels: Sequence[str] = ()
 
     @property
     def datasets(self) -> Sequence[str]:
@@ -89,17 +100,25 @@ def main() -> None:
 @cache
 def play(asked: Asked, here: Path) -> Study:
     """Play every content on a model's runs, and write the study's page."""
-    print(f"harness study contents {here / 'frozen'} --out {here / 'contents'}", file=sys.stderr, flush=True)
+    print(
+        f"harness study contents {here / 'frozen'} --out {here / 'contents'}",
+        file=sys.stderr,
+        flush=True,
+    )
     runs = [ReplayedRun(run) for run in folders(here / "frozen")]
     panels = panels_of(runs, asked.panels, (), ())
-    results = run_contents(models([runs], panels), panels, runs[0].seeds, here / "contents", Progress())
+    results = run_contents(
+        models([runs], panels), panels, runs[0].seeds, here / "contents", Progress()
+    )
     study = contents_study(results, runs[0].seeds)
     write_study(study, here / "contents")
     return study
 
 
 def drive(asked: Asked, here: Path, limit: int | None, study: Study) -> None:
-    """Drive the layouts of a model's datasets with each content that it can play, unless it is done."""
+    """Drive the layouts of a model's datasets with each content that it can play,
+    unless it is done.
+    """
     conditions = [PLAYED[content] for content, *_ in study.tables[0].rows]
     for name in asked.datasets if asked.drives else ():
         dataset, out = load(find(name)), here / "driven" / name
@@ -108,7 +127,9 @@ def drive(asked: Asked, here: Path, limit: int | None, study: Study) -> None:
             points = [word for point in conditions for word in ("--condition", point)]
             where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
             scenario = ("--scenario", scenarios.argument(dataset.scenario))
-            harness("drive", *asked.row.who, *scenario, *where, *points, "--out", str(out), "--quiet")
+            harness(
+                "drive", *asked.row.who, *scenario, *where, *points, "--out", str(out), "--quiet"
+            )
 
 
 def driven(asked: Asked, here: Path) -> dict[str, Outcome]:
@@ -118,7 +139,9 @@ def driven(asked: Asked, here: Path) -> dict[str, Outcome]:
     if not all((out / "run.json").exists() for out in outs.values()):
         return {}
     runs = {name: read(out) for name, out in outs.items()}
-    rules = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in runs.values()])
+    rules = alike(
+        [Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in runs.values()]
+    )
     for name, run in runs.items():
         [success] = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes).values()
         for content, point in PLAYED.items():
@@ -137,11 +160,14 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
         heads = (*first.heads, "driven %", "driven, over intents")
         cells = [
             (
-                *cells, shown(driven[cells[0]].leading),
-                "" if cells[0] == "intent" else shown(driven[cells[0]].over(driven["intent"]), sign="+"),
+                *cells,
+                shown(driven[cells[0]].leading),
+                ""
+                if cells[0] == "intent"
+                else shown(driven[cells[0]].over(driven["intent"]), sign="+"),
             )
             for cells in first.rows
-        ]  # fmt: skip
+        ]
         first = Table(first.title, heads, cells)
     counted = study.about[0].split(". ")[0]
     parts = [f"### {row}", *study.headline, f"{counted}."]
@@ -152,7 +178,10 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
 
 def in_markdown(table: Table) -> str:
     """Return a table of the study in Markdown."""
-    rows = ([cell.striptags() if isinstance(cell, Markup) else cell for cell in row] for row in table.rows)
+    rows = (
+        [cell.striptags() if isinstance(cell, Markup) else cell for cell in row]
+        for row in table.rows
+    )
     return markdown(table.heads, rows)
 
 

@@ -43,7 +43,10 @@ def main() -> None:
             coordinate(point, intents, draws)
             found[name].append(process_time() - start)
     medians = {name: statistics.median(values) for name, values in found.items()}
-    print(f"CPU seconds for {n} decisions of {HELPERS} helpers, median of {given.repeats}; aim {AIM_S}")
+    print(
+        f"CPU seconds for {n} decisions of {HELPERS} helpers, median of {given.repeats}; aim "
+        f"{AIM_S}"
+    )
     for name, median_s in medians.items():
         print(f"  {name:<14}{median_s:8.4f}   {median_s / medians['limit']:6.1f} of the limit")
     limit, *points = [(name, 1000 * s) for name, s in medians.items()]

@@ -1,4 +1,6 @@
-"""A dataset or a run many times over, for benchmarks: every copy has other episodes, and other prompts."""
+"""A dataset or a run many times over, for benchmarks:
+every copy has other episodes, and other prompts.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +17,8 @@ from harness.runs.folder import Run
 
 @dataclass(frozen=True)
 class Copies(Dataset):
-    """Copies of a dataset. The ego's distance to the zone, which every prompt states, differs by a decimetre.
+    """Copies of a dataset. The ego's distance to the zone, which every prompt states,
+    differs by a decimetre.
 
     Attributes:
         original: the dataset.
@@ -34,21 +37,27 @@ class Copies(Dataset):
         [scene] = self.original.scenes([shifted(name, -again * apart)])
         graphs = {
             viewer: structs.replace(
-                graph, ego=structs.replace(graph.ego, zone_m=round(graph.ego.zone_m + again / 10, 1))
+                graph,
+                ego=structs.replace(graph.ego, zone_m=round(graph.ego.zone_m + again / 10, 1)),
             )
             for viewer, graph in scene.graphs.items()
         }
         episode_seed = scene.record.episode_seed + again * apart
-        return scene.changed(scene=name, episode=int(name[:5]), episode_seed=episode_seed, graphs=graphs)
+        return scene.changed(
+            scene=name, episode=int(name[:5]), episode_seed=episode_seed, graphs=graphs
+        )
 
 
 def copies(dataset: Dataset, n: int) -> Copies:
     """The dataset n times."""
     apart = len(dataset.trees)
     trees = Trees(
-        range(n * apart), lambda number: _tree(dataset.trees[number % apart], number // apart * apart)
+        range(n * apart),
+        lambda number: _tree(dataset.trees[number % apart], number // apart * apart),
     )
-    return Copies(dataset.path, dataset.manifest, dataset.sha256, trees, dataset.trusted, original=dataset)
+    return Copies(
+        dataset.path, dataset.manifest, dataset.sha256, trees, dataset.trusted, original=dataset
+    )
 
 
 def _tree(tree: Tree, by: int) -> Tree:
@@ -56,9 +65,11 @@ def _tree(tree: Tree, by: int) -> Tree:
         return structs.replace(point, scene=shifted(point.scene, by))
 
     return structs.replace(
-        tree, episode=tree.episode + by, episode_seed=tree.episode_seed + by,
+        tree,
+        episode=tree.episode + by,
+        episode_seed=tree.episode_seed + by,
         levels=[list(map(moved, level)) for level in tree.levels],
-    )  # fmt: skip
+    )
 
 
 def shifted(scene: str, by: int) -> str:
@@ -81,7 +92,11 @@ def repeated(run: Run, times: int, apart: int, out: Path) -> Run:
         out,
         structs.replace(run.manifest, world=world),
         Decisions.concat([moved(by) for by in shifts]),
-        [structs.replace(episode, episode=episode.episode + by) for episode in run.episodes for by in shifts],
+        [
+            structs.replace(episode, episode=episode.episode + by)
+            for episode in run.episodes
+            for by in shifts
+        ],
         (
             writer.lines([structs.replace(a, scene=shifted(a.scene, by)) for a in run.answers])
             for by in shifts

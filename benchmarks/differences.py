@@ -1,11 +1,11 @@
 """How often intervals of paired differences of success hold the truth, and find it.
 
-A *study* draws layouts of known truths: in a half, a share of layouts is gained and another lost, and in the
-others nothing changes. *Covered*: studies whose 95 % interval holds the truth. *Found*: those whose interval
-leaves out 0. *Sign flips*: those in which a test by random signs of the layouts that differ has p < .05; it
-knows nothing of variances, and is the most that is due. *Before*: covered and found by the interval of the
-edition v2v-safety-1.0. Truths were listed before any rule was tried; sizes of six are those of the suite
-v2v-safety-2.
+A *study* draws layouts of known truths: in a half, a share of layouts is gained and another lost,
+and in the others nothing changes. *Covered*: studies whose 95 % interval holds the truth. *Found*:
+those whose interval leaves out 0. *Sign flips*: those in which a test by random signs of the
+layouts that differ has p < .05; it knows nothing of variances, and is the most that is due.
+*Before*: covered and found by the interval of the edition v2v-safety-1.0. Truths were listed before
+any rule was tried; sizes of six are those of the suite v2v-safety-2.
 
     python benchmarks/differences.py [--studies 10000] [--seed 0]
 """
@@ -20,10 +20,12 @@ from harness.core.arrays import Floats
 from harness.core.statistics import Estimate, mean_of, paired_difference, rate_difference, wilson
 
 SMALLEST = "--studies 20"
-SIX = ((155, 45), (42, 18), (26, 14), (62, 38), (65, 35), (66, 34))  # with a danger and without, in the suite
+# with a danger and without, in the suite
+SIX = ((155, 45), (42, 18), (26, 14), (62, 38), (65, 35), (66, 34))
 FLIPPED = 2000  # studies, of which each has so many
 FLIPS = 999
-MANY = 15  # layouts that differ on average: from here on, intervals should be about as wide as they must
+# layouts that differ on average: from here on, intervals should be about as wide as they must
+MANY = 15
 Half = tuple[int, float, float]  # layouts, and the shares that are gained and lost
 
 
@@ -32,7 +34,9 @@ def six(dangerous: tuple[float, float], harmless: tuple[float, float]) -> list[H
     return [half for n, others in SIX for half in ((n, *dangerous), (others, *harmless))]
 
 
-def one(n: tuple[int, int], dangerous: tuple[float, float], harmless: tuple[float, float]) -> list[Half]:
+def one(
+    n: tuple[int, int], dangerous: tuple[float, float], harmless: tuple[float, float]
+) -> list[Half]:
     """Return the halves of one family."""
     return [(n[0], *dangerous), (n[1], *harmless)]
 
@@ -87,11 +91,16 @@ class Cell:
 def study(rng: np.random.Generator, halves: list[Half]) -> list[Floats]:
     """Draw each half's differences: 1 gained, -1 lost, else 0."""
     shares = [(gained, lost, 1 - gained - lost) for _, gained, lost in halves]
-    return [rng.choice([1.0, -1.0, 0.0], n, p=share) for (n, _, _), share in zip(halves, shares, strict=True)]
+    return [
+        rng.choice([1.0, -1.0, 0.0], n, p=share)
+        for (n, _, _), share in zip(halves, shares, strict=True)
+    ]
 
 
 def before(differences: list[Floats]) -> Estimate:
-    """Return the interval of v2v-safety-1.0; a layout that does not differ succeeds in every second."""
+    """Return the interval of v2v-safety-1.0;
+    a layout that does not differ succeeds in every second.
+    """
     halves = []
     for of_half in differences:
         same = np.arange(len(of_half)) % 2 == 0
@@ -138,10 +147,16 @@ def measure(truth: str, halves: list[Half], studies: int, seed: int) -> Cell:
 
     many = differing / studies
     return Cell(
-        truth, 100 * difference, many, covered(now), found(now),
+        truth,
+        100 * difference,
+        many,
+        covered(now),
+        found(now),
         100 * float(np.mean([e.high - e.low for e in now])),
-        100 * float(np.mean(flips)) if many >= MANY else None, covered(then), found(then),
-    )  # fmt: skip
+        100 * float(np.mean(flips)) if many >= MANY else None,
+        covered(then),
+        found(then),
+    )
 
 
 def main() -> None:
@@ -158,10 +173,15 @@ def main() -> None:
         cell = measure(truth, halves, given.studies, given.seed)
         cells.append(cell)
         figures = (
-            f"{cell.difference:+.1f}", f"{cell.differing:.1f}", f"{cell.covered:.1f}", f"{cell.found:.1f}",
-            f"{cell.width:.1f}", "–" if cell.sign_flips is None else f"{cell.sign_flips:.1f}",
-            f"{cell.covered_before:.1f}", f"{cell.found_before:.1f}",
-        )  # fmt: skip
+            f"{cell.difference:+.1f}",
+            f"{cell.differing:.1f}",
+            f"{cell.covered:.1f}",
+            f"{cell.found:.1f}",
+            f"{cell.width:.1f}",
+            "–" if cell.sign_flips is None else f"{cell.sign_flips:.1f}",
+            f"{cell.covered_before:.1f}",
+            f"{cell.found_before:.1f}",
+        )
         print(f"{truth:<32}" + "".join(f"{figure:>13}" for figure in figures), flush=True)
     many = [cell for cell in cells if cell.sign_flips is not None]
     told = {
@@ -170,7 +190,9 @@ def main() -> None:
         "most_lost_to_sign_flips": max((cell.sign_flips or 0.0) - cell.found for cell in many),
         "error_of_a_share": 100 * (wilson(0.95, given.studies)[1] - 0.95),
     }
-    print("\n" + ", ".join(f"{name.replace('_', ' ')}: {value:.1f}" for name, value in told.items()))
+    print(
+        "\n" + ", ".join(f"{name.replace('_', ' ')}: {value:.1f}" for name, value in told.items())
+    )
     print(json.dumps({"studies": given.studies, **told, "cells": list(map(asdict, cells))}))
 
 

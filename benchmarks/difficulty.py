@@ -1,16 +1,18 @@
 """How many answers fewer are enough where each layout's difficulty is taken off its success.
 
-A tree knows, before any model is asked, what the drivers `local-view` and `cruise` and a draw of even
-actions achieve in its layout. `harness/core/covariate.py` corrects success by how far theirs in the answered
-layouts are from those of a pool of layouts. *Ratio*: how many times as many answers the plain figure needs
-for an interval as narrow, if the pool has no end, and its 95 % interval over layouts; a dash where nothing is
-left to vary. *Strata*: the same where layouts are counted by kind instead: whether each driver succeeds, and
-whether even actions do so more often than in the median layout. *Width*: of the corrected interval of the
-most answered layouts, as a share of the plain one's. *Coverage*: how often the interval of a study of so many
-answered layouts, drawn from those of the run, and a pool of five times as many holds the run's figure, in
-percent; beside it the plain interval's.
+A tree knows, before any model is asked, what the drivers `local-view` and `cruise` and a draw of
+even actions achieve in its layout. `harness/core/covariate.py` corrects success by how far theirs
+in the answered layouts are from those of a pool of layouts. *Ratio*: how many times as many answers
+the plain figure needs for an interval as narrow, if the pool has no end, and its 95 % interval over
+layouts; a dash where nothing is left to vary. *Strata*: the same where layouts are counted by kind
+instead: whether each driver succeeds, and whether even actions do so more often than in the median
+layout. *Width*: of the corrected interval of the most answered layouts, as a share of the plain
+one's. *Coverage*: how often the interval of a study of so many answered layouts, drawn from those
+of the run, and a pool of five times as many holds the run's figure, in percent; beside it the plain
+interval's.
 
-    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 40 60]
+    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 40
+    60]
 """
 
 import argparse
@@ -54,7 +56,9 @@ class Figure:
     known: Floats  # what trees know of the layouts, (E, K)
 
     def estimates(self, some: Ints, pool: Ints) -> tuple[Estimate, Estimate | None]:
-        """Return it in some layouts, plain and corrected by those of a pool, of which they are the first."""
+        """Return it in some layouts, plain and corrected by those of a pool,
+        of which they are the first.
+        """
         of, values = Success(self.success.dangerous[some]), self.values[:, some]
         all_of = Pool(self.known[pool], self.success.dangerous[pool], np.arange(len(some)))
         if self.base is None:
@@ -70,7 +74,9 @@ class Figure:
         return replace(self, known=np.eye(8)[of_drivers @ [4, 2] + easy])
 
     def ratio(self, some: Ints) -> float:
-        """Return how many times as many answers it needs plain; NaN where nothing is left to vary."""
+        """Return how many times as many answers it needs plain;
+        NaN where nothing is left to vary.
+        """
         plain, better = self.estimates(some, np.tile(some, ENDLESS))
         ratio = covariate.worth(plain, better) if better else 1.0
         return ratio if ratio < MOST else np.nan
@@ -115,16 +121,32 @@ def measure(figure: Figure, answered: int, studies: int, rng: np.random.Generato
 def figures(model: str, layouts: int, folder: Path) -> Iterator[Figure]:
     """Run a model; yield success of each condition and its gain over alone, plain and balanced."""
     pages.harness(
-        "eval", "--model", model, "--dataset", DATASET, "--limit", str(layouts), "--quiet",
-        "--condition", "single-local", "--condition", "6g", "--out", str(folder / model),
-    )  # fmt: skip
+        "eval",
+        "--model",
+        model,
+        "--dataset",
+        DATASET,
+        "--limit",
+        str(layouts),
+        "--quiet",
+        "--condition",
+        "single-local",
+        "--condition",
+        "6g",
+        "--out",
+        str(folder / model),
+    )
     done = read(folder / model)
     references = load(find(DATASET), layouts).reference_success()
     in_trees = np.column_stack([references[name] for name in REFERENCES])
     balanced, values = by_condition(done.grid, done.episodes)
     alone, helped = values["single-local"], values["6g"]
     for how in (balanced.plain, balanced):
-        for name, of, base in (("alone", alone, None), ("6g", helped, None), ("gain", helped, alone)):
+        for name, of, base in (
+            ("alone", alone, None),
+            ("6g", helped, None),
+            ("gain", helped, alone),
+        ):
             yield Figure(f"{model}, {IN_WORDS[how.metric]}, {name}", how, of, base, in_trees)
 
 
@@ -137,7 +159,9 @@ def main() -> None:
     arguments.add_argument("--studies", type=int, default=1000)
     given = arguments.parse_args()
     cells = list[Cell]()
-    print(f"{DATASET}, {given.layouts} layouts; {given.studies} studies, a pool {POOL} times as large")
+    print(
+        f"{DATASET}, {given.layouts} layouts; {given.studies} studies, a pool {POOL} times as large"
+    )
     heads = "".join(f"{f'of {answered}':>8}{'plain':>7}" for answered in given.answered)
     print(f"{'':<36}{'ratio':>20}{'strata':>8}{'width':>7}{heads}")
     with tempfile.TemporaryDirectory() as folder:
@@ -146,7 +170,9 @@ def main() -> None:
                 rng = np.random.default_rng(list(figure.name.encode()))
                 covariate.LEAST = LEAST
                 drawn = resampled(rng, given.layouts, RESAMPLES)
-                ratios = np.array([figure.ratio(np.repeat(np.arange(given.layouts), n)) for n in drawn])
+                ratios = np.array(
+                    [figure.ratio(np.repeat(np.arange(given.layouts), n)) for n in drawn]
+                )
                 ratio = resampled_estimate(ratios, given.layouts)
                 strata = figure.by_kind.ratio(np.arange(given.layouts))
                 coverage = [measure(figure, n, given.studies, rng) for n in given.answered]

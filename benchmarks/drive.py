@@ -1,8 +1,9 @@
 """Live driving: where time goes, and what a second worker adds.
 
-The parts are measured in one process with the proxy, whose answers cost next to nothing, so that the
-harness's own share is the largest it can be. Of repeats the one whose time is the median counts. The same of
-four agents that drive by the right-hand rule, alone on the air; their limit is what the simulator takes.
+The parts are measured in one process with the proxy, whose answers cost next to nothing, so that
+the harness's own share is the largest it can be. Of repeats the one whose time is the median
+counts. The same of four agents that drive by the right-hand rule, alone on the air; their limit is
+what the simulator takes.
 
     python benchmarks/drive.py [--episodes 32] [--seeds 5] [--repeats 3]
 """
@@ -44,7 +45,8 @@ TABLE = ""
 NAME = "occluded-intersection:witnesses=any,radio_share=0,limits=1,perception=1"
 SWARM = "all-way-crossing:agent_share=1"
 LATENCY = Latency("card", "the proxy's card", 0.145, 0.145, 0.145)
-# Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our own.
+# Functions whose time makes up a part: the simulator, what is seen, and who drives. The rest is our
+# own.
 PARTS: dict[str, tuple[Any, str]] = {
     "frames": (lockstep, "advance"),
     "sensors": (freeze, "scene_graphs"),
@@ -62,13 +64,18 @@ def main() -> None:
     arguments.add_argument("--repeats", type=int, default=3)
     given = arguments.parse_args()
     spec = Spec(
-        Agent(cards.resolve("proxy"), prompts.load("v2")), LiveSource(0, given.episodes, NAME),
-        tuple(POINTS.values()), tuple(range(given.seeds)),
-    )  # fmt: skip
+        Agent(cards.resolve("proxy"), prompts.load("v2")),
+        LiveSource(0, given.episodes, NAME),
+        tuple(POINTS.values()),
+        tuple(range(given.seeds)),
+    )
     swarm = Spec(
-        Agent(cards.resolve("right-hand"), prompts.load("v4")), LiveSource(0, given.episodes, SWARM),
-        (POINTS["single-local"],), spec.seeds, settings=Settings(latency="paper"),
-    )  # fmt: skip
+        Agent(cards.resolve("right-hand"), prompts.load("v4")),
+        LiveSource(0, given.episodes, SWARM),
+        (POINTS["single-local"],),
+        spec.seeds,
+        settings=Settings(latency="paper"),
+    )
     lives = given.episodes * len(spec.points) * len(spec.seeds)
 
     for each in (spec, swarm):
@@ -81,13 +88,21 @@ def main() -> None:
     walls = {workers: wall_s(spec, workers, 2) for workers in (1, 2)}
     total = sum(parts.values())
 
-    print(f"{lives} episodes ({given.episodes} layouts, {len(spec.points)} conditions, {given.seeds} seeds)")
-    print(f"  frames: {frames} simulated, {frames_lived} lived through: shared worlds save "
-          f"{1 - frames / frames_lived:.0%}")  # fmt: skip
+    print(
+        f"{lives} episodes ({given.episodes} layouts, {len(spec.points)} conditions, {given.seeds} "
+        "seeds)"
+    )
+    print(
+        f"  frames: {frames} simulated, {frames_lived} lived through: shared worlds save "
+        f"{1 - frames / frames_lived:.0%}"
+    )
     for part, seconds in parts.items():
         print(f"  {part:<12}{seconds:8.2f} s {seconds / total:7.1%}")
     print(f"  {lives / total:.0f} episodes a second of that CPU time")
-    print(f"{of_rule} episodes of four agents by a rule ({given.episodes} layouts, {given.seeds} seeds)")
+    print(
+        f"{of_rule} episodes of four agents by a rule ({given.episodes} layouts, {given.seeds} "
+        "seeds)"
+    )
     for part, seconds in of_swarm.items():
         print(f"  {part:<12}{seconds:8.2f} s {seconds / sum(of_swarm.values()):7.1%}")
     for workers, seconds in walls.items():
@@ -103,7 +118,9 @@ def main() -> None:
             given.repeats,
             aim="≤ 20",
         ),
-        Row("closed loop, times as fast with 2 workers, wall", walls[1] / walls[2], "times", 2, 2.0),
+        Row(
+            "closed loop, times as fast with 2 workers, wall", walls[1] / walls[2], "times", 2, 2.0
+        ),
         Row(
             "closed loop, four agents by a rule, episodes a CPU second",
             of_rule / sum(of_swarm.values()),
@@ -114,9 +131,15 @@ def main() -> None:
         ),
     ]
     finish(
-        rows, episodes=lives, frames=frames, frames_lived=frames_lived, parts_s=parts, wall_s=walls,
-        cpu_s=cpu, swarm_s=of_swarm,
-    )  # fmt: skip
+        rows,
+        episodes=lives,
+        frames=frames,
+        frames_lived=frames_lived,
+        parts_s=parts,
+        wall_s=walls,
+        cpu_s=cpu,
+        swarm_s=of_swarm,
+    )
 
 
 def drive(spec: Spec, numbers: range) -> list[Episode]:
@@ -131,12 +154,16 @@ def drive(spec: Spec, numbers: range) -> list[Episode]:
 def middle(spec: Spec, repeats: int) -> tuple[dict[str, float], int, int]:
     """The `shares` of all episodes in the repeat whose time is the median."""
     numbers = range(spec.source.record().episodes)
-    every = sorted((shares(spec, numbers) for _ in range(repeats)), key=lambda each: sum(each[0].values()))
+    every = sorted(
+        (shares(spec, numbers) for _ in range(repeats)), key=lambda each: sum(each[0].values())
+    )
     return every[len(every) // 2]
 
 
 def shares(spec: Spec, numbers: range) -> tuple[dict[str, float], int, int]:
-    """CPU seconds of each part in one process, frames simulated, and frames lived through by all episodes."""
+    """CPU seconds of each part in one process, frames simulated,
+    and frames lived through by all episodes.
+    """
     spent = dict.fromkeys(PARTS, 0.0)
     simulated = 0
 

@@ -1,13 +1,14 @@
-"""CPU seconds of a read-out and of a JSON answer of one card on each of its engines, as the card comes.
+"""CPU seconds of a read-out and of a JSON answer of one card on each of its engines,
+as the card comes.
 
     python benchmarks/engines.py [--model smollm2-135m] [--questions 12]
     python benchmarks/engines.py --dtype bfloat16 --answers readout
 
-The fixed questions of `harness model check`, with prompt v2, one at a time after one that warms up, on the
-engine's usual threads, in this process. An engine is opened anew for each kind of answer, since prompts of
-two kinds begin alike. The limit is of transformers: of what all prompts begin with nothing, of the rest of
-each the matrix products at the rate of one of the model's own shape, and for each written token one reading
-of all weights at the rate at which memory is summed up.
+The fixed questions of `harness model check`, with prompt v2, one at a time after one that warms up,
+on the engine's usual threads, in this process. An engine is opened anew for each kind of answer,
+since prompts of two kinds begin alike. The limit is of transformers: of what all prompts begin with
+nothing, of the rest of each the matrix products at the rate of one of the model's own shape, and
+for each written token one reading of all weights at the rate at which memory is summed up.
 """
 
 import argparse
@@ -47,11 +48,18 @@ def main() -> None:
         ours, limit, tokens = of["transformers"]
         theirs = of["llama-cpp"][0]
         print(
-            f"{answer:<8} n = {given.questions}, {tokens:.0f} tokens: transformers {ours:.2f} CPU s, "
-            f"llama-cpp {theirs:.2f}, {theirs / ours:.1f} times as many (aim {aim:g}); limit {limit:.2f}, "
+            f"{answer:<8} n = {given.questions}, {tokens:.0f} tokens: transformers {ours:.2f} CPU "
+            "s, "
+            f"llama-cpp {theirs:.2f}, {theirs / ours:.1f} times as many (aim {aim:g}); limit "
+            f"{limit:.2f}, "
             f"{ours / limit:.1f} times it"
         )
-        found[answer] = {"transformers": ours, "llama-cpp": theirs, "limit": limit, "tokens": tokens}
+        found[answer] = {
+            "transformers": ours,
+            "llama-cpp": theirs,
+            "limit": limit,
+            "tokens": tokens,
+        }
     print(json.dumps(found | vars(given)))
 
 
@@ -75,7 +83,10 @@ def measure(given: argparse.Namespace, engine: str, answer: str) -> tuple[float,
     card = cards.resolve(given.model, engine)
     agent = Agent(card, versions.load("v2"), answer, letters="raw")  # type: ignore[arg-type]
     backend = OPENED[engine](given)
-    warm, *asked = [*questions.requests(agent, "helper")[:1], *questions.requests(agent)[: given.questions]]
+    warm, *asked = [
+        *questions.requests(agent, "helper")[:1],
+        *questions.requests(agent)[: given.questions],
+    ]
     backend.complete([warm])
     start_s = time.process_time()
     done = [backend.complete([request])[0] for request in asked]

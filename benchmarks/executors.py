@@ -1,9 +1,10 @@
 """Processes and a Ray cluster: what handing out a chunk costs, and what a second worker adds.
 
-Chunks wait for a second, so that what else the machine does changes little, or do nothing. Ray is a cluster
-of two nodes of a core each, all here.
+Chunks wait for a second, so that what else the machine does changes little, or do nothing. Ray is a
+cluster of two nodes of a core each, all here.
 
-    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5] [--only TEXT]
+    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5] [--only
+    TEXT]
 """
 
 import argparse
@@ -48,13 +49,17 @@ def main() -> None:
     print(f"  1 process     {alone:6.2f} s, {own:g} s of them the chunks'")
     for name, of in found.items():
         took, empty = alone / of["speed_up"], of["empty_ms"]
-        print(f"  {name:<14}{took:6.2f} s, {of['speed_up']:.2f} times as fast; an empty chunk {empty:.2f} ms")
+        print(
+            f"  {name:<14}{took:6.2f} s, {of['speed_up']:.2f} times as fast; an empty chunk "
+            f"{empty:.2f} ms"
+        )
     rows = [
         Row(f"{name}, times as fast as one process", of["speed_up"], "times", given.repeats, 2.0)
         for name, of in found.items()
     ]
     rows += [
-        Row(f"{name}, an empty chunk", of["empty_ms"], "ms", given.repeats) for name, of in found.items()
+        Row(f"{name}, an empty chunk", of["empty_ms"], "ms", given.repeats)
+        for name, of in found.items()
     ]
     finish(rows, chunks=given.chunks, seconds=given.seconds, alone_s=alone, executors=found)
 
@@ -65,7 +70,9 @@ def nap(seconds: float) -> float:
     return seconds
 
 
-def least_s(work: Callable[[float], float], chunks: list[float], workers: Workers, repeats: int) -> float:
+def least_s(
+    work: Callable[[float], float], chunks: list[float], workers: Workers, repeats: int
+) -> float:
     """Wall time of all chunks: the least of some."""
 
     def once() -> float:

@@ -38,7 +38,9 @@ class Row(NamedTuple):
         return "--model", self.model, "--prompt", self.prompt, "--answer", self.answer
 
     def asked(self, layouts: int | None = None, dataset: str | None = None) -> "Row":
-        """Return it on so many layouts of each family, or on other scenes, where these are given."""
+        """Return it on so many layouts of each family, or on other scenes,
+        where these are given.
+        """
         return self._replace(limit=layouts or self.limit, dataset=dataset or self.dataset)
 
     def evaluate(self, out: Path, *options: str) -> None:
@@ -67,7 +69,9 @@ class Families(NamedTuple):
         return cls({"": folder.read(path)}) if (path / "run.json").exists() else None
 
     def estimate(self, condition: str, metric: str) -> Estimate | None:
-        """Return a metric's mean over families, of episodes or answers; None if a family has no value."""
+        """Return a metric's mean over families, of episodes or answers;
+        None if a family has no value.
+        """
         if metric == GAINS[BALANCED]:
             families = [by_condition(run.grid, run.episodes) for run in self.runs.values()]
             return mean_difference([(how, of[condition], of[BASELINE]) for how, of in families])
@@ -86,7 +90,9 @@ class Families(NamedTuple):
         return shown(estimate, sign=sign) if estimate else ""
 
     def over(self, other: "Families", condition: str) -> Estimate:
-        """Return balanced success less that of other runs in the same condition, paired by episode."""
+        """Return balanced success less that of other runs in the same condition,
+        paired by episode.
+        """
         differences = []
         for family in self.runs:
             mine, theirs = (_halves(each.runs[family], condition) for each in (self, other))
@@ -97,7 +103,9 @@ class Families(NamedTuple):
     def counted(self) -> str:
         """Layouts of all families, and seeds, in words."""
         runs = list(self.runs.values())
-        return f"{sum(len(r.grid.episodes) for r in runs)} layouts × {len(runs[0].grid.seeds)} seeds"
+        return (
+            f"{sum(len(r.grid.episodes) for r in runs)} layouts × {len(runs[0].grid.seeds)} seeds"
+        )
 
 
 def _halves(run: Run, condition: str) -> dict[str, Floats]:

@@ -1,12 +1,12 @@
 """How time and memory grow with the decisions of a run, and time with the workers.
 
-Decisions: `harness eval --model proxy`, report included, on the first layouts of the shipped dataset, and on
-all of them many times over where they are too few; beyond a million, under more seeds of the channel. The
-limit of the time is what the proxy takes to answer all that is asked; that of the memory, a process that only
-holds the decisions as a table and the page's text. Where Chromium is, it opens the page: the time until every
-decision can be filtered and opened, the least of three.
-Workers: chunks that wait for a second, four a worker, so that any number of them fits the cores that are
-here; the limit is those four seconds.
+Decisions: `harness eval --model proxy`, report included, on the first layouts of the shipped
+dataset, and on all of them many times over where they are too few; beyond a million, under more
+seeds of the channel. The limit of the time is what the proxy takes to answer all that is asked;
+that of the memory, a process that only holds the decisions as a table and the page's text. Where
+Chromium is, it opens the page: the time until every decision can be filtered and opened, the least
+of three. Workers: chunks that wait for a second, four a worker, so that any number of them fits the
+cores that are here; the limit is those four seconds.
 
     python benchmarks/growth.py [--decisions 1000 10000 100000 1000000 10000000]
                                 [--workers 1 2 4 8 16 32 64] [--seconds 1] [--first 20]
@@ -23,6 +23,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter, process_time
+from typing import Any
 
 import pyarrow.parquet as pq
 from commands import HERE, copied, run
@@ -71,7 +72,9 @@ def main() -> None:
     arguments.add_argument("--decisions", type=int, nargs="*", default=[10**n for n in range(3, 8)])
     arguments.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8, 16, 32, 64])
     arguments.add_argument("--seconds", type=float, default=1.0, help="that a chunk waits")
-    arguments.add_argument("--first", type=int, default=20, help="layouts that tell how much a layout is")
+    arguments.add_argument(
+        "--first", type=int, default=20, help="layouts that tell how much a layout is"
+    )
     arguments.add_argument("--picture", type=Path)
     given = arguments.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
@@ -80,7 +83,11 @@ def main() -> None:
     for rows in filter(None, (decisions, workers)):
         print("".join(f"{name:>12}" for name in rows[0]))
         for row in rows:
-            print("".join(f"{value:12.0f}" if value >= 100 else f"{value:12.2f}" for value in row.values()))
+            print(
+                "".join(
+                    f"{value:12.0f}" if value >= 100 else f"{value:12.2f}" for value in row.values()
+                )
+            )
     if given.picture:
         save(drawn(decisions, workers), given.picture, "svg")
     figures = []
@@ -91,7 +98,10 @@ def main() -> None:
             Figures(f"{what}, peak memory", row["peak_mb"], "MB", 1, row["limit_mb"]),
         ]
     for row in workers:
-        took, what = row["wall_s"] - row["start_s"], f"{row['workers']} workers that wait, after the start"
+        took, what = (
+            row["wall_s"] - row["start_s"],
+            f"{row['workers']} workers that wait, after the start",
+        )
         figures.append(Figures(what, took, "s", 1, row["limit_s"]))
     finish(figures, decisions=decisions, workers=workers)
 
@@ -115,18 +125,27 @@ def of_decisions(sizes: Sequence[int], first: int, scratch: Path) -> list[Row]:
         command = [sys.executable, "-c", HOLDS, str(made.path)]
         held = subprocess.run(command, capture_output=True, check=True, text=True).stdout
         answers = (made.path / "answers.jsonl").read_bytes().count(b"\n")
-        rows.append({
-            "decisions": pq.read_metadata(made.path / "decisions.parquet").num_rows, **row,
-            "limit_s": answer_s * answers, "limit_mb": float(held), "opened_s": opened(made.path),
-        })  # fmt: skip
+        rows.append(
+            {
+                "decisions": pq.read_metadata(made.path / "decisions.parquet").num_rows,
+                **row,
+                "limit_s": answer_s * answers,
+                "limit_mb": float(held),
+                "opened_s": opened(made.path),
+            }
+        )
         print(json.dumps(rows[-1]), flush=True)  # the next may take long
     return rows
 
 
 def evaluated(options: Sequence[str], scratch: Path) -> tuple[folder.Run, Row]:
-    """`harness eval --model proxy` with some options: the run, its wall and CPU time and its memory."""
+    """`harness eval --model proxy` with some options:
+    the run, its wall and CPU time and its memory.
+    """
     start = perf_counter()
-    cpu_s, peak_mb = run(HERE, ["eval", "--model", "proxy", "--quiet", *options, "--out", "OUT"], scratch)
+    cpu_s, peak_mb = run(
+        HERE, ["eval", "--model", "proxy", "--quiet", *options, "--out", "OUT"], scratch
+    )
     row = {"wall_s": perf_counter() - start, "cpu_s": cpu_s, "peak_mb": peak_mb}
     return folder.read(scratch / "run"), row
 
@@ -160,7 +179,12 @@ def of_workers(workers: int, seconds: float) -> Row:
         start = perf_counter()
         spread(nap, chunks, workers, lambda done: None, repeatable=False)
         took.append(perf_counter() - start)
-    return {"workers": workers, "wall_s": took[0], "start_s": took[1], "limit_s": A_WORKER * seconds}
+    return {
+        "workers": workers,
+        "wall_s": took[0],
+        "start_s": took[1],
+        "limit_s": A_WORKER * seconds,
+    }
 
 
 @styled
@@ -169,7 +193,15 @@ def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(7.2, 2.6))
     time, memory, hands = figure.subplots(1, 3)
 
-    def line(axes, rows, x: str, y: Callable[[Row], float], colour: str, label: str, end: str = "-") -> None:  # type: ignore[no-untyped-def]
+    def line(
+        axes: Any,
+        rows: Sequence[Row],
+        x: str,
+        y: Callable[[Row], float],
+        colour: str,
+        label: str,
+        end: str = "-",
+    ) -> None:
         axes.plot(
             [row[x] for row in rows],
             [y(row) for row in rows],
@@ -180,24 +212,57 @@ def drawn(decisions: Sequence[Row], workers: Sequence[Row]) -> Figure:
             label=label,
         )
 
-    line(time, decisions, "decisions", lambda row: row["cpu_s"], INK, "harness eval, report included")
-    line(time, decisions, "decisions", lambda row: row["limit_s"], GREY, "limit: the proxy's answers", "--")
+    line(
+        time, decisions, "decisions", lambda row: row["cpu_s"], INK, "harness eval, report included"
+    )
+    line(
+        time,
+        decisions,
+        "decisions",
+        lambda row: row["limit_s"],
+        GREY,
+        "limit: the proxy's answers",
+        "--",
+    )
     time.set(xscale="log", yscale="log", xlabel="decisions", ylabel="CPU seconds")
     line(memory, decisions, "decisions", lambda row: row["peak_mb"], INK, "peak of harness eval")
-    line(memory, decisions, "decisions", lambda row: row["limit_mb"], GREY, "limit: table and page", "--")
+    line(
+        memory,
+        decisions,
+        "decisions",
+        lambda row: row["limit_mb"],
+        GREY,
+        "limit: table and page",
+        "--",
+    )
     memory.axhline(AIM_MB, color=BAD, lw=0.8, label="aim")
     memory.set(xscale="log", yscale="log", xlabel="decisions", ylabel="MB")
-    line(hands, workers, "workers", lambda row: row["wall_s"] - row["start_s"], INK, "after the start")
+    line(
+        hands,
+        workers,
+        "workers",
+        lambda row: row["wall_s"] - row["start_s"],
+        INK,
+        "after the start",
+    )
     line(hands, workers, "workers", lambda row: row["wall_s"], INK, "with the start", ":")
-    line(hands, workers, "workers", lambda row: row["limit_s"], GREY, "limit: the chunks' own", "--")
-    hands.set(xscale="log", xlabel="workers", ylabel="seconds of four chunks a worker", ylim=(0, None))
+    line(
+        hands, workers, "workers", lambda row: row["limit_s"], GREY, "limit: the chunks' own", "--"
+    )
+    hands.set(
+        xscale="log", xlabel="workers", ylabel="seconds of four chunks a worker", ylim=(0, None)
+    )
     hands.set_xticks(
-        [row["workers"] for row in workers], [f"{row['workers']:.0f}" for row in workers], minor=False
+        [row["workers"] for row in workers],
+        [f"{row['workers']:.0f}" for row in workers],
+        minor=False,
     )
     hands.minorticks_off()
     powers = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
     for axes in (time, memory):
-        axes.xaxis.set_major_formatter(lambda n, _: f"10{str(round(math.log10(n))).translate(powers)}")
+        axes.xaxis.set_major_formatter(
+            lambda n, _: f"10{str(round(math.log10(n))).translate(powers)}"
+        )
         axes.yaxis.set_major_formatter(lambda n, _: f"{n:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
     memory.set_yticks([200, 500, 1000, 2000, 5000, 10000])

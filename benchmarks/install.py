@@ -1,9 +1,10 @@
-"""Seconds and MB from nothing to a first run: environment, base install, `harness eval --model proxy`.
+"""Seconds and MB from nothing to a first run:
+environment, base install, `harness eval --model proxy`.
 
     python benchmarks/install.py [--against COMMIT]
 
-Each checkout is cloned, gets an environment of its own, and pip keeps nothing. The limit of the time is the
-registry's: the same packages are fetched again without being installed.
+Each checkout is cloned, gets an environment of its own, and pip keeps nothing. The limit of the
+time is the registry's: the same packages are fetched again without being installed.
 """
 
 import argparse
@@ -29,7 +30,9 @@ def main() -> None:
     against = arguments.parse_args().against
     rows = [row(None), *([row(against)] if against else [])]
     columns = ("environment", "install", "first run", "all", "fetch")
-    print(" " * 10 + "".join(f"{name:>12}" for name in columns) + f"{'fetched':>10}{'installed':>10}")
+    print(
+        " " * 10 + "".join(f"{name:>12}" for name in columns) + f"{'fetched':>10}{'installed':>10}"
+    )
     for r in rows:
         seconds = [r[name] for name in ("environment_s", "install_s", "run_s")]
         times = "".join(f"{s:10.1f} s" for s in (*seconds, sum(seconds), r["fetch_s"]))
@@ -64,10 +67,23 @@ def row(commit: str | None) -> dict[str, Any]:
         wheels = place / "wheels"
         fetch_s = run(python, "-m", "pip", "download", *PIP, "--dest", wheels, clone)
         fetched_mb = size_mb(wheels)
-        packages = {p.name: size_mb(p) for p in next(environment.glob("lib/*/site-packages")).iterdir()}
+        packages = {
+            p.name: size_mb(p) for p in next(environment.glob("lib/*/site-packages")).iterdir()
+        }
         largest = dict(sorted(packages.items(), key=lambda item: -item[1])[:6])
-    times = {"environment_s": environment_s, "install_s": install_s, "run_s": run_s, "fetch_s": fetch_s}
-    return {"commit": commit or "here", **times, "fetched_mb": fetched_mb, "mb": mb, "largest_mb": largest}
+    times = {
+        "environment_s": environment_s,
+        "install_s": install_s,
+        "run_s": run_s,
+        "fetch_s": fetch_s,
+    }
+    return {
+        "commit": commit or "here",
+        **times,
+        "fetched_mb": fetched_mb,
+        "mb": mb,
+        "largest_mb": largest,
+    }
 
 
 def run(*command: object, at: Path = HERE) -> float:
@@ -79,7 +95,9 @@ def run(*command: object, at: Path = HERE) -> float:
 
 def size_mb(place: Path) -> float:
     """Size of all files below a place."""
-    return sum(f.stat().st_size for f in place.rglob("*") if f.is_file() and not f.is_symlink()) / 1e6
+    return (
+        sum(f.stat().st_size for f in place.rglob("*") if f.is_file() and not f.is_symlink()) / 1e6
+    )
 
 
 if __name__ == "__main__":

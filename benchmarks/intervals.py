@@ -1,10 +1,10 @@
 """How often the harness's nominal 95 % intervals hold the truth, over simulated runs.
 
-A *cell* is a kind of figure, a true rate and a number of episodes E; in each so many runs are drawn whose
-truth is known, and the functions that make `summary.csv` and `harness compare` say their intervals. *Alike*
-is how alike the seeds, or the answers, of one episode are: their intraclass correlation, 1 where no seed
-changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2 000 runs a cell of exactly 95 % is
-measured within 1 point of it.
+A *cell* is a kind of figure, a true rate and a number of episodes E; in each so many runs are drawn
+whose truth is known, and the functions that make `summary.csv` and `harness compare` say their
+intervals. *Alike* is how alike the seeds, or the answers, of one episode are: their intraclass
+correlation, 1 where no seed changes anything. `<` marks less than 94 %, `>` more than 96 %; with 2
+000 runs a cell of exactly 95 % is measured within 1 point of it.
 
 `benchmarks/differences.py` has paired differences of success over halves and families.
 
@@ -32,7 +32,8 @@ from harness.core.statistics import (
 from harness.runs.metrics import SUCCESS, difference, over_episodes, over_seeds
 
 SMALLEST = "--runs 2"
-EPISODES, SEEDS, ANSWERS = (20, 60, 240), 5, (3, 9)  # an episode has so many answers, at least and at most
+# an episode has so many answers, at least and at most
+EPISODES, SEEDS, ANSWERS = (20, 60, 240), 5, (3, 9)
 TWINS = (12, 24, 40)  # episodes of `harness study twins`
 RATES = (0.54, 0.75, 0.9, 0.97, 0.99)
 PAIRS = ((0.54, 0.54), (0.54, 0.75), (0.75, 0.9), (0.9, 0.97), (0.97, 0.99), (0.97, 0.97))
@@ -42,7 +43,9 @@ ALONE = 0.7  # share of episodes that succeed without a message
 
 @dataclass(frozen=True)
 class Cell:
-    """What was measured: coverage and runs without an interval in percent, and the widths of the others."""
+    """What was measured: coverage and runs without an interval in percent,
+    and the widths of the others.
+    """
 
     kind: str
     row: str
@@ -57,10 +60,14 @@ Drawn = Iterator[tuple[Estimate, float]]  # a run's interval, and what it should
 Kind = Callable[[np.random.Generator, int, int], Drawn]  # from the runs and the episodes of each
 
 
-def outcomes(rng: np.random.Generator, rate: float, alike: float, episodes: int, seeds: int) -> Floats:
+def outcomes(
+    rng: np.random.Generator, rate: float, alike: float, episodes: int, seeds: int
+) -> Floats:
     """Successes (S, E) of layouts whose own rates are drawn from a beta distribution."""
     if alike in (0.0, 1.0):
-        own = np.full(episodes, rate) if alike == 0.0 else (rng.random(episodes) < rate).astype(float)
+        own = (
+            np.full(episodes, rate) if alike == 0.0 else (rng.random(episodes) < rate).astype(float)
+        )
     else:
         size = (1 - alike) / alike
         own = rng.beta(size * rate, size * (1 - rate), episodes)
@@ -87,8 +94,8 @@ def paired(
 ) -> list[Floats]:
     """Successes (E, S) of two conditions.
 
-    In a share `alike` of episodes the layout decides, in the others each seed; nine layouts in ten are as
-    hard for one condition as for the other.
+    In a share `alike` of episodes the layout decides, in the others each seed; nine layouts in ten
+    are as hard for one condition as for the other.
     """
     hard = rng.random(episodes)
     same, decides = rng.random(episodes) < 0.9, rng.random(episodes)
@@ -112,7 +119,9 @@ def gain(before: float, after: float, alike: tuple[float, float], seeds: int) ->
 
 
 def rare_change(rate: float, gained: float, seeds: int, loss: float) -> Kind:
-    """A gain in so few episodes that many runs see none: so many are expected, whatever their number."""
+    """A gain in so few episodes that many runs see none:
+    so many are expected, whatever their number.
+    """
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         share = gained / episodes
@@ -133,14 +142,18 @@ def answers(rate: float, alike: float) -> Kind:
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for _ in range(runs):
             given = outcomes(rng, rate, alike, episodes, ANSWERS[1]).T
-            said = np.arange(ANSWERS[1]) < rng.integers(ANSWERS[0], ANSWERS[1] + 1, episodes)[:, None]
+            said = (
+                np.arange(ANSWERS[1]) < rng.integers(ANSWERS[0], ANSWERS[1] + 1, episodes)[:, None]
+            )
             yield rate_interval(given[said], np.nonzero(said)[0]), rate
 
     return draw
 
 
 def twins(rate: float, alike: float, pairs: int) -> Kind:
-    """The share of questions whose twin agrees, with so many of each episode: 6 of the ego, 18 of helpers."""
+    """The share of questions whose twin agrees, with so many of each episode:
+    6 of the ego, 18 of helpers.
+    """
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         of = np.repeat(np.arange(episodes), pairs)
@@ -151,7 +164,9 @@ def twins(rate: float, alike: float, pairs: int) -> Kind:
 
 
 def seed_means(loss: float) -> Kind:
-    """A success rate over seeds, of these very episodes: some hang on a message, which may be lost."""
+    """A success rate over seeds, of these very episodes:
+    some hang on a message, which may be lost.
+    """
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         own = np.where(np.arange(episodes) < round(ALONE * episodes), 1.0, 1.0 - loss)
@@ -163,7 +178,9 @@ def seed_means(loss: float) -> Kind:
 
 
 def own_episodes(rate: float) -> Kind:
-    """A success rate over seeds of which each has episodes of its own, as in `harness study paper`."""
+    """A success rate over seeds of which each has episodes of its own,
+    as in `harness study paper`.
+    """
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for _ in range(runs):
@@ -191,7 +208,10 @@ def suite(families: Sequence[Kind]) -> Kind:
 
     def draw(rng: np.random.Generator, runs: int, episodes: int) -> Drawn:
         for drawn in zip(*(family(rng, runs, episodes) for family in families), strict=True):
-            yield mean_of([estimate for estimate, _ in drawn]), float(np.mean([truth for _, truth in drawn]))
+            yield (
+                mean_of([estimate for estimate, _ in drawn]),
+                float(np.mean([truth for _, truth in drawn])),
+            )
 
     return draw
 
@@ -223,13 +243,19 @@ def twin_kinds() -> Iterator[tuple[str, str, Kind]]:
 def kinds() -> Iterator[tuple[str, str, Kind]]:
     """What is measured: its heading, its row, and how it is drawn."""
     for seeds, alike in ((1, 1.0), (SEEDS, 0.1), (SEEDS, 0.6), (SEEDS, 0.9)):
-        heading = f"success rate, {seeds} seeds, alike {alike}" if seeds > 1 else "success rate, one seed"
+        heading = (
+            f"success rate, {seeds} seeds, alike {alike}" if seeds > 1 else "success rate, one seed"
+        )
         for rate in RATES:
             yield heading, f"{rate:.2f}", success(rate, alike, seeds)
     for seeds, shares in ((1, (1.0, 1.0)), (SEEDS, (1.0, 0.9)), (SEEDS, (0.6, 0.6))):
         of = f"{seeds} seeds, alike {shares[0]} and {shares[1]}" if seeds > 1 else "one seed"
         for before, after in PAIRS:
-            yield f"paired gain, {of}", f"{before:.2f} to {after:.2f}", gain(before, after, shares, seeds)
+            yield (
+                f"paired gain, {of}",
+                f"{before:.2f} to {after:.2f}",
+                gain(before, after, shares, seeds),
+            )
     for seeds, loss in ((1, 0.0), (SEEDS, 0.012)):
         of = f"{seeds} seeds, loss {loss}" if seeds > 1 else "one seed"
         for gained in (1, 2, 3, 4, 6):
@@ -256,7 +282,9 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--runs", type=int, default=2000)
     arguments.add_argument("--seed", type=int, default=0)
-    arguments.add_argument("--twins", action="store_true", help="those of `harness study twins` alone")
+    arguments.add_argument(
+        "--twins", action="store_true", help="those of `harness study twins` alone"
+    )
     given = arguments.parse_args()
     began, found, before = perf_counter(), list[Cell](), ""
     of = TWINS if given.twins else EPISODES
@@ -268,7 +296,9 @@ def main() -> None:
         for episodes in of:
             rng = np.random.default_rng((given.seed, n, episodes))
             drawn = list(kind(rng, given.runs, episodes))
-            covered = 100 * float(np.mean([e.low - 1e-9 <= truth <= e.high + 1e-9 for e, truth in drawn]))
+            covered = 100 * float(
+                np.mean([e.low - 1e-9 <= truth <= e.high + 1e-9 for e, truth in drawn])
+            )
             widths = np.array([e.high - e.low for e, _ in drawn])
             unknown = 100 * float(np.isnan(widths).mean())
             spread = float(np.nanmin(widths)), float(np.nanmean(widths))
@@ -284,8 +314,14 @@ def main() -> None:
         "of_no_width": sum(cell.least_width <= 0.0 for cell in found),
         "seconds": round(perf_counter() - began, 1),
     }
-    print("\n" + ", ".join(f"{name.replace('_', ' ')}: {value:.4g}" for name, value in told.items()))
-    print(json.dumps({"runs": given.runs, "seed": given.seed, **told, "found": list(map(asdict, found))}))
+    print(
+        "\n" + ", ".join(f"{name.replace('_', ' ')}: {value:.4g}" for name, value in told.items())
+    )
+    print(
+        json.dumps(
+            {"runs": given.runs, "seed": given.seed, **told, "found": list(map(asdict, found))}
+        )
+    )
 
 
 if __name__ == "__main__":

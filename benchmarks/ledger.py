@@ -3,7 +3,8 @@
     python benchmarks/ledger.py [--sets 10] [--coverage 100]
 
 Prints the ledger's counts on consecutive sets of five seeds at the paper's own sizes, each by
-`harness study paper --seeds`, and how often intervals over five other seeds hold the mean of all of them.
+`harness study paper --seeds`, and how often intervals over five other seeds hold the mean of all of
+them.
 """
 
 import argparse
@@ -33,7 +34,9 @@ def main() -> None:
     """Print both tables, and all as one line of JSON."""
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--sets", type=int, default=10)
-    arguments.add_argument("--coverage", type=int, default=100, help="sets of five seeds for the intervals")
+    arguments.add_argument(
+        "--coverage", type=int, default=100, help="sets of five seeds for the intervals"
+    )
     given = arguments.parse_args()
     held = [of_set(SEEDS * n) for n in range(given.sets)]
     covered = coverage(given.coverage)
@@ -45,7 +48,9 @@ def of_set(first: int) -> dict[str, object]:
     seeds = f"{first}:{first + SEEDS}"
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "harness", "study", "paper", "--seeds", seeds, "--json"]
-        said = subprocess.run([*command, "--out", folder], check=True, capture_output=True, text=True).stdout
+        said = subprocess.run(
+            [*command, "--out", folder], check=True, capture_output=True, text=True
+        ).stdout
     ledger = pd.read_json(StringIO(said), orient="records")
     counts = tally(ledger)
     off = {
@@ -54,15 +59,21 @@ def of_set(first: int) -> dict[str, object]:
     }
     print(
         f"seeds {seeds:<8}{counts['within']} of {counts['total']} within"
-        + "".join(f"; {verdict} {rows}" for verdict, rows in off.items() if rows), flush=True,
-    )  # fmt: skip
+        + "".join(f"; {verdict} {rows}" for verdict, rows in off.items() if rows),
+        flush=True,
+    )
     return {"seeds": seeds, **counts, "rows": off}
 
 
 def coverage(sets: int) -> list[dict[str, object]]:
-    """How often the interval of five seeds has the mean of all seeds, which is as good as the truth."""
+    """How often the interval of five seeds has the mean of all seeds,
+    which is as good as the truth.
+    """
     found: list[dict[str, object]] = []
-    heads = (f"{head:>10}" for head in ("value", "episodes", "success %", "covers %", "± ours", "± plain"))
+    heads = (
+        f"{head:>10}"
+        for head in ("value", "episodes", "success %", "covers %", "± ours", "± plain")
+    )
     print(f"{'panel':<8}{''.join(heads)}")
     for panel in panels():
         source = Calibrated(panel.episodes)
@@ -76,8 +87,9 @@ def coverage(sets: int) -> list[dict[str, object]]:
             measured = _covered([part.ends["success_rate"] for [part] in walks])
             print(
                 f"{panel.name:<8}{setting.value:>10}{panel.episodes:>10}"
-                + "".join(f"{number:>10.2f}" for number in measured.values()), flush=True,
-            )  # fmt: skip
+                + "".join(f"{number:>10.2f}" for number in measured.values()),
+                flush=True,
+            )
             found.append({"panel": panel.name, "value": setting.value, **measured})
     return found
 

@@ -2,9 +2,10 @@
 
     python benchmarks/load.py [RUN] [--decisions 1000000] [--repeats 5] [--layouts N]
 
-The run is made of a real one, by default of the shipped dataset: its decisions, answers and episodes stand in
-it again and again under new numbers of episodes. It is read in a process of its own. The limit is what
-nobody can do without: imports of pandas and pyarrow, and the same Parquet file as a data frame.
+The run is made of a real one, by default of the shipped dataset: its decisions, answers and
+episodes stand in it again and again under new numbers of episodes. It is read in a process of its
+own. The limit is what nobody can do without: imports of pandas and pyarrow, and the same Parquet
+file as a data frame.
 """
 
 import argparse
@@ -46,7 +47,9 @@ def main() -> None:
     arguments.add_argument("run", nargs="?", type=Path)
     arguments.add_argument("--decisions", type=int, default=1_000_000)
     arguments.add_argument("--repeats", type=int, default=5)
-    arguments.add_argument("--layouts", type=int, help="of the shipped dataset in the real run; else all")
+    arguments.add_argument(
+        "--layouts", type=int, help="of the shipped dataset in the real run; else all"
+    )
     given = arguments.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         source = given.run or evaluated(Path(scratch) / "real", given.layouts)
@@ -67,7 +70,12 @@ def main() -> None:
     what, n = f"{given.decisions} decisions as a table", given.repeats
     rows = [
         Row(
-            f"{what}, wall", found["decisions_s"], "s", n, found["limit_s"], aim=f"≤ {AIMS['decisions_s']:g}"
+            f"{what}, wall",
+            found["decisions_s"],
+            "s",
+            n,
+            found["limit_s"],
+            aim=f"≤ {AIMS['decisions_s']:g}",
         ),
         Row(f"{what}, peak memory", found["decisions_mb"], "MB", n, found["limit_mb"]),
     ]
@@ -85,7 +93,10 @@ def evaluated(out: Path, layouts: int | None) -> Path:
 def measured(program: str, run: Path) -> list[float]:
     """What a program prints last, run in a new process."""
     command = [sys.executable, "-c", MEASURED.format(program), str(run)]
-    return [float(value) for value in subprocess.run(command, check=True, capture_output=True).stdout.split()]
+    return [
+        float(value)
+        for value in subprocess.run(command, check=True, capture_output=True).stdout.split()
+    ]
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """How often runs that may stop at every look hold the truth, and after how many layouts they stop.
 
-Outcomes are those of `benchmarks/intervals.py` and `benchmarks/plan.py`, whose truth is known. A run has so
-many layouts at most, and is looked at as with `harness eval --until-width` and `--until-decided`. *Every
-look*: runs whose interval holds the truth at all looks. *Stop*: at the look where it stops. *Fixed*: at all
-looks, by the interval for a number of layouts fixed before. *Layouts*: the median after which runs stop.
-*Planned*: what the same width, or a power of 80 %, needs without looking.
+Outcomes are those of `benchmarks/intervals.py` and `benchmarks/plan.py`, whose truth is known. A
+run has so many layouts at most, and is looked at as with `harness eval --until-width` and
+`--until-decided`. *Every look*: runs whose interval holds the truth at all looks. *Stop*: at the
+look where it stops. *Fixed*: at all looks, by the interval for a number of layouts fixed before.
+*Layouts*: the median after which runs stop. *Planned*: what the same width, or a power of 80 %,
+needs without looking.
 
     python benchmarks/looks.py [--runs 1000] [--layouts 1000] [--seed 0] [--only TEXT]
 """
@@ -59,7 +60,9 @@ def rate(truth: str, rates: tuple[float, ...], seeds: int, alike: float) -> Case
     """A success rate; of two it is the mean, with a danger and without."""
 
     def study(rng: np.random.Generator, layouts: int) -> Outcomes:
-        dangerous: Bools = np.arange(layouts) % 3 > 0 if len(rates) > 1 else np.zeros(layouts, dtype=bool)
+        dangerous: Bools = (
+            np.arange(layouts) % 3 > 0 if len(rates) > 1 else np.zeros(layouts, dtype=bool)
+        )
         success = np.empty((seeds, layouts))
         parts = (dangerous, ~dangerous) if len(rates) > 1 else (~dangerous,)
         for part, of_part in zip(parts, rates, strict=True):
@@ -68,14 +71,21 @@ def rate(truth: str, rates: tuple[float, ...], seeds: int, alike: float) -> Case
 
     def planned(many: Outcomes) -> float:
         success, values, _ = many
-        spread = success.spread(np.zeros_like(values), values, np.ones(values.shape[1], dtype=np.int64))
+        spread = success.spread(
+            np.zeros_like(values), values, np.ones(values.shape[1], dtype=np.int64)
+        )
         variance = float(np.sum(spread.variances / spread.shares)) / len(spread.shares) ** 2
         return (2 * 1.96 / WIDTH) ** 2 * variance
 
     return Case(
-        truth, float(np.mean(rates)), study, lambda o: o[0].any_time(o[1]),
-        lambda o: o[0].estimate(o[1]), planned, decided=False,
-    )  # fmt: skip
+        truth,
+        float(np.mean(rates)),
+        study,
+        lambda o: o[0].any_time(o[1]),
+        lambda o: o[0].estimate(o[1]),
+        planned,
+        decided=False,
+    )
 
 
 def gain(truth: str, value: float, study: Study) -> Case:
@@ -85,9 +95,14 @@ def gain(truth: str, value: float, study: Study) -> Case:
         return float(spread_of(many).episodes(value, 0.8)) if value else np.nan
 
     return Case(
-        truth, value, study, lambda o: o[0].any_time_difference(o[2], o[1]),
-        lambda o: o[0].difference(o[2], o[1]), planned, decided=True,
-    )  # fmt: skip
+        truth,
+        value,
+        study,
+        lambda o: o[0].any_time_difference(o[2], o[1]),
+        lambda o: o[0].difference(o[2], o[1]),
+        planned,
+        decided=True,
+    )
 
 
 def cases() -> list[Case]:
@@ -99,7 +114,10 @@ def cases() -> list[Case]:
             gain(f"gain {a:.2f} to {b:.2f}, one seed", b - a, plain(a, b, 1, 1.0))
             for a, b in ((0.75, 0.75), (0.75, 0.8), (0.75, 0.85), (0.54, 0.74))
         ),
-        *(gain(f"gain {a:.2f} to {b:.2f}, 5 seeds", b - a, plain(a, b, 5, 0.6)) for a, b in ((0.75, 0.85),)),
+        *(
+            gain(f"gain {a:.2f} to {b:.2f}, 5 seeds", b - a, plain(a, b, 5, 0.6))
+            for a, b in ((0.75, 0.85),)
+        ),
         gain("balanced gain, .50 to .70", 0.1, mixed(balanced(0.5, 0.7, 5, 0.6))),
     ]
 
@@ -131,11 +149,13 @@ def measure(case: Case, layouts: int, runs: int, seed: int) -> Cell:
         stop += holds[last]
         fixed += all(_holds(case.fixed(prefix), case.value) for prefix in prefixes)
         after.append(looks(layouts)[last])
-    share_every, share_stop, share_fixed = ((k / runs, *wilson(k / runs, runs)) for k in (every, stop, fixed))
+    share_every, share_stop, share_fixed = (
+        (k / runs, *wilson(k / runs, runs)) for k in (every, stop, fixed)
+    )
     stopped = float(np.mean(np.array(after) < layouts))
     return Cell(
         case.truth, share_every, share_stop, share_fixed, float(np.median(after)), stopped, planned
-    )  # fmt: skip
+    )
 
 
 def _holds(span: Estimate, value: float) -> bool:
@@ -143,7 +163,9 @@ def _holds(span: Estimate, value: float) -> bool:
 
 
 def _enough(case: Case, span: Estimate) -> bool:
-    return bool(span.low > 0 or span.high < 0) if case.decided else bool(span.high - span.low <= WIDTH)
+    return (
+        bool(span.low > 0 or span.high < 0) if case.decided else bool(span.high - span.low <= WIDTH)
+    )
 
 
 def main() -> None:
@@ -155,7 +177,8 @@ def main() -> None:
     arguments.add_argument("--only", default="", help="only truths whose name holds this text")
     given = arguments.parse_args()
     print(
-        f"{given.runs} runs of {given.layouts} layouts at most, {len(looks(given.layouts))} looks; they stop "
+        f"{given.runs} runs of {given.layouts} layouts at most, {len(looks(given.layouts))} looks; "
+        "they stop "
         f"at a width of {100 * WIDTH:g} points, gains where they are decided"
     )
     heads = ("every look", "stop", "fixed", "layouts", "stopped", "planned")
@@ -171,11 +194,16 @@ def main() -> None:
         shares = (cell.every_look, cell.stop, cell.fixed)
         shown = [f"{100 * p:.1f} [{100 * low:.1f}, {100 * high:.1f}]" for p, low, high in shares]
         print(
-            f"{cell.truth:<28}" + "".join(f"{text:>20}" for text in shown)
+            f"{cell.truth:<28}"
+            + "".join(f"{text:>20}" for text in shown)
             + f"{cell.layouts:>9.0f}{100 * cell.stopped:>8.0f}%{cell.planned:>9.0f}",
             flush=True,
-        )  # fmt: skip
-    print(json.dumps({"runs": given.runs, "layouts": given.layouts, "cells": list(map(asdict, cells))}))
+        )
+    print(
+        json.dumps(
+            {"runs": given.runs, "layouts": given.layouts, "cells": list(map(asdict, cells))}
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 """Sizes of messages as an ASN.1 encoder writes them: what `tests/golden/message-sizes.json` holds.
 
-It needs pycrate (pip install pycrate==0.8.1) and the modules of the standards, which do not ship here:
+It needs pycrate (pip install pycrate==0.8.1) and the modules of the standards,
+which do not ship here:
 
-- ETSI's, a directory of .asn files: `TS103900v231-CAM.asn`, `TS102894-2v241-CDD.asn` and the `CPM-*.asn` of
-  `TS103324v211/`, from `asn1/release2` of github.com/riebl/vanetza (published by ETSI at forge.etsi.org);
-- J2735 of September 2024, which has J3224's SDSM, as pycrate compiles it: `j2735_202409/__init__.py` of
-  github.com/jwillmartin/j2735_2024.
+- ETSI's, a directory of .asn files: `TS103900v231-CAM.asn`, `TS102894-2v241-CDD.asn` and the
+  `CPM-*.asn` of `TS103324v211/`, from `asn1/release2` of github.com/riebl/vanetza (published by
+  ETSI at forge.etsi.org);
+- J2735 of September 2024, which has J3224's SDSM, as pycrate compiles it:
+  `j2735_202409/__init__.py` of github.com/jwillmartin/j2735_2024.
 
 The CAM of EN 302 637-2 and IEEE 1609.2 come with pycrate. Values are drawn within their ranges.
 
@@ -24,7 +26,8 @@ from pathlib import Path
 from typing import Any
 
 UNTESTED = "it needs pycrate and modules of the standards, which do not ship here"
-# Containers of our own, of elements that CDD and J2735 have. They stand where an MCM or an MSCM would.
+# Containers of our own, of elements that CDD and J2735 have. They stand where an MCM or an MSCM
+# would.
 OWN = """
 Own DEFINITIONS AUTOMATIC TAGS ::= BEGIN
 IMPORTS ItsPduHeader, GenerationDeltaTime, ReferencePosition, StationId FROM ETSI-ITS-CDD
@@ -45,7 +48,7 @@ SaeIntent ::= SEQUENCE { start SaeStart, judgement Judgement, ... }
 SaeRequest ::= SEQUENCE { start SaeStart, deadline INTEGER (0..4095),
   helpers SEQUENCE (SIZE (1..1024)) OF OCTET STRING (SIZE (4)), ... }
 END
-"""
+"""  # noqa: E501
 OBJECTS, POINTS = (*range(21), 60, 255), (1, 2, 5, 10, 23)
 ACTIONS, TEXTS, HELPERS = (0, 1, 3, 5, 15), (0, 1, 60, 119, 120, 200), (1, 3, 32)
 PAYLOADS = (1, 40, 60, 115, 127, 128, 200, 255, 256, 300, 1400)
@@ -61,18 +64,26 @@ def etsi_start(message_id: int) -> dict[str, Any]:
 
 
 def etsi_position(
-    major: str = "semiMajorConfidence", minor: str = "semiMinorConfidence", turn: str = "semiMajorOrientation"
+    major: str = "semiMajorConfidence",
+    minor: str = "semiMinorConfidence",
+    turn: str = "semiMajorOrientation",
 ) -> dict[str, Any]:
     return {
         "latitude": number(-900000000, 900000001),
         "longitude": number(-1800000000, 1800000001),
-        "positionConfidenceEllipse": {major: number(0, 4095), minor: number(0, 4095), turn: number(0, 3601)},
+        "positionConfidenceEllipse": {
+            major: number(0, 4095),
+            minor: number(0, 4095),
+            turn: number(0, 3601),
+        },
         "altitude": {"altitudeValue": number(-100000, 800001), "altitudeConfidence": "unavailable"},
     }
 
 
 def cam(points: int) -> dict[str, Any]:
-    """Return the members of a CAM; the low-frequency container with a path of some points, if any."""
+    """Return the members of a CAM; the low-frequency container with a path of some points, if
+    any.
+    """
     high = {
         "heading": {"headingValue": number(0, 3601), "headingConfidence": number(1, 127)},
         "speed": {"speedValue": number(0, 16383), "speedConfidence": number(1, 127)},
@@ -87,7 +98,11 @@ def cam(points: int) -> dict[str, Any]:
         "curvatureCalculationMode": "yawRateUsed",
         "yawRate": {"yawRateValue": number(-32766, 32767), "yawRateConfidence": "unavailable"},
     }
-    position = {"deltaLatitude": 1, "deltaLongitude": number(-131071, 131072), "deltaAltitude": 12800}
+    position = {
+        "deltaLatitude": 1,
+        "deltaLongitude": number(-131071, 131072),
+        "deltaAltitude": 12800,
+    }
     path = [{"pathPosition": position, "pathDeltaTime": number(1, 65535)} for _ in range(points)]
     low = {"vehicleRole": "default", "exteriorLights": (number(0, 255), 8), "pathHistory": path}
     names = "semiMajorAxisLength", "semiMinorAxisLength", "semiMajorAxisOrientation"
@@ -105,7 +120,10 @@ def cam_of_release_1(points: int) -> dict[str, Any]:
     members = cam(points)
     parameters = members["camParameters"]
     high = parameters["highFrequencyContainer"][1]
-    names = {"value": "longitudinalAccelerationValue", "confidence": "longitudinalAccelerationConfidence"}
+    names = {
+        "value": "longitudinalAccelerationValue",
+        "confidence": "longitudinalAccelerationConfidence",
+    }
     acceleration = {names[key]: value for key, value in high["longitudinalAcceleration"].items()}
     high["longitudinalAcceleration"] = acceleration
     parameters["basicContainer"]["referencePosition"] = etsi_position()
@@ -124,7 +142,10 @@ def cpm(objects: int, optional: bool) -> dict[str, Any]:
         }
         if optional:
             polar = {
-                "velocityMagnitude": {"speedValue": number(0, 16383), "speedConfidence": number(1, 127)},
+                "velocityMagnitude": {
+                    "speedValue": number(0, 16383),
+                    "speedConfidence": number(1, 127),
+                },
                 "velocityDirection": {"value": number(0, 3601), "confidence": number(1, 127)},
             }
             members["velocity"] = "polarVelocity", polar
@@ -167,15 +188,24 @@ def bsm(points: int) -> dict[str, Any]:
         "angle": number(-126, 127),
         "accelSet": {"long": number(-2000, 2001), "lat": 0, "vert": number(-127, 127), "yaw": 0},
         "brakes": {
-            "wheelBrakes": (number(0, 31), 5), "traction": "on", "abs": "on", "scs": "on",
-            "brakeBoost": "on", "auxBrakes": "on",
+            "wheelBrakes": (number(0, 31), 5),
+            "traction": "on",
+            "abs": "on",
+            "scs": "on",
+            "brakeBoost": "on",
+            "auxBrakes": "on",
         },
         "size": {"width": number(0, 1023), "length": number(0, 4095)},
-    }  # fmt: skip
+    }
     if not points:
         return {"coreData": core}
     crumbs = [
-        {"latOffset": number(-131072, 131071), "lonOffset": 0, "elevationOffset": 5, "timeOffset": 9}
+        {
+            "latOffset": number(-131072, 131071),
+            "lonOffset": 0,
+            "elevationOffset": 5,
+            "timeOffset": 9,
+        }
         for _ in range(points)
     ]
     extensions = {
@@ -202,19 +232,27 @@ def sdsm(objects: int, optional: bool) -> dict[str, Any]:
             "headingConf": "unavailable",
         }
         lights = {"lights": (number(0, 511), 9), "vehicleClass": number(0, 255)}
-        return {"detObjCommon": common, **({"detObjOptData": ("detVeh", lights)} if optional else {})}
+        return {
+            "detObjCommon": common,
+            **({"detObjOptData": ("detVeh", lights)} if optional else {}),
+        }
 
     return {
         "msgCnt": number(0, 127),
         "sourceID": random.randbytes(4),
         "equipmentType": "obu",
         "sDSMTimeStamp": {
-            "year": 2026, "month": 11, "day": 27, "hour": 8, "minute": 30, "second": number(0, 65535)
+            "year": 2026,
+            "month": 11,
+            "day": 27,
+            "hour": 8,
+            "minute": 30,
+            "second": number(0, 65535),
         },
         "refPos": {"lat": number(-900000000, 900000001), "long": number(-1799999999, 1800000001)},
         "refPosXYConf": {"semiMajor": 255, "semiMinor": 255, "orientation": number(0, 65535)},
         "objects": [detected() for _ in range(objects)],
-    }  # fmt: skip
+    }
 
 
 def judgement(actions: int, text: int) -> dict[str, Any]:
@@ -255,9 +293,16 @@ def messages(etsi: Any, j2735: Any, own: Any) -> Iterator[tuple[str, dict[str, i
     for objects in OBJECTS:
         for optional in (False, True):
             counts = {"objects": objects, "optional": int(optional)}
-            yield "CPM", counts, uper(kind, {"header": etsi_start(14), "payload": cpm(objects, optional)})
+            yield (
+                "CPM",
+                counts,
+                uper(kind, {"header": etsi_start(14), "payload": cpm(objects, optional)}),
+            )
             if objects:
-                frame = ("SensorDataSharingMessage", "SensorDataSharingMessage"), sdsm(objects, optional)
+                frame = (
+                    ("SensorDataSharingMessage", "SensorDataSharingMessage"),
+                    sdsm(objects, optional),
+                )
                 yield "SDSM", counts, uper(sae, {"messageId": 41, "value": frame})
 
     def framed(kind: Any, value: Any) -> int:
@@ -270,14 +315,21 @@ def messages(etsi: Any, j2735: Any, own: Any) -> Iterator[tuple[str, dict[str, i
 
     for actions in ACTIONS:
         for text in TEXTS:
-            counts, value = {"actions": actions, "text_bytes": text}, {"judgement": judgement(actions, text)}
+            counts, value = (
+                {"actions": actions, "text_bytes": text},
+                {"judgement": judgement(actions, text)},
+            )
             yield "etsi-intent", counts, uper(own.EtsiIntent, {**etsi_members(), **value})
             yield "sae-intent", counts, framed(own.SaeIntent, {"start": sae_start(), **value})
     for helpers in HELPERS:
         counts = {"helpers": helpers}
         deadline: dict[str, Any] = {"deadline": number(0, 4095)}
         ids = [number(0, 2**32 - 1) for _ in range(helpers)]
-        yield "etsi-request", counts, uper(own.EtsiRequest, {**etsi_members(), **deadline, "helpers": ids})
+        yield (
+            "etsi-request",
+            counts,
+            uper(own.EtsiRequest, {**etsi_members(), **deadline, "helpers": ids}),
+        )
         names = [random.randbytes(4) for _ in range(helpers)]
         asked = {"start": sae_start(), **deadline, "helpers": names}
         yield "sae-request", counts, framed(own.SaeRequest, asked)
@@ -378,16 +430,26 @@ def main() -> None:
         for name, counts, bits in messages(etsi, opened(given.j2735), etsi.Own)
     ]
     envelopes = [
-        {"psid": psid, "payload_bits": 8 * payload, "certificate": certificate,
-         "bits": signed(psid, payload, certificate)}
-        for psid in (32, 36, 144, 639) for payload in PAYLOADS for certificate in (False, True)
-    ]  # fmt: skip
+        {
+            "psid": psid,
+            "payload_bits": 8 * payload,
+            "certificate": certificate,
+            "bits": signed(psid, payload, certificate),
+        }
+        for psid in (32, 36, 144, 639)
+        for payload in PAYLOADS
+        for certificate in (False, True)
+    ]
     made = {
         "command": "python benchmarks/message_sizes.py ETSI_DIRECTORY J2735_MODULE",
         "encoder": f"pycrate {version('pycrate')}",
         "modules": [path.name for path in paths] + ["J2735 2024-09"],
     }
-    print(json.dumps({**made, "messages": cases, "envelopes": envelopes}, indent=None, separators=(",", ":")))
+    print(
+        json.dumps(
+            {**made, "messages": cases, "envelopes": envelopes}, indent=None, separators=(",", ":")
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
-"""What tests catch: mutants of the harness's own lines, drawn by a seed, before two versions of the tests.
+"""What tests catch: mutants of the harness's own lines, drawn by a seed,
+before two versions of the tests.
 
     pip install pytest-cov
     python benchmarks/mutants.py reach CHECKOUT FILE [-m MARKS]
     python benchmarks/mutants.py try OLD OLD_FILE NEW NEW_FILE [--page FILE]
 
-`reach` runs the tests of a checkout and writes which test runs which line. `try` draws two mutants of each of
-fifteen rooms from lines that OLD's tests run. OLD and NEW are checkouts with the same `harness/`, which is
-changed in both, one mutant at a time, and restored. Each version stops at its first failure. Tests that run
-the line are tried, 80 at most, the most specific first: those that run the fewest lines. Of few, all tests
-of their files follow, since what a shared fixture runs counts as run by its first test. What OLD catches and
-NEW has not caught by then is shown to all of NEW's tests. With --page, the same command goes on after a kill.
+`reach` runs the tests of a checkout and writes which test runs which line. `try` draws two mutants
+of each of fifteen rooms from lines that OLD's tests run. OLD and NEW are checkouts with the same
+`harness/`, which is changed in both, one mutant at a time, and restored. Each version stops at its
+first failure. Tests that run the line are tried, 80 at most, the most specific first: those that
+run the fewest lines. Of few, all tests of their files follow, since what a shared fixture runs
+counts as run by its first test. What OLD catches and NEW has not caught by then is shown to all of
+NEW's tests. With --page, the same command goes on after a kill.
 """
 
 import argparse
@@ -89,7 +91,9 @@ def main() -> None:
     measured = commands.add_parser("reach")
     measured.add_argument("checkout", type=Path)
     measured.add_argument("file", type=Path)
-    measured.add_argument("-m", dest="marks", default="", help="tests of these marks alone, as pytest's -m")
+    measured.add_argument(
+        "-m", dest="marks", default="", help="tests of these marks alone, as pytest's -m"
+    )
     measured.set_defaults(run=lambda given: reach(given.checkout, given.file, given.marks))
     tried = commands.add_parser("try")
     for name in ("old", "old_file", "new", "new_file"):
@@ -97,7 +101,9 @@ def main() -> None:
     tried.add_argument("--seed", type=int, default=59)
     tried.add_argument("--each", type=int, default=2, help="mutants of each room")
     tried.add_argument("--new-marks", default="not exhaustive", help="which of NEW's tests count")
-    tried.add_argument("--page", type=Path, help="file to which the table is written, a row at a time")
+    tried.add_argument(
+        "--page", type=Path, help="file to which the table is written, a row at a time"
+    )
     tried.set_defaults(run=compare)
     given = parser.parse_args()
     given.run(given)
@@ -110,7 +116,14 @@ def reach(checkout: Path, file: Path, marks: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         config, data = Path(folder, "coverage.ini"), Path(folder, "data")
         config.write_text(COVERAGE.replace("{}", str(data)))
-        options = ["--cov", "--cov-context=test", f"--cov-config={config}", "--cov-report=", "-m", marks]
+        options = [
+            "--cov",
+            "--cov-context=test",
+            f"--cov-config={config}",
+            "--cov-report=",
+            "-m",
+            marks,
+        ]
         command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "worksteal", *options]
         subprocess.run(command, cwd=checkout, env=environment(checkout), check=False)
         found = CoverageData(str(data))
@@ -176,7 +189,9 @@ def read_table(page: Path | None) -> list[list[str]]:
 def read_reach(file: Path) -> Reach:
     """Read which tests run which line."""
     rows = json.loads(file.read_text())
-    return {name: {int(line): tests for line, tests in lines.items()} for name, lines in rows.items()}
+    return {
+        name: {int(line): tests for line, tests in lines.items()} for name, lines in rows.items()
+    }
 
 
 def drawn(checkout: Path, reached: Reach, seed: int, each: int) -> list[Mutant]:
@@ -193,7 +208,9 @@ def drawn(checkout: Path, reached: Reach, seed: int, each: int) -> list[Mutant]:
         files: set[str] = set()
         for rule in draw.sample(rules, len(rules)):
             # Rules first, so that frequent ones do not crowd out the others.
-            left = [mutant for mutant in candidates if mutant.rule == rule and mutant.file not in files]
+            left = [
+                mutant for mutant in candidates if mutant.rule == rule and mutant.file not in files
+            ]
             if left and len(files) < each:
                 chosen.append(draw.choice(left))
                 files.add(chosen[-1].file)
@@ -227,14 +244,18 @@ def mutants(name: str, source: str) -> Iterator[Mutant]:
             yield Mutant(name, left.lineno, rule, at, at + len(stands), signs[stands])
 
     functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
-    for node in {inner for function in functions for part in function.body for inner in ast.walk(part)}:
+    for node in {
+        inner for function in functions for part in function.body for inner in ast.walk(part)
+    }:
         if isinstance(node, ast.BinOp):
             yield from between(node.left, node.right, SIGNS, "sign")
         elif isinstance(node, ast.Compare) and len(node.ops) == 1:
             yield from between(node.left, node.comparators[0], COMPARISONS, "bound")
         elif isinstance(node, ast.If) and isinstance(node.body[0], ast.Raise):
             yield Mutant(name, node.lineno, "dropped check", *span(node.test), "False")
-        elif isinstance(node, ast.Tuple | ast.List) or (isinstance(node, ast.Call) and len(node.args) > 1):
+        elif isinstance(node, ast.Tuple | ast.List) or (
+            isinstance(node, ast.Call) and len(node.args) > 1
+        ):
             parts = node.args if isinstance(node, ast.Call) else node.elts
             if len(parts) > 1 and isinstance(getattr(node, "ctx", ast.Load()), ast.Load):
                 (start, first_end), (second, end) = span(parts[0]), span(parts[1])
@@ -251,7 +272,9 @@ def mutants(name: str, source: str) -> Iterator[Mutant]:
         if isinstance(node, ast.Call) and node.args and getattr(node.func, "id", "") in DRAWS:
             start, end = span(node.args[-1])
             if not isinstance(node.args[-1], ast.Starred):
-                yield Mutant(name, node.args[-1].lineno, "seed", start, end, f"({source[start:end]}, 1)")
+                yield Mutant(
+                    name, node.args[-1].lineno, "seed", start, end, f"({source[start:end]}, 1)"
+                )
 
 
 def tried(mutant: Mutant, checkout: Path, reached: Reach, marks: str, known: str = "") -> Verdict:
@@ -259,7 +282,9 @@ def tried(mutant: Mutant, checkout: Path, reached: Reach, marks: str, known: str
     file = checkout / mutant.file
     source = file.read_text("utf-8")
     lines = Counter(test for rows in reached.values() for tests in rows.values() for test in tests)
-    tests = sorted(reached.get(mutant.file, {}).get(mutant.line, []), key=lambda test: (lines[test], test))
+    tests = sorted(
+        reached.get(mutant.file, {}).get(mutant.line, []), key=lambda test: (lines[test], test)
+    )
     stages: list[Sequence[str]] = [tests[:FIRST], tests[FIRST:MOST]]
     if known in lines:
         stages.insert(0, [known])  # it still stands, and catches most likely what it caught before
@@ -287,7 +312,16 @@ def first_failure(checkout: Path, tests: Sequence[str], marks: str) -> tuple[str
         listed.write("\n".join(tests))
         listed.flush()
         workers = ["-n", "2"] if len(tests) > FIRST or "::" not in tests[0] else []
-        options = ["-x", "--tb=no", "-p", "no:cacheprovider", "-m", marks, *workers, f"@{listed.name}"]
+        options = [
+            "-x",
+            "--tb=no",
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            marks,
+            *workers,
+            f"@{listed.name}",
+        ]
         command = [sys.executable, "-m", "pytest", *options]
         try:
             done = subprocess.run(

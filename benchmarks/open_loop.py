@@ -2,10 +2,10 @@
 
     python benchmarks/open_loop.py [--layouts 100] [--scenarios NAME ...]
 
-It builds the trees of so many layouts of each scenario in half an hour, and searches all sequences. One is
-left as soon as the layouts that it can still clear are no more than the best so far clears. It prints what is
-found; without options it writes `harness/world/open_loop.csv`, from which the driver `open-loop` takes its
-actions.
+It builds the trees of so many layouts of each scenario in half an hour, and searches all sequences.
+One is left as soon as the layouts that it can still clear are no more than the best so far clears.
+It prints what is found; without options it writes `harness/world/open_loop.csv`, from which the
+driver `open-loop` takes its actions.
 """
 
 import argparse
@@ -24,13 +24,27 @@ from harness.world.drivers import OPEN_LOOPS
 
 SMALLEST = "--layouts 1 --scenarios parking-exit"
 LAYOUTS = 100
-# Scenarios, and the version of the limits by which their layouts are drawn and judged: those of the suite
-# v2v-safety-2, and the paper's scenario by the first version.
+# Scenarios, and the version of the limits by which their layouts are drawn and judged: those of the
+# suite v2v-safety-2, and the paper's scenario by the first version.
 SEARCHED = (
-    ("occluded-intersection", 1), ("occluded-intersection", 2), ("hard-brake-ahead", 2), ("do-not-pass", 2),
-    ("roundabout-entry", 2), ("parking-exit", 2), ("blind-merge", 2),
-)  # fmt: skip
-HEADS = ("scenario", "limits", "actions", "cleared", "layouts", "harmless_cleared", "harmless", "first_seed")
+    ("occluded-intersection", 1),
+    ("occluded-intersection", 2),
+    ("hard-brake-ahead", 2),
+    ("do-not-pass", 2),
+    ("roundabout-entry", 2),
+    ("parking-exit", 2),
+    ("blind-merge", 2),
+)
+HEADS = (
+    "scenario",
+    "limits",
+    "actions",
+    "cleared",
+    "layouts",
+    "harmless_cleared",
+    "harmless",
+    "first_seed",
+)
 
 
 def weights(dangerous: Floats, limits: int = 2) -> Floats:
@@ -87,7 +101,10 @@ def main() -> None:
     arguments.add_argument("--layouts", type=int, default=LAYOUTS)
     arguments.add_argument("--scenarios", nargs="+", default=[name for name, _ in SEARCHED])
     given = arguments.parse_args()
-    print(f"{stated(FIRST['tune'], given.layouts)}; cleared, layouts, cleared without a danger, of these")
+    print(
+        f"{stated(FIRST['tune'], given.layouts)}; cleared, layouts, cleared without a danger, of "
+        "these"
+    )
     searched = [each for each in SEARCHED if each[0] in given.scenarios]
     rows = [measured(name, limits, given.layouts) for name, limits in searched]
     if (given.layouts, searched) == (LAYOUTS, list(SEARCHED)):

@@ -3,9 +3,9 @@
     python benchmarks/order.py [--only TEXT] [--layouts N] [--out reports/order]
                                [--page benchmarks/measured/benchmark.md]
 
-It evaluates each of `ENTRIES` on the suite under `6g`, draws weights of the families from the flat Dirichlet
-distribution, and writes the tables of the page between its marks. What is finished is read and not made
-again; a stopped one goes on with the same command.
+It evaluates each of `ENTRIES` on the suite under `6g`, draws weights of the families from the flat
+Dirichlet distribution, and writes the tables of the page between its marks. What is finished is
+read and not made again; a stopped one goes on with the same command.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -68,15 +68,28 @@ def by_weights(entries: Mapping[str, Families]) -> Iterator[str]:
     ahead = np.diff(weights @ scores.T, axis=1) < 0
     yield f"The order stays in {int(ahead.all(axis=1).sum())} of {DRAWS} draws."
     rows = [
-        (f"{' over '.join(pair)}", str(int(often)), difference(entries, pair), *least(entries, *pair))
+        (
+            f"{' over '.join(pair)}",
+            str(int(often)),
+            difference(entries, pair),
+            *least(entries, *pair),
+        )
         for pair, often in zip(pairwise(entries), ahead.sum(axis=0), strict=True)
     ]
-    heads = ("neighbours", f"ahead, of {DRAWS}", "difference, points", "least without a family", "which")
+    heads = (
+        "neighbours",
+        f"ahead, of {DRAWS}",
+        "difference, points",
+        "least without a family",
+        "which",
+    )
     yield markdown(heads, rows)
 
 
 def difference(entries: Mapping[str, Families], pair: Sequence[str], without: str = "") -> str:
-    """Return by how much the first is above the second, paired by layout, perhaps without one family."""
+    """Return by how much the first is above the second, paired by layout,
+    perhaps without one family.
+    """
     upper, lower = (
         Families({family: run for family, run in entries[name].runs.items() if family != without})
         for name in pair

@@ -1,9 +1,9 @@
 """The harness's own CPU time for a decision: the slope of an evaluation between two sizes.
 
-A decision is a decision point that some walk came to: one ego answer and up to three helper answers, scored
-under three conditions and five seeds. Sizes are copies of the dataset. Own time is the process's CPU time
-less what `backend.complete` takes, and less what making the copies takes. Loading the dataset is apart, since
-it is done once.
+A decision is a decision point that some walk came to: one ego answer and up to three helper
+answers, scored under three conditions and five seeds. Sizes are copies of the dataset. Own time is
+the process's CPU time less what `backend.complete` takes, and less what making the copies takes.
+Loading the dataset is apart, since it is done once.
 
     python benchmarks/own_time.py [DATASET] [--layouts N] [--sizes 1 5] [--repeats 3]
                                   [--prompt v2]
@@ -48,7 +48,8 @@ from harness.world.scene_graph import SceneGraph
 SMALLEST = "--layouts 1 --sizes 1 2 --repeats 1"
 TABLE = "--sizes 1 2"
 AIM_MS = 0.2
-# Functions whose time makes up a part; what the backend and the copies take is no part of the harness.
+# Functions whose time makes up a part; what the backend and the copies take is no part of the
+# harness.
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "proxy": [(Proxy, "complete")],
     "copies": [(copies.Copies, "scenes"), (copies, "_tree")],
@@ -60,7 +61,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "keep": [(KeptAnswers, "append")],
     "table": [(run, "table"), (run_parts, "part_files"), (run_parts, "write_part")],
     "score": [(run, "_gather")],
-}  # fmt: skip
+}
 OTHERS = ("proxy", "copies")
 LIMIT = "limit"
 
@@ -82,9 +83,14 @@ def main() -> None:
     loading_ms = (process_time() - start) * 1000 / len(dataset.forest.ids)
     agent = Agent(cards.resolve("proxy"), prompts.load(given.prompt))
     specs = [
-        Spec(agent, FrozenSource(copies.copies(dataset, size)), tuple(POINTS.values()), tuple(range(5)))
+        Spec(
+            agent,
+            FrozenSource(copies.copies(dataset, size)),
+            tuple(POINTS.values()),
+            tuple(range(5)),
+        )
         for size in given.sizes
-    ]  # fmt: skip
+    ]
     first = evaluated(specs[0], OTHERS)  # pays for imports and compiled templates
     requests = first["answers"] / first["decisions"]
     # Clocks around every call take time too, so the total comes from runs with few of them.
@@ -93,13 +99,22 @@ def main() -> None:
     own_ms = total["own"]
     shown = {part: parts[part] for part in (*PARTS, "other") if part not in OTHERS}
     result = {
-        "sizes": given.sizes, "repeats": given.repeats, "requests_per_decision": round(requests, 3),
-        "own_ms": own_ms, "own_ms_per_request": own_ms / requests, "limit_ms": total[LIMIT],
-        "own_over_limit": own_ms / total[LIMIT], "proxy_ms": total["proxy"], "parts_ms": shown,
+        "sizes": given.sizes,
+        "repeats": given.repeats,
+        "requests_per_decision": round(requests, 3),
+        "own_ms": own_ms,
+        "own_ms_per_request": own_ms / requests,
+        "limit_ms": total[LIMIT],
+        "own_over_limit": own_ms / total[LIMIT],
+        "proxy_ms": total["proxy"],
+        "parts_ms": shown,
         "loading_ms": loading_ms,
-    }  # fmt: skip
+    }
     small, large = given.sizes
-    print(f"CPU ms a decision, slope {small} to {large}, median of {given.repeats}; parts with their clocks")
+    print(
+        f"CPU ms a decision, slope {small} to {large}, median of {given.repeats}; parts with their "
+        "clocks"
+    )
     for part, ms in shown.items():
         print(f"  {part:<12}{ms:8.3f}")
     print(f"own           {own_ms:8.3f}   aim {AIM_MS}; {own_ms / requests:.3f} a request")
@@ -116,7 +131,9 @@ def main() -> None:
 
 
 def slopes(specs: list[Spec], parts: Sequence[str], repeats: int) -> dict[str, float]:
-    """Milliseconds a decision more costs, by part: median over repeats of the slope between two sizes."""
+    """Milliseconds a decision more costs, by part:
+    median over repeats of the slope between two sizes.
+    """
     found: dict[str, list[float]] = {}
     for _ in range(repeats):
         small, large = (evaluated(spec, parts) for spec in specs)
@@ -128,7 +145,9 @@ def slopes(specs: list[Spec], parts: Sequence[str], repeats: int) -> dict[str, f
 
 
 def evaluated(spec: Spec, parts: Sequence[str]) -> dict[str, float]:
-    """CPU seconds of one evaluation: its parts, its own time, its record's limit; and what it counted."""
+    """CPU seconds of one evaluation: its parts, its own time, its record's limit;
+    and what it counted.
+    """
     assert isinstance(spec.source, FrozenSource)
     with tempfile.TemporaryDirectory() as folder:
         spent: defaultdict[str, float] = defaultdict(float)
@@ -150,8 +169,9 @@ def evaluated(spec: Spec, parts: Sequence[str]) -> dict[str, float]:
 def limit_s(spec: Spec, out: Path) -> float:
     """CPU seconds of what no harness with this record can leave out.
 
-    Every prompt hashed, every answer decoded as JSON, every line of answers encoded as JSON, with the
-    standard library alone, and the decisions written by Arrow; rendering and bookkeeping for nothing.
+    Every prompt hashed, every answer decoded as JSON, every line of answers encoded as JSON, with
+    the standard library alone, and the decisions written by Arrow; rendering and bookkeeping for
+    nothing.
     """
     assert isinstance(spec.source, FrozenSource)
     scenes = spec.source.dataset.scenes(list(read(out).decisions.scenes))
@@ -171,7 +191,9 @@ def limit_s(spec: Spec, out: Path) -> float:
 
 @contextmanager
 def clocked(owner: Any, name: str, spent: defaultdict[str, float], part: str) -> Iterator[None]:
-    """While open, the CPU time of calls of `owner.name` goes to a part. A generator is run out at once."""
+    """While open, the CPU time of calls of `owner.name` goes to a part.
+    A generator is run out at once.
+    """
     function: Callable[..., Any] = getattr(owner, name)
 
     def timed(*args: Any, **kwargs: Any) -> Any:

@@ -12,7 +12,9 @@ def options(doc: str, out: str, picture: bool = False) -> argparse.ArgumentParse
     """Return the options that they share, with a folder under reports/ to write to."""
     parser = argparse.ArgumentParser(description=doc.split("\n")[0])
     parser.add_argument("--only", default="", help="only rows whose folder holds this text")
-    parser.add_argument("--layouts", type=int, help="layouts of each run or family, instead of a row's own")
+    parser.add_argument(
+        "--layouts", type=int, help="layouts of each run or family, instead of a row's own"
+    )
     parser.add_argument("--out", type=Path, default=Path("reports", out))
     parser.add_argument("--page", type=Path, help="page to write the tables to")
     if picture:
@@ -40,6 +42,9 @@ def write_tables(page: Path, tables: str) -> None:
     """Write tables between a page's marks."""
     text = page.read_text("utf-8")
     text = re.sub(
-        r"(<!-- tables -->\n).*(<!-- end -->)", lambda m: f"{m[1]}{tables}\n{m[2]}", text, flags=re.S
+        r"(<!-- tables -->\n).*(<!-- end -->)",
+        lambda m: f"{m[1]}{tables}\n{m[2]}",
+        text,
+        flags=re.S,
     )
     page.write_text(text, "utf-8")

@@ -1,7 +1,7 @@
 """Decisions a CPU second with and without pictures, and what part of them is drawing and encoding.
 
-A model of the shipped size and random weights reads letters out: what it says means nothing, what it costs is
-the same. The limit is the same prompt without its picture.
+A model of the shipped size and random weights reads letters out: what it says means nothing, what
+it costs is the same. The limit is the same prompt without its picture.
 
     python benchmarks/pictures.py [--decisions 40]
 """
@@ -50,19 +50,28 @@ def main() -> None:
             backend: Any = open_backend(cards.resolve(folder), device="cpu", dtype="float32")
             whole_s, drawing_s = timed(backend, asked), drawn(asked)
             row = {
-                "prompt": version, "image": image, "n": given.decisions,
-                "decisions_per_s": given.decisions / whole_s, "drawing": drawing_s / whole_s,
+                "prompt": version,
+                "image": image,
+                "n": given.decisions,
+                "decisions_per_s": given.decisions / whole_s,
+                "drawing": drawing_s / whole_s,
                 "encoding": encoded(backend, asked) / whole_s,
-            }  # fmt: skip
+            }
             rows.append(row)
             ratio = row["decisions_per_s"] / rows[0]["decisions_per_s"]
-            print(f"{f'{version}, image {image}':<22}{row['decisions_per_s']:>12.2f}{ratio:>8.2f}"
-                  f"{row['drawing']:>9.0%}{row['encoding']:>10.0%}{given.decisions:>5}")  # fmt: skip
+            print(
+                f"{f'{version}, image {image}':<22}{row['decisions_per_s']:>12.2f}{ratio:>8.2f}"
+                f"{row['drawing']:>9.0%}{row['encoding']:>10.0%}{given.decisions:>5}"
+            )
     plain, *others = rows
     n, limit = given.decisions, 1000 / plain["decisions_per_s"]
     figures = [
         Row(
-            f"a decision with pictures, `{row['prompt']}`, CPU", 1000 / row["decisions_per_s"], "ms", n, limit
+            f"a decision with pictures, `{row['prompt']}`, CPU",
+            1000 / row["decisions_per_s"],
+            "ms",
+            n,
+            limit,
         )
         for row in others
     ]
@@ -70,13 +79,17 @@ def main() -> None:
 
 
 def questions(folder: Path, version: str, image: ImageMode, decisions: int) -> list[Request]:
-    """All that is asked at some decision points, of a model that is made in the folder if it is not there."""
+    """All that is asked at some decision points,
+    of a model that is made in the folder if it is not there.
+    """
     dataset, prompt = load(find(DATASET)), versions.load(version)
     scenes = dataset.scenes(dataset.courses()[:decisions])
     if not (folder / "config.json").is_file():
         words = dataset.scenario.prompt_words
         graphs = [graph for scene in scenes for graph in scene.graphs.values()]
-        texts = [m["content"] for g in graphs for m in prompt.render(g, dataset.actions, words=words)]
+        texts = [
+            m["content"] for g in graphs for m in prompt.render(g, dataset.actions, words=words)
+        ]
         tokenizer = train_tokenizer(texts, sees=True)
         new_model(tokenizer, 0, sees=True).save_pretrained(folder)
         save_tokenizer(tokenizer, folder)

@@ -1,9 +1,11 @@
-"""How often studies of as many layouts as `harness plan` says find the difference that they were planned for.
+"""How often studies of as many layouts as `harness plan` says find the difference that they were
+planned for.
 
-Outcomes are those of `benchmarks/intervals.py`, whose truth is known. A study finds a difference if the 95 %
-interval that `harness compare` prints leaves out 0 on its side. *Known*: planned by how far layouts differ in
-truth. *Pilots*: every study has a pilot of its own, of so many layouts, and as many layouts as that one says,
-so that the figure is of planning and study together. Intervals are Wilson's, over studies.
+Outcomes are those of `benchmarks/intervals.py`, whose truth is known. A study finds a difference if
+the 95 % interval that `harness compare` prints leaves out 0 on its side. *Known*: planned by how
+far layouts differ in truth. *Pilots*: every study has a pilot of its own, of so many layouts, and
+as many layouts as that one says, so that the figure is of planning and study together. Intervals
+are Wilson's, over studies.
 
     python benchmarks/plan.py [--studies 1000] [--seed 0] [--power 0.8]
 """
@@ -71,14 +73,22 @@ def truths() -> list[tuple[str, float, Study]]:
     """What is planned for: its name, its difference and how it is drawn."""
     rates = [(0.54, 0.59), (0.75, 0.8), (0.9, 0.95), (0.54, 0.64), (0.75, 0.85)]
     rows = [
-        (f"{before:.2f} to {after:.2f}, {words}", after - before, plain(before, after, seeds, alike))
+        (
+            f"{before:.2f} to {after:.2f}, {words}",
+            after - before,
+            plain(before, after, seeds, alike),
+        )
         for seeds, alike, words in ((1, 1.0, "one seed"), (5, 0.6, "5 seeds"))
         for before, after in rates
     ]
     return [
         *rows,
         *(
-            (f"balanced, {before:.2f} to {after:.2f}", (after - before) / 2, balanced(before, after, 5, 0.6))
+            (
+                f"balanced, {before:.2f} to {after:.2f}",
+                (after - before) / 2,
+                balanced(before, after, 5, 0.6),
+            )
             for before, after in ((0.5, 0.6), (0.5, 0.7))
         ),
     ]
@@ -105,7 +115,9 @@ def measure(
         success, a, b = study(rng, layouts)
         hits += success.difference(b, a).low > 0
         planned.append(layouts)
-    return Cell(truth, pilot, float(np.median(planned)), hits / studies, *wilson(hits / studies, studies))
+    return Cell(
+        truth, pilot, float(np.median(planned)), hits / studies, *wilson(hits / studies, studies)
+    )
 
 
 def main() -> None:
@@ -115,19 +127,28 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--power", type=float, default=0.8)
     given = arguments.parse_args()
-    print(f"power of {given.studies} studies, %, and their layouts (median); planned: {given.power:.0%}")
+    print(
+        f"power of {given.studies} studies, %, and their layouts (median); planned: "
+        f"{given.power:.0%}"
+    )
     heads = ["known", *(f"pilots of {pilot}" for pilot in PILOTS)]
     print(f"{'':<24}" + "".join(f"{head:>28}" for head in heads))
     cells = []
     for truth, difference, study in truths():
         print(f"{truth:<24}", end="", flush=True)
         for pilot in (0, *PILOTS):
-            cell = measure(truth, difference, study, pilot, given.power, (given.seed, given.studies))
+            cell = measure(
+                truth, difference, study, pilot, given.power, (given.seed, given.studies)
+            )
             cells.append(cell)
             share = f"{100 * cell.power:.1f} [{100 * cell.low:.1f}, {100 * cell.high:.1f}]"
             print(f"{share:>20}{cell.layouts:>8.0f}", end="", flush=True)
         print()
-    print(json.dumps({"studies": given.studies, "power": given.power, "cells": list(map(asdict, cells))}))
+    print(
+        json.dumps(
+            {"studies": given.studies, "power": given.power, "cells": list(map(asdict, cells))}
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """CPU seconds of physical radios for a million links, by model.
 
-The limit is drawing the random numbers that so many links need, and one pass over them. Shadowing along the
-trip is a part of its own, since every model has the same. `first` is what a new set of parameters costs once.
+The limit is drawing the random numbers that so many links need, and one pass over them. Shadowing
+along the trip is a part of its own, since every model has the same. `first` is what a new set of
+parameters costs once.
 
     python benchmarks/radio.py [--links 1000000] [--repeats 5]
 """
@@ -64,14 +65,18 @@ def main() -> None:
     for name, median_s in medians.items():
         print(f"  {name:<26}{median_s:8.4f}   {median_s / medians['limit']:6.1f} of the limit")
     rows = [
-        Row(f"{n * HELPERS} links, {name}, CPU", medians[name], "s", given.repeats, medians["limit"])
+        Row(
+            f"{n * HELPERS} links, {name}, CPU", medians[name], "s", given.repeats, medians["limit"]
+        )
         for name in ("shadowing", *(f"{model}: deliver" for model in MODELS))
     ]
     finish(rows, links=n * HELPERS, repeats=given.repeats, cpu_s=medians)
 
 
 def made_up(generator: np.random.Generator, n: int) -> tuple[Links, Site, Trips]:
-    """Made-up links of `n` decisions near a crossing, a third each clear, blocked and round the corner."""
+    """Made-up links of `n` decisions near a crossing, a third each clear,
+    blocked and round the corner.
+    """
     shape = (n, HELPERS)
     site = Site(
         xy_m=generator.uniform(-100.0, 100.0, (n, 1 + HELPERS, 2)),
@@ -80,12 +85,21 @@ def made_up(generator: np.random.Generator, n: int) -> tuple[Links, Site, Trips]
         corner_m=generator.uniform(5.0, 100.0, (*shape, 2)),
     )
     links = Links(
-        asked=np.ones(shape, bool), ready_s=generator.uniform(0.1, 0.2, shape), range_m=site.distance_m,
-        payload_bits=generator.uniform(800.0, 2400.0, shape), in_radius=np.ones(shape, bool),
-        rounds=np.zeros(shape, bool), request_bits=400.0, site=site,
-    )  # fmt: skip
+        asked=np.ones(shape, bool),
+        ready_s=generator.uniform(0.1, 0.2, shape),
+        range_m=site.distance_m,
+        payload_bits=generator.uniform(800.0, 2400.0, shape),
+        in_radius=np.ones(shape, bool),
+        rounds=np.zeros(shape, bool),
+        request_bits=400.0,
+        site=site,
+    )
     decision = np.arange(n)
-    return links, site, Trips(np.zeros(n, np.int64), decision // STEPS % 500, decision % STEPS, STEPS)
+    return (
+        links,
+        site,
+        Trips(np.zeros(n, np.int64), decision // STEPS % 500, decision % STEPS, STEPS),
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """What a report weighs, how long it takes to write, and how long a browser takes to open it.
 
-The proxy's run on the shipped dataset; for more decisions all its scenes are repeated as further episodes.
-A page is *readable* at its first contentful paint, *ready* when every decision can be filtered and opened,
-*drawn* when the last chart is. The limit is a page of the same bytes whose script is taken out.
+The proxy's run on the shipped dataset; for more decisions all its scenes are repeated as further
+episodes. A page is *readable* at its first contentful paint, *ready* when every decision can be
+filtered and opened, *drawn* when the last chart is. The limit is a page of the same bytes whose
+script is taken out.
 
     python benchmarks/report.py [--layouts N] [--decisions 1440 20160] [--repeats 5]
 """

@@ -1,13 +1,16 @@
-"""What models do in the paper's scenario: prompts, answer modes and conditions, with n and intervals.
+"""What models do in the paper's scenario:
+prompts, answer modes and conditions, with n and intervals.
 
-    python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT] [--out reports/results]
-                                 [--page docs/results.md] [--details benchmarks/measured/results.md]
-                                 [--picture docs/pictures/results.svg]
+    python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT] [--out
+                                 reports/results] [--page docs/results.md] [--details
+                                 benchmarks/measured/results.md] [--picture
+                                 docs/pictures/results.svg]
 
-It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes success between
-the marks of the page, what the answers are like between those of the details, and the picture. Finished runs
-are read and not made again; a stopped one goes on with the same command. On a CPU, a published model takes
-seconds an answer: with `--limit` it is asked on fewer layouts, and each row says on how many.
+It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes
+success between the marks of the page, what the answers are like between those of the details, and
+the picture. Finished runs are read and not made again; a stopped one goes on with the same command.
+On a CPU, a published model takes seconds an answer: with `--limit` it is asked on fewer layouts,
+and each row says on how many.
 """
 
 import argparse
@@ -31,7 +34,8 @@ SMALLEST = "--only proxy --layouts 1"
 DATASET = "occluded-intersection-v2"  # all rows are of it; published models take hours
 CONDITIONS_SHOWN = ("single-local", "v2x", "6g", "6g:messages=shuffled")
 HEADS = ("alone", "v2x", "6g", "6g, shuffled")
-ARGUMENTS = ("--control", "shuffled-messages", "--ask", "all")  # every helper's answers are described
+# every helper's answers are described
+ARGUMENTS = ("--control", "shuffled-messages", "--ask", "all")
 
 
 class Row(NamedTuple):
@@ -67,7 +71,9 @@ OURS = (
     Row("swarm-tiny-six", "v4", "json"),
     Row("swarm-tiny-six", "v4", "readout"),
 )
-RULES = tuple(Row(name) for name in ("proxy", "local-view", "constant", "uniform", "brake", "full-view"))
+RULES = tuple(
+    Row(name) for name in ("proxy", "local-view", "constant", "uniform", "brake", "full-view")
+)
 MODELS = (*PUBLISHED, *OURS)
 ROWS = (*MODELS, *RULES)
 
@@ -75,16 +81,24 @@ ROWS = (*MODELS, *RULES)
 def main() -> None:
     """Make the runs that are missing, and write the page's tables and its picture."""
     arguments = options(__doc__, "results", picture=True)
-    arguments.add_argument("--details", type=Path, help="page to write to what the answers are like")
+    arguments.add_argument(
+        "--details", type=Path, help="page to write to what the answers are like"
+    )
     arguments.add_argument("--limit", type=int, help="layouts of each run of a published model")
-    arguments.add_argument("--answers", type=Path, help="folder of such runs, whose answers are scored again")
+    arguments.add_argument(
+        "--answers", type=Path, help="folder of such runs, whose answers are scored again"
+    )
     arguments.add_argument("--device", help="where published models run")
     arguments.add_argument("--batch-size", help="prompts of a published model in one batch")
     given = arguments.parse_args()
     for row in ROWS:
         if given.only in row.folder:
             make(row, given)
-    runs = {row: read(path) for row in ROWS if (path := given.out / row.folder).joinpath("run.json").exists()}
+    runs = {
+        row: read(path)
+        for row in ROWS
+        if (path := given.out / row.folder).joinpath("run.json").exists()
+    }
     said = {row: list(of_roles(row, run)) for row, run in runs.items() if row in MODELS}
     details = f"{answers(runs, said)}\n\n{sentences(said)}"
     for page, text in ((given.page, success(runs)), (given.details, details)):
@@ -138,7 +152,8 @@ def percent(score: Score | None) -> str:
 def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:
     """What the answers of every model are like, in both roles."""
     lines = [
-        "| who answers | role | n | readable % | strict % | copies an example % | follows the letter % "
+        "| who answers | role | n | readable % | strict % | copies an example % | follows the "
+        "letter % "
         "| distinct | commonest action % |",
         "|---|---|--:|--:|--:|--:|--:|--:|---|",
     ]
@@ -147,7 +162,9 @@ def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:
         common = f"{it.action} {100 * it.action_count / it.readable:.1f}" if it.readable else "–"
         letter = runs[row].score("all", f"follows_letter_{it.role}")
         shares.append("–" if letter is None else f"{100 * (letter.value or 0):.1f}")
-        lines.append(f"| {' | '.join([row.name, it.role, str(it.n), *shares, str(it.distinct), common])} |")
+        lines.append(
+            f"| {' | '.join([row.name, it.role, str(it.n), *shares, str(it.distinct), common])} |"
+        )
     return "\n".join(lines)
 
 
@@ -182,13 +199,21 @@ def drawn(runs: dict[Row, Run]) -> Figure:
                 continue
             ends = [[100 * (score.value - score.low)], [100 * (score.high - score.value)]]
             axes.errorbar(
-                100 * score.value, place + shift, xerr=ends, fmt="o" if condition == "6g" else "s", ms=4,
-                color=CONDITIONS[condition], lw=1.2, label=condition if not place else None,
-            )  # fmt: skip
+                100 * score.value,
+                place + shift,
+                xerr=ends,
+                fmt="o" if condition == "6g" else "s",
+                ms=4,
+                color=CONDITIONS[condition],
+                lw=1.2,
+                label=condition if not place else None,
+            )
     last = max((n for n, row in enumerate(rows) if row in PUBLISHED), default=-1)
     axes.axhline(last + 0.5, color=GREY, lw=0.6, ls=":")
     axes.set_yticks(
-        range(len(rows)), [f"{row.name}  (n = {len(runs[row].grid.episodes)})" for row in rows], fontsize=7
+        range(len(rows)),
+        [f"{row.name}  (n = {len(runs[row].grid.episodes)})" for row in rows],
+        fontsize=7,
     )
     axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5), xlabel="success %, with 95 % intervals")
     axes.legend(fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

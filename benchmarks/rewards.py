@@ -1,8 +1,8 @@
 """How many rewards a CPU second: distributions looked up in a batch, by place and by id, and texts.
 
-Trees of train seeds, built at the first call and kept in the cache folder. Texts are what a model might
-write: a strict answer, one among other words, and one that cannot be read, a third each, all different. A
-step is one of the environment, with its chat. Each figure is the best of five passes.
+Trees of train seeds, built at the first call and kept in the cache folder. Texts are what a model
+might write: a strict answer, one among other words, and one that cannot be read, a third each, all
+different. A step is one of the environment, with its chat. Each figure is the best of five passes.
 
     python benchmarks/rewards.py [--scenario NAME] [--layouts 8] [--batch 256]
 """
@@ -34,8 +34,12 @@ def a_second(count: int, work: Callable[[], object]) -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--scenario", default="blind-merge:witnesses=any,radio_share=0,limits=1,perception=1")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument(
+        "--scenario", default="blind-merge:witnesses=any,radio_share=0,limits=1,perception=1"
+    )
     parser.add_argument("--layouts", type=int, default=8)
     parser.add_argument("--batch", type=int, default=256)
     args = parser.parse_args()
@@ -49,7 +53,8 @@ def main() -> None:
     rows = env.rows()
     shares = rng.multinomial(100, np.full(len(env.actions), 1 / len(env.actions)), len(rows)) / 100
     answers = [
-        STATED % ",".join(f'"{a}":{n:.2f}' for a, n in zip(env.actions, row, strict=True)) for row in shares
+        STATED % ",".join(f'"{a}":{n:.2f}' for a, n in zip(env.actions, row, strict=True))
+        for row in shares
     ]
     forms = cycle(("%s", "I brake. %s Done.", "I do not know: %.20s"))
     texts = [form % answer for form, answer in zip(forms, answers, strict=False)]

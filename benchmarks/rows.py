@@ -18,5 +18,7 @@ class Row(NamedTuple):
 
 
 def finish(rows: Iterable[Row], **others: object) -> None:
-    """Print the line of JSON that ends a benchmark: rows of the table, and whatever else it measured."""
+    """Print the line of JSON that ends a benchmark:
+    rows of the table, and whatever else it measured.
+    """
     print(json.dumps({"rows": [row._asdict() for row in rows], **others}, default=str))

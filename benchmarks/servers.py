@@ -1,14 +1,15 @@
 """Asking servers: how near a run comes to what they can answer, and the client's CPU a request.
 
-Each server is a process of its own on this machine that answers chat completions after a fixed time, so
-many at once, whatever is asked. Ideal is that each of them is always full. Asked are the shipped dataset's
-prompts: by `complete` alone, and by all that `harness eval` does to get, read and keep answers. The limit is
-sockets alone: the same bytes are written, and answers read, on connections that stay open. With `--workers`
-so many processes do each of these, as those of `harness eval --workers` do: each asks parts of the requests,
-keeps the answers of a part in a file, and has its share of the batch size. What its start takes is not timed.
+Each server is a process of its own on this machine that answers chat completions after a fixed
+time, so many at once, whatever is asked. Ideal is that each of them is always full. Asked are the
+shipped dataset's prompts: by `complete` alone, and by all that `harness eval` does to get, read and
+keep answers. The limit is sockets alone: the same bytes are written, and answers read, on
+connections that stay open. With `--workers` so many processes do each of these, as those of
+`harness eval --workers` do: each asks parts of the requests, keeps the answers of a part in a file,
+and has its share of the batch size. What its start takes is not timed.
 
-    python benchmarks/servers.py [--servers 1] [--requests 4000] [--repeats 5] [--seconds 0.05] [--at-once 20]
-        [--batch-size 20] [--workers 1]
+    python benchmarks/servers.py [--servers 1] [--requests 4000] [--repeats 5] [--seconds 0.05]
+        [--at-once 20] [--batch-size 20] [--workers 1]
 """
 
 import argparse
@@ -97,20 +98,27 @@ def main() -> None:
     parts = [range(at, min(at + size, given.requests)) for at in range(0, given.requests, size)]
     found: dict[str, list[tuple[float, float, float]]] = {}
     with ExitStack() as stack:
-        urls = [stack.enter_context(serving(given.seconds, given.at_once)) for _ in range(given.servers)]
+        urls = [
+            stack.enter_context(serving(given.seconds, given.at_once)) for _ in range(given.servers)
+        ]
         base = cards.load("openai-example")
         urls_of_card = urls[0] if len(urls) == 1 else tuple(urls)
         card = replace(base, server=Server(urls_of_card), thinking="none", weights="m")
         dataset = load.load(load.find(DATASET))
         spec = Spec(
-            Agent(card, prompts.load("v2")), FrozenSource(dataset), tuple(POINTS.values()), (0,),
+            Agent(card, prompts.load("v2")),
+            FrozenSource(dataset),
+            tuple(POINTS.values()),
+            (0,),
             settings=Settings(batch_size=batch_size),
-        )  # fmt: skip
+        )
         asked = list(requests(spec, dataset.scenes(dataset.courses())))
         assert card.server
         bodies = [json.dumps(body(card, card.server, request)).encode() for request in asked]
         ways: dict[str, Callable[[range], object]] = {
-            "sockets": lambda part: asyncio.run(bare(urls, of_part(bodies, part), share(given.at_once))),
+            "sockets": lambda part: asyncio.run(
+                bare(urls, of_part(bodies, part), share(given.at_once))
+            ),
             "complete": lambda part: completed(model(spec), named(asked, part)),
             "ask": lambda part: kept(spec, model(spec), named(asked, part)),
         }
@@ -123,27 +131,40 @@ def main() -> None:
                 found.setdefault(name, []).append(together(list(took.values())))
         counted = [stats(url) for url in urls]
     result: dict[str, Any] = {
-        "servers": given.servers, "requests": given.requests, "repeats": given.repeats,
-        "seconds": given.seconds, "at_once": given.at_once, "batch_size": batch_size, "workers": workers,
-        "cores": os.cpu_count(), "load": os.getloadavg()[0],
+        "servers": given.servers,
+        "requests": given.requests,
+        "repeats": given.repeats,
+        "seconds": given.seconds,
+        "at_once": given.at_once,
+        "batch_size": batch_size,
+        "workers": workers,
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0],
         "ideal_per_s": given.requests / ideal_s,
         "answered": [int(of["answered"]) for of in counted],
         "connections": [int(of["connections"]) for of in counted],
         "server_cpu_ms": max(1000 * of["cpu_s"] / of["answered"] for of in counted),
-    }  # fmt: skip
+    }
     print(
         f"{given.requests} requests, {given.servers} servers of {given.seconds * 1000:g} ms x "
-        f"{given.at_once}, batch size {batch_size}, {workers} client processes on {os.cpu_count()} cores: "
+        f"{given.at_once}, batch size {batch_size}, {workers} client processes on {os.cpu_count()} "
+        "cores: "
         f"ideal {given.requests / ideal_s:.0f}/s; medians of {given.repeats}"
     )
     for name, times in found.items():
-        wall_s, cpu_s, memory_mb = (statistics.median(values) for values in zip(*times, strict=True))
+        wall_s, cpu_s, memory_mb = (
+            statistics.median(values) for values in zip(*times, strict=True)
+        )
         of_ideal, cpu_ms = ideal_s / wall_s, 1000 * cpu_s / given.requests
         shares = [ideal_s / wall for wall, _, _ in times]
         result[name] = {
-            "of_ideal": of_ideal, "least": min(shares), "most": max(shares), "cpu_ms": cpu_ms,
-            "per_s": given.requests / wall_s, "memory_mb": memory_mb,
-        }  # fmt: skip
+            "of_ideal": of_ideal,
+            "least": min(shares),
+            "most": max(shares),
+            "cpu_ms": cpu_ms,
+            "per_s": given.requests / wall_s,
+            "memory_mb": memory_mb,
+        }
         aim = f"   aim {100 * AIMS['of_ideal']:g} %, {AIMS['cpu_ms']} ms" if name == "ask" else ""
         print(
             f"{name:<10}{given.requests / wall_s:7.0f}/s {100 * of_ideal:6.1f} % of ideal "
@@ -152,7 +173,8 @@ def main() -> None:
         )
     server_ms = result["server_cpu_ms"]
     print(
-        f"answered by each: {result['answered']}; connections: {result['connections']}; a server takes "
+        f"answered by each: {result['answered']}; connections: {result['connections']}; a server "
+        "takes "
         f"{server_ms:.3f} ms of CPU a request itself: {1000 / server_ms:.0f}/s at most"
     )
     rows = list[Row]()
@@ -160,7 +182,9 @@ def main() -> None:
         limit, asking = result["sockets"], result["ask"]
         what, n = f"asking servers of {given.seconds * 1000:g} ms × {given.at_once}", given.repeats
         rows = [
-            Row(f"{what}, of ideal, wall", 100 * asking["of_ideal"], "%", n, 100 * limit["of_ideal"]),
+            Row(
+                f"{what}, of ideal, wall", 100 * asking["of_ideal"], "%", n, 100 * limit["of_ideal"]
+            ),
             Row(f"{what}, a request, CPU", asking["cpu_ms"], "ms", n, limit["cpu_ms"]),
         ]
     finish(rows, **result)
@@ -180,7 +204,9 @@ BEGUN: set[tuple[int, int]] = set()  # by process and way
 
 
 def measured(part: range) -> Part:
-    """Ask a part of the requests; a process that begins opens its connections, and waits for the others."""
+    """Ask a part of the requests; a process that begins opens its connections,
+    and waits for the others.
+    """
     way = WAYS["now"]
     if (begun := (os.getpid(), id(way))) not in BEGUN:
         BEGUN.add(begun)
@@ -204,7 +230,9 @@ def model(spec: Spec) -> Backend:
 
 
 def of_part(drawn: Sequence[Any], part: range) -> Iterator[Any]:
-    """As many as a part has, taken again and again from what was drawn, on from where the part begins."""
+    """As many as a part has, taken again and again from what was drawn,
+    on from where the part begins.
+    """
     at = part.start % len(drawn)
     return islice(cycle([*drawn[at:], *drawn[:at]]), len(part))
 
@@ -221,7 +249,8 @@ def completed(backend: Backend, asked: Sequence[Request]) -> None:
     """Ask by `complete` alone."""
     completions = backend.complete(asked)
     assert all(
-        c.text == (EGO if r.role == "ego" else HELPER) for r, c in zip(asked, completions, strict=True)
+        c.text == (EGO if r.role == "ego" else HELPER)
+        for r, c in zip(asked, completions, strict=True)
     )
 
 
@@ -235,7 +264,9 @@ def kept(spec: Spec, backend: Backend, asked: Sequence[Request]) -> None:
 
 
 async def bare(urls: Sequence[str], bodies: Iterator[bytes], at_once: int) -> None:
-    """The same bytes on so many connections a server, each asked again as soon as it has answered."""
+    """The same bytes on so many connections a server,
+    each asked again as soon as it has answered.
+    """
 
     async def asking(url: str) -> None:
         parts = urlsplit(url)
@@ -254,14 +285,17 @@ def sized(data: bytes) -> bytes:
     return b"Content-Length: %d\r\n\r\n%b" % (len(data), data)
 
 
-# -- the server ---------------------------------------------------------------------------------------------
+# -- the server
+# ---------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def serving(seconds: float, at_once: int) -> Iterator[str]:
     """A server in a process of its own; its base URL."""
     options = ["--serve", "--seconds", str(seconds), "--at-once", str(at_once)]
-    process = subprocess.Popen([sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout
     try:
         yield process.stdout.readline().strip()
@@ -272,14 +306,17 @@ def serving(seconds: float, at_once: int) -> Iterator[str]:
 
 def stats(url: str) -> dict[str, float]:
     """What a server counted, and its CPU seconds."""
-    with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(f"{url}/stats") as answer:
+    with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(
+        f"{url}/stats"
+    ) as answer:
         counted: dict[str, float] = json.load(answer)
         return counted
 
 
 def serve(seconds: float, at_once: int) -> None:
     """Answer for ever; the base URL is printed first."""
-    # `select` waits for microseconds, and `epoll` for whole milliseconds, which answers would wait for.
+    # `select` waits for microseconds, and `epoll` for whole milliseconds, which answers would wait
+    # for.
     with asyncio.Runner(
         loop_factory=partial(asyncio.SelectorEventLoop, selectors.SelectSelector())
     ) as runner:
@@ -289,9 +326,13 @@ def serve(seconds: float, at_once: int) -> None:
 async def served(seconds: float, at_once: int) -> None:
     loop, counts = asyncio.get_running_loop(), {"answered": 0, "connections": 0, "busy": 0}
     messages = [
-        {"choices": [{"finish_reason": "stop", "message": {"content": text}}]} for text in (EGO, HELPER)
+        {"choices": [{"finish_reason": "stop", "message": {"content": text}}]}
+        for text in (EGO, HELPER)
     ]
-    answers, listed = [json.dumps(message).encode() for message in messages], json.dumps(LISTED).encode()
+    answers, listed = (
+        [json.dumps(message).encode() for message in messages],
+        json.dumps(LISTED).encode(),
+    )
     waiting = deque[tuple[asyncio.Transport, bytes]]()
 
     def reply(to: asyncio.Transport, data: bytes) -> None:

@@ -1,10 +1,11 @@
 """What is served against what is answered in this process: the furthest probability, and the time.
 
-The model is asked what `harness eval --answer decision` asks about scenes of six datasets, one question at a
-time: in this process, and by this program's own client through a `harness serve` of the same model, engine
-and number format.
+The model is asked what `harness eval --answer decision` asks about scenes of six datasets, one
+question at a time: in this process, and by this program's own client through a `harness serve` of
+the same model, engine and number format.
 
-    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500] [--letters cyclic]
+    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500] [--letters
+    cyclic]
 """
 
 import argparse
@@ -31,9 +32,13 @@ from harness.prompts import versions
 SMALLEST = "--prompts 6"
 NEEDS = "llama_cpp"
 DATASETS = (
-    "occluded-intersection-v2", "blind-merge-v1", "do-not-pass-v1", "hard-brake-ahead-v1", "parking-exit-v1",
+    "occluded-intersection-v2",
+    "blind-merge-v1",
+    "do-not-pass-v1",
+    "hard-brake-ahead-v1",
+    "parking-exit-v1",
     "roundabout-entry-v1",
-)  # fmt: skip
+)
 AIM = 1e-6
 
 
@@ -45,20 +50,31 @@ def main() -> None:
     arguments.add_argument("--prompts", type=int, default=500)
     arguments.add_argument("--letters", choices=["raw", "cyclic"])
     given = arguments.parse_args()
-    agent = Agent(cards.resolve(given.model), versions.load("v9"), "decision", letters=given.letters)
+    agent = Agent(
+        cards.resolve(given.model), versions.load("v9"), "decision", letters=given.letters
+    )
     asked = questions(agent, given.prompts)
     here, here_ms = answers(open_backend(agent.card, batch_size=1), asked)
     with serving(given.model, *(["--letters", given.letters] if given.letters else [])) as url:
         card = cards.load(f"{given.wire}-example")
         assert card.server is not None
-        client = open_backend(replace(card, server=replace(card.server, base_url=url)), batch_size=1)
+        client = open_backend(
+            replace(card, server=replace(card.server, base_url=url)), batch_size=1
+        )
         # A client asks one question; in which orders its letters are read is the server's matter.
         there, there_ms = answers(client, [request.alike(orders=()) for request in asked])
-    furthest = max(abs(one[o] - other[o]) for one, other in zip(here, there, strict=True) for o in one)
+    furthest = max(
+        abs(one[o] - other[o]) for one, other in zip(here, there, strict=True) for o in one
+    )
     result = {
-        "model": given.model, "wire": given.wire, "prompts": len(asked), "furthest": furthest,
-        "here_ms": round(here_ms, 2), "served_ms": round(there_ms, 2), "ok": furthest <= AIM,
-    }  # fmt: skip
+        "model": given.model,
+        "wire": given.wire,
+        "prompts": len(asked),
+        "furthest": furthest,
+        "here_ms": round(here_ms, 2),
+        "served_ms": round(there_ms, 2),
+        "ok": furthest <= AIM,
+    }
     for name, value in result.items():
         print(f"{name:<12}{value}")
     print(json.dumps(result))

@@ -1,14 +1,17 @@
-"""What does it bring to answer faster? The same answers at several latencies, under several conditions.
+"""What does it bring to answer faster? The same answers at several latencies,
+under several conditions.
 
-    python benchmarks/speed_of_answers.py [--only TEXT] [--layouts N] [--dataset D] [--out reports/speed]
-                                          [--page benchmarks/measured/speed-of-answers.md]
-                                          [--picture docs/pictures/speed-of-answers.svg]
+    python benchmarks/speed_of_answers.py [--only TEXT] [--layouts N] [--dataset D] [--out
+                                          reports/speed] [--page
+                                          benchmarks/measured/speed-of-answers.md] [--picture
+                                          docs/pictures/speed-of-answers.svg]
 
-For each row of `ROWS` it evaluates the model on report layouts of a suite, once at each of `LATENCIES_MS`.
-The first run asks; the others find its answers in the completion cache, and the page is refused if one
-question was answered in two ways. `proxy`, a rule, also drives the same layouts in closed loop, where an
-action begins when its decision is ready. It writes the page's tables between its marks, and the picture. What
-is finished is read and not made again; a stopped one goes on with the same command.
+For each row of `ROWS` it evaluates the model on report layouts of a suite, once at each of
+`LATENCIES_MS`. The first run asks; the others find its answers in the completion cache, and the
+page is refused if one question was answered in two ways. `proxy`, a rule, also drives the same
+layouts in closed loop, where an action begins when its decision is ready. It writes the page's
+tables between its marks, and the picture. What is finished is read and not made again; a stopped
+one goes on with the same command.
 """
 
 from collections.abc import Mapping
@@ -79,21 +82,32 @@ def drive(row: Row, ms: int, out: Path) -> None:
     if not (out / "run.json").exists():
         data = load(find(DRIVEN))
         scenario = ("--scenario", scenarios.argument(data.scenario), "--seeds", "0:2")
-        layouts = ("--episodes", str(row.limit or len(data.episodes)), "--first-seed", str(data.seeds[0]))
+        layouts = (
+            "--episodes",
+            str(row.limit or len(data.episodes)),
+            "--first-seed",
+            str(data.seeds[0]),
+        )
         harness("drive", *row.who, *scenario, *layouts, *options(ms), "--out", str(out), "--quiet")
 
 
 @cache
 def timed_of(here: Path, kind: str) -> dict[int, Families] | None:
-    """Read a model's runs by latency; None unless all are there. Ends the program if answers differ."""
+    """Read a model's runs by latency; None unless all are there.
+    Ends the program if answers differ.
+    """
     latencies = DRIVEN_MS if kind == "driven" else LATENCIES_MS
     read = {ms: Families.read(here / f"{kind}-{ms}") for ms in latencies}
     found = {ms: families for ms, families in read.items() if families}
     answered: dict[tuple[str, str], str] = {}
-    for family, run in ((f, run) for families in found.values() for f, run in families.runs.items()):
+    for family, run in (
+        (f, run) for families in found.values() for f, run in families.runs.items()
+    ):
         for answer in run.answers if kind == "frozen" else ():
             if answered.setdefault((family, answer.id), answer.raw) != answer.raw:
-                raise SystemExit(f"{run.path}: {answer.id} was answered otherwise at another latency")
+                raise SystemExit(
+                    f"{run.path}: {answer.id} was answered otherwise at another latency"
+                )
     return found if len(found) == len(latencies) else None
 
 
@@ -111,15 +125,17 @@ def written(name: str, timed: Mapping[int, Families]) -> str:
         if at is not first
     ]
     lates = [[f"{ms}", *(at.shown(c, late) for c in every)] for ms, at in timed.items()]
-    return "\n\n".join([
-        f"### {name}",
-        f"Balanced success, %, of {first.counted}:",
-        markdown(heads, rows),
-        f"The same, less that at {LATENCIES_MS[0]} ms in the same condition:",
-        markdown(["ms", *every], faster),
-        "Decisions that outlast the window, %:",
-        markdown(["ms", *every], lates),
-    ])  # fmt: skip
+    return "\n\n".join(
+        [
+            f"### {name}",
+            f"Balanced success, %, of {first.counted}:",
+            markdown(heads, rows),
+            f"The same, less that at {LATENCIES_MS[0]} ms in the same condition:",
+            markdown(["ms", *every], faster),
+            "Decisions that outlast the window, %:",
+            markdown(["ms", *every], lates),
+        ]
+    )
 
 
 @styled
@@ -133,9 +149,16 @@ def drawn(done: Mapping[str, Mapping[int, Families]]) -> Figure:
             points = [each.estimate(condition, GAINS[BALANCED]) for each in timed.values()]
             value, low, high = 100 * np.array([(p.value, p.low, p.high) for p in points if p]).T
             axes.errorbar(
-                np.array(list(timed)) * 1.07 ** (n - 1), value, yerr=[value - low, high - value],
-                label=condition, color=colour, marker=MARKERS[n], markersize=3, capsize=2, linewidth=1.0,
-            )  # fmt: skip
+                np.array(list(timed)) * 1.07 ** (n - 1),
+                value,
+                yerr=[value - low, high - value],
+                label=condition,
+                color=colour,
+                marker=MARKERS[n],
+                markersize=3,
+                capsize=2,
+                linewidth=1.0,
+            )
         axes.set(xscale="log", xlabel="one answer, ms")
         axes.set_xticks(LATENCIES_MS, [str(ms) for ms in LATENCIES_MS])
         axes.minorticks_off()

@@ -1,12 +1,13 @@
-"""CPU seconds from the start of a process to the first `complete`, of `harness --help` and of lists.
+"""CPU seconds from the start of a process to the first `complete`,
+of `harness --help` and of lists.
 
-And wall seconds from typing `harness eval --model swarm-tiny` to its first decision, one ego and three
-helpers answered by llama.cpp: that works in a process of its own.
+And wall seconds from typing `harness eval --model swarm-tiny` to its first decision, one ego and
+three helpers answered by llama.cpp: that works in a process of its own.
 
     python benchmarks/startup.py [DATASET] [--repeats 5]
 
-The limit is what a process with these libraries cannot do without: the interpreter, and imports of NumPy,
-Jinja2 and typer.
+The limit is what a process with these libraries cannot do without:
+the interpreter, and imports of NumPy, Jinja2 and typer.
 """
 
 import argparse
@@ -27,9 +28,11 @@ TABLE = "--repeats 3"
 NEEDS = "llama_cpp"
 LISTS = ("model list", "prompt list", "dataset scenario list")
 AIMS_S = {
-    "help": 0.12, **dict.fromkeys(LISTS, 0.12), "first_call": 0.45,
+    "help": 0.12,
+    **dict.fromkeys(LISTS, 0.12),
+    "first_call": 0.45,
     "first_decision_wall": 2.0,
-}  # fmt: skip
+}
 
 # Each ends by printing the CPU seconds of its own process; CPU time starts with the process.
 TYPED = """

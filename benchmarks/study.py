@@ -1,4 +1,5 @@
-"""What playing decisions costs: the grid points of the paper's campaign, its figures, and ten million.
+"""What playing decisions costs: the grid points of the paper's campaign, its figures,
+and ten million.
 
 The limit is drawing the random numbers that each grid point's decisions need, with NumPy.
 
@@ -41,7 +42,9 @@ def main() -> None:
         print(f"{name:<28}{value:>10.2f}{aim}")
     a_million = f"a million decisions of one grid point, of {most}, CPU"
     rows = [
-        Row("the campaign's decisions played, CPU", found["play_cpu_s"], "s", 1, found["draw_cpu_s"]),
+        Row(
+            "the campaign's decisions played, CPU", found["play_cpu_s"], "s", 1, found["draw_cpu_s"]
+        ),
         Row(a_million, found["large_s_per_million"], "s", 1, found["small_s_per_million"]),
     ]
     finish(rows, **found)
@@ -51,7 +54,9 @@ def campaign() -> dict[str, float]:
     """Its grid points against drawing what they need."""
     start, decisions = process_time(), 0
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels()}
-    played = [play(sources[p.episodes], p.name, p.settings, SEEDS, lambda done: None) for p in panels()]
+    played = [
+        play(sources[p.episodes], p.name, p.settings, SEEDS, lambda done: None) for p in panels()
+    ]
     play_s = process_time() - start
     start = process_time()
     for panel in panels():
@@ -62,9 +67,11 @@ def campaign() -> dict[str, float]:
     draw_s = process_time() - start
     return {
         "campaign_decisions": decisions,
-        "play_cpu_s": play_s, "draw_cpu_s": draw_s,
-        "play_over_draw": play_s / draw_s, **pictures([part.summary for part in played]),
-    }  # fmt: skip
+        "play_cpu_s": play_s,
+        "draw_cpu_s": draw_s,
+        "play_over_draw": play_s / draw_s,
+        **pictures([part.summary for part in played]),
+    }
 
 
 def pictures(summaries: "Sequence[pd.DataFrame]") -> dict[str, float]:
@@ -92,7 +99,9 @@ def draw(generator: np.random.Generator, episodes: int, helpers: int) -> None:
 
 
 def linear(most: int) -> dict[str, float]:
-    """Seconds per million decisions of one grid point with five seeds, small and large; peak memory."""
+    """Seconds per million decisions of one grid point with five seeds, small and large;
+    peak memory.
+    """
     found = {}
     for name, decisions in (("small", most // 10), ("large", most)):
         source = Calibrated(decisions // (STEPS * len(SEEDS)))

@@ -1,10 +1,12 @@
-"""The table of benchmarks/README.md, all of it from this commit: runs the benchmarks that have rows in it.
+"""The table of benchmarks/README.md, all of it from this commit:
+runs the benchmarks that have rows in it.
 
     python benchmarks/table.py [--only TEXT] [--smallest] [--page benchmarks/README.md]
 
-A benchmark says in constants with which options it is run: `TABLE` for the table (some minutes in all), and
-`SMALLEST` in seconds, as the tests run it. Its last line is JSON with `rows` (rows.py). Others' load is the
-mean number of cores that other processes took meanwhile. What fails is named under the table.
+A benchmark says in constants with which options it is run: `TABLE` for the table (some minutes in
+all), and `SMALLEST` in seconds, as the tests run it. Its last line is JSON with `rows` (rows.py).
+Others' load is the mean number of cores that other processes took meanwhile. What fails is named
+under the table.
 """
 
 import argparse
@@ -36,7 +38,9 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     arguments.add_argument("--only", default="", help="only benchmarks whose name has this text")
     arguments.add_argument("--smallest", action="store_true", help="at their smallest, to try them")
-    arguments.add_argument("--page", type=Path, help="page between whose marks the table is written")
+    arguments.add_argument(
+        "--page", type=Path, help="page between whose marks the table is written"
+    )
     given = arguments.parse_args()
     lines, failed = [heads(HEADS)], []
     start = perf_counter()
@@ -50,7 +54,9 @@ def main() -> None:
         options = shlex.split(stated[size])
         print(" ".join(["benchmarks/" + script.name, *options]), file=sys.stderr, flush=True)
         busy_s, began_s = busy(), perf_counter()
-        done = subprocess.run([sys.executable, str(script), *options], stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            [sys.executable, str(script), *options], stdout=subprocess.PIPE, text=True
+        )
         load = (busy() - busy_s) / (perf_counter() - began_s)
         if done.returncode:
             failed.append(f"`{script.name}` failed.")
@@ -67,7 +73,9 @@ def main() -> None:
 
 
 def scripts() -> Mapping[Path, Mapping[str, Any]]:
-    """Return each program of this folder, and the constants in capitals that it states as they stand."""
+    """Return each program of this folder,
+    and the constants in capitals that it states as they stand.
+    """
     found = {}
     for path in sorted(HERE.glob("*.py")):
         parts = ast.parse(path.read_text("utf-8")).body
@@ -91,7 +99,10 @@ def line(row: Row, load: float) -> str:
     """Return a row's line."""
     limit, ratio = "", ""
     if row.limit is not None:
-        limit, ratio = shown(row.limit, row.unit), f"{row.measured / row.limit:.2g}" if row.limit else ""
+        limit, ratio = (
+            shown(row.limit, row.unit),
+            f"{row.measured / row.limit:.2g}" if row.limit else "",
+        )
     cells = (row.what, shown(row.measured, row.unit), str(row.n), row.aim, limit, ratio, row.peer)
     return f"| {' | '.join(cells)} | {load:.1f} |"
 
@@ -102,7 +113,9 @@ def shown(value: float, unit: str) -> str:
 
 
 def busy() -> float:
-    """Return CPU seconds that processes which this one did not start have taken since the machine started."""
+    """Return CPU seconds that processes which this one did not start have taken since the machine
+    started.
+    """
     own = resource.getrusage(resource.RUSAGE_CHILDREN)
     ticks = map(int, Path("/proc/stat").read_text().split("\n")[0].split()[1:])
     of = dict(zip(TIMES, ticks, strict=False))
@@ -113,9 +126,13 @@ def machine() -> str:
     """Return on what, and of which commit, all is measured."""
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", HERE, *words], capture_output=True, text=True).stdout.strip()
+        return subprocess.run(
+            ["git", "-C", HERE, *words], capture_output=True, text=True
+        ).stdout.strip()
 
-    names = [s for s in Path("/proc/cpuinfo").read_text().splitlines() if s.startswith("model name")]
+    names = [
+        s for s in Path("/proc/cpuinfo").read_text().splitlines() if s.startswith("model name")
+    ]
     processor = names[0].partition(": ")[2] if names else platform.machine()
     changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
     python = f"Python {platform.python_version()}"

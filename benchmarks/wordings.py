@@ -1,10 +1,12 @@
-"""What a search over marked wordings gains, by read-out: SmolLM2 with `v9`, and two small models with `v4`.
+"""What a search over marked wordings gains, by read-out:
+SmolLM2 with `v9`, and two small models with `v4`.
 
     python benchmarks/wordings.py [--only TEXT] [--out reports/wordings] [OPTION ...]
 
-It makes a project in the folder, marks alternatives in copies of the prompts, and types `harness prompt
-optimize` for each row of `ROWS`, with further options if any are given. What is finished stays; a stopped
-search goes on with the same command. SmolLM2 asks its weights of `harness model pull smollm2-135m`.
+It makes a project in the folder, marks alternatives in copies of the prompts, and types `harness
+prompt optimize` for each row of `ROWS`, with further options if any are given. What is finished
+stays; a stopped search goes on with the same command. SmolLM2 asks its weights of `harness model
+pull smollm2-135m`.
 """
 
 import argparse
@@ -52,7 +54,10 @@ OBJECTS = (
     "{% else -%}\nnone\n{% endfor -%}\n"
     "{% if more and not messages %}and {{ more }} farther away\n{% endif -%}\n"
 )
-SEEN, TENS = "{{ (s.seen_share * 100) | round | int }}", "{{ (s.seen_share * 10) | round | int * 10 }}"
+SEEN, TENS = (
+    "{{ (s.seen_share * 100) | round | int }}",
+    "{{ (s.seen_share * 10) | round | int * 10 }}",
+)
 
 
 def either(name: str, *texts: str) -> str:
@@ -100,7 +105,9 @@ ROWS = {
 
 
 def mark(row: Row, name: str, where: Path) -> str:
-    """Write a copy of the row's prompt with its marks into a project, unless it is there; return its name."""
+    """Write a copy of the row's prompt with its marks into a project, unless it is there;
+    return its name.
+    """
     if not (where / name).is_dir():
         shutil.copytree(folder("prompts") / row.prompt, where / name)
         file = where / name / "ego.j2"
@@ -125,9 +132,21 @@ def main() -> None:
         if options.only in name and not Path("reports", name, "optimize.json").is_file():
             base = mark(row, f"{row.prompt}-{name}", Path("prompts"))
             harness(
-                "prompt", "optimize", "--model", row.model, "--prompt", base, "--answer", "readout",
-                "--dataset", row.dataset, "--out", name, *row.options.split(), *others,
-            )  # fmt: skip
+                "prompt",
+                "optimize",
+                "--model",
+                row.model,
+                "--prompt",
+                base,
+                "--answer",
+                "readout",
+                "--dataset",
+                row.dataset,
+                "--out",
+                name,
+                *row.options.split(),
+                *others,
+            )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
 """Worlds in arrays: a frame of many together, beside one by one, highway-env and EnvPool.
 
-Plain means that highway-env's own `act` and `step` drive the same vehicles. All ways lead to the same
-trajectories; alone and together are compared to the last bit. EnvPool is no dependency: name a Python that
-has it.
+Plain means that highway-env's own `act` and `step` drive the same vehicles. All ways lead to the
+same trajectories; alone and together are compared to the last bit. EnvPool is no dependency: name a
+Python that has it.
 
-    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...]
-                                [--sizes 16 64 128 512] [--frozen 8] [--envpool PYTHON]
-    python benchmarks/worlds.py --trees     # only what a decision point costs that is frozen, together
-    python benchmarks/worlds.py --joint 4 --scenarios all-way-crossing narrow-passage --frozen 10
-        # only how many states two agents can bring about together, with so many decisions each
+    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...] [--sizes 16 64
+                                128 512] [--frozen 8] [--envpool PYTHON] python benchmarks/worlds.py
+                                --trees     # only what a decision point costs that is frozen,
+                                together python benchmarks/worlds.py --joint 4 --scenarios
+                                all-way-crossing narrow-passage --frozen 10 # only how many states
+                                two agents can bring about together, with so many decisions each
 """
 
 import argparse
@@ -53,15 +54,24 @@ def main() -> None:
     arguments.add_argument("--layouts", type=int, default=500)
     arguments.add_argument("--worlds", type=int, default=128)
     arguments.add_argument("--scenarios", nargs="+", default=scenarios.names())
-    arguments.add_argument("--sizes", type=int, nargs="+", default=[16, 64, 128, 512], help="worlds at once")
+    arguments.add_argument(
+        "--sizes", type=int, nargs="+", default=[16, 64, 128, 512], help="worlds at once"
+    )
     arguments.add_argument("--envpool", help="a Python interpreter that has EnvPool")
-    arguments.add_argument("--frozen", type=int, default=8, help="layouts of each scenario that are frozen")
+    arguments.add_argument(
+        "--frozen", type=int, default=8, help="layouts of each scenario that are frozen"
+    )
     arguments.add_argument("--trees", action="store_true", help="measure only freezing, together")
-    arguments.add_argument("--joint", type=int, help="measure only joint trees, of so many decisions")
+    arguments.add_argument(
+        "--joint", type=int, help="measure only joint trees, of so many decisions"
+    )
     given = arguments.parse_args()
     if given.joint:
         for name in given.scenarios:
-            print(f"{name}: {joint_tree(scenarios.get(f'{name}:agent_share=1'), given.frozen, given.joint)}")
+            print(
+                f"{name}: "
+                f"{joint_tree(scenarios.get(f'{name}:agent_share=1'), given.frozen, given.joint)}"
+            )
         return
     if given.trees:
         for name in given.scenarios:
@@ -81,18 +91,29 @@ def main() -> None:
     print(f"\n{'CPU µs a frame of':<24}" + "".join(f"{n:>12}" for n in sizes))
     for name, r in rows.items():
         print(f"{name:<24}" + "".join(f"{r['sizes_us'][n]:12.2f}" for n in sizes))
-    print(f"\n{'the same to the last bit':<24}{'frames':>8}{'differ':>8}   freezing, ms a decision point")
+    print(
+        f"\n{'the same to the last bit':<24}{'frames':>8}{'differ':>8}   freezing, ms a decision "
+        "point"
+    )
     for name, r in rows.items():
         trees = f"{r['tree_ms']:.1f}, one layout at a time {r['tree_alone_ms']:.1f}"
         print(f"{name:<24}{r['frames']:8}{r['differ']:8}   {trees}")
     envpool_us = None
     if given.envpool:
-        made = subprocess.run([given.envpool, "-c", ENVPOOL], capture_output=True, text=True, check=True)
+        made = subprocess.run(
+            [given.envpool, "-c", ENVPOOL], capture_output=True, text=True, check=True
+        )
         envpool_us = float(made.stdout.split()[-1])
         print(f"\nEnvPool's Intersection-v0, 64 at once on one thread: {envpool_us:.1f} µs a frame")
     at_once = f"a world's frame, {given.worlds} at once"
     figures = [
-        Row(f"{at_once}, `{name}`, CPU", r["frame_us"], "µs", 3, peer=f"highway-env {r['plain_us']:.0f} µs")
+        Row(
+            f"{at_once}, `{name}`, CPU",
+            r["frame_us"],
+            "µs",
+            3,
+            peer=f"highway-env {r['plain_us']:.0f} µs",
+        )
         for name, r in rows.items()
     ]
     figures += [
@@ -102,18 +123,28 @@ def main() -> None:
     finish(figures, worlds=rows, envpool_us=envpool_us)
 
 
-def row(scenario: Scenario, layouts: int, at_once: int, sizes: Sequence[int], trees: int) -> dict[str, Any]:
-    """What a scenario's frames and trees cost in each way, and in how many worlds two ways differ."""
-    same = [frames_of(scenario, range(n, min(n + at_once, layouts))) for n in range(0, layouts, at_once)]
+def row(
+    scenario: Scenario, layouts: int, at_once: int, sizes: Sequence[int], trees: int
+) -> dict[str, Any]:
+    """What a scenario's frames and trees cost in each way,
+    and in how many worlds two ways differ.
+    """
+    same = [
+        frames_of(scenario, range(n, min(n + at_once, layouts))) for n in range(0, layouts, at_once)
+    ]
     alone_s, together_s, frames, differ = np.sum(same, axis=0).tolist()
     still = [World.start(scenario, FIRST_SEED + n) for n in range(max(at_once, *sizes))]
     return {
-        "plain_us": plain_us(scenario), "alone_us": alone_s * 1e6 / frames,
-        "together_us": together_s * 1e6 / frames, "frame_us": step_us(still[:at_once]),
+        "plain_us": plain_us(scenario),
+        "alone_us": alone_s * 1e6 / frames,
+        "together_us": together_s * 1e6 / frames,
+        "frame_us": step_us(still[:at_once]),
         "sizes_us": {n: step_us(still[:n]) for n in sizes},
-        "frames": int(frames), "differ": int(differ),
-        "tree_ms": tree_ms(scenario, trees, trees), "tree_alone_ms": tree_ms(scenario, trees, 1),
-    }  # fmt: skip
+        "frames": int(frames),
+        "differ": int(differ),
+        "tree_ms": tree_ms(scenario, trees, trees),
+        "tree_alone_ms": tree_ms(scenario, trees, 1),
+    }
 
 
 def started(scenario: Scenario, layouts: Sequence[int]) -> list[World]:
@@ -125,7 +156,9 @@ def started(scenario: Scenario, layouts: Sequence[int]) -> list[World]:
 
 
 def step_us(still: Sequence[World]) -> float:
-    """A frame of a world among others, all it does but record it: the least of three measurements."""
+    """A frame of a world among others, all it does but record it:
+    the least of three measurements.
+    """
 
     def once() -> float:
         fleet = lockstep.Fleet(still)
@@ -198,7 +231,8 @@ def joint_tree(scenario: Scenario, layouts: int, decisions: int) -> str:
     if not level:
         return "no layout has two agents"
     p, n, start = scenario.parameters, len(level), process_time()
-    states, edges = [1.0], list[list[int]]()  # of each edge, the number of the state that it leads to
+    # of each edge, the number of the state that it leads to
+    states, edges = [1.0], list[list[int]]()
     for step in range(decisions):
         lockstep.advance(level, [p.due_frame(step) + p.lag_frames] * len(level))
         parts = [part for world in level for part in joint_parts(world)]
@@ -218,9 +252,13 @@ def joint_tree(scenario: Scenario, layouts: int, decisions: int) -> str:
 def joint_parts(world: World) -> list[World]:
     """A world for each choice of the targets of all agents that are under way."""
     free = [
-        [(agent, action) for action in {world.target_after(a, agent): a for a in world.actions}.values()]
-        for agent, journey in world.journeys.items() if not journey.outcome.ended
-    ]  # fmt: skip
+        [
+            (agent, action)
+            for action in {world.target_after(a, agent): a for a in world.actions}.values()
+        ]
+        for agent, journey in world.journeys.items()
+        if not journey.outcome.ended
+    ]
     parts = []
     for choice in product(*free):
         part = world.branch()

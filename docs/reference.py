@@ -1,4 +1,5 @@
-"""Writes docs/commands.md out of the program: `python docs/reference.py`. A test holds the page to it.
+"""Writes docs/commands.md out of the program: `python docs/reference.py`.
+A test holds the page to it.
 
 Examples are not written here: each is a command of another page, which the tests run.
 """
@@ -21,14 +22,15 @@ HEAD = """\
 
 Written by `python docs/reference.py` out of the program, which says the same with `--help`. Bad input is one
 line on stderr and exit code 2; all codes are in [a table](answers.md#exit-codes).
-"""
+"""  # noqa: E501
 SHARED = """\
 ## Shared options
 
 Options with one meaning in several commands. Each command below names those that it has, in brackets with its
 default where defaults differ.
-"""
-HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"  # meaning and default
+"""  # noqa: E501
+# meaning and default
+HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"
 
 
 def pages() -> list[Path]:
@@ -39,11 +41,15 @@ def pages() -> list[Path]:
 
 def blocks(page: Path) -> list[tuple[str, str]]:
     """A page's blocks of `console` and `python`, each with its language, in order."""
-    return re.findall(r"^```(console|python)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    return re.findall(
+        r"^```(console|python)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL
+    )
 
 
 def typed(block: str) -> list[tuple[str, str]]:
-    """What a console block has a reader type, each with what it shows below; a backslash joins two lines."""
+    """What a console block has a reader type, each with what it shows below;
+    a backslash joins two lines.
+    """
     lines = re.split(r"^\$ ", block.replace("\\\n", ""), flags=re.MULTILINE)[1:]
     return [(line, shown) for line, _, shown in (each.partition("\n") for each in lines)]
 
@@ -64,7 +70,9 @@ def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def parameters(command: Any) -> Iterator[tuple[str, str, str]]:
-    """A command's arguments and options but `--help`: what is typed, its meaning, and its default."""
+    """A command's arguments and options but `--help`:
+    what is typed, its meaning, and its default.
+    """
     context = Context(command)
     for parameter in command.get_params(context):
         name, text = parameter.get_help_record(context) or ("--help", "")
@@ -73,12 +81,16 @@ def parameters(command: Any) -> Iterator[tuple[str, str, str]]:
 
 
 def shared(found: list[tuple[str, Any]]) -> dict[str, tuple[str, set[str]]]:
-    """Options that several commands have: by what is typed, the meaning that most have, and its defaults."""
+    """Options that several commands have:
+    by what is typed, the meaning that most have, and its defaults.
+    """
     meanings: dict[str, dict[str, list[str]]] = {}
     for name, meaning, default in (each for _, command in found for each in parameters(command)):
         if name.startswith("-"):
             meanings.setdefault(name, {}).setdefault(meaning, []).append(default)
-    most = {name: max(each.items(), key=lambda item: len(item[1])) for name, each in meanings.items()}
+    most = {
+        name: max(each.items(), key=lambda item: len(item[1])) for name, each in meanings.items()
+    }
     return {name: (each, {*has}) for name, (each, has) in sorted(most.items()) if len(has) > 1}
 
 
@@ -127,14 +139,18 @@ def reference() -> str:
     lines = [" ".join(line.partition(" #")[0].split()) for line in all_typed()]
     found = list(commands(get_command(app), "harness"))
     # A command without an example ends this here: the documents have to show each of them.
-    examples = {path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found}
+    examples = {
+        path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found
+    }
     common = shared(found)
     sections = (section(path, command, examples[path], common) for path, command in found)
     return "\n".join([HEAD, overview(found), shared_section(common), *sections])
 
 
 def _item(name: str, meaning: str, default: str) -> str:
-    stated = f" Default: {default}." if default not in ("", "required") else " Required." * bool(default)
+    stated = (
+        f" Default: {default}." if default not in ("", "required") else " Required." * bool(default)
+    )
     return f"- `{name}`: {_plain(meaning + stated)}"
 
 

@@ -1,4 +1,6 @@
-"""Evaluate, load and compare runs from Python; results show themselves in a notebook (docs/python.md)."""
+"""Evaluate, load and compare runs from Python;
+results show themselves in a notebook (docs/python.md).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -44,8 +46,8 @@ class Run(Tables):
             viewer: whose view the picture shows; None for the ego's.
 
         Raises:
-            UserError: the run has no such decision point, its dataset is not found, or nobody of that name
-                answers there.
+            UserError: the run has no such decision point, its dataset is not found,
+                or nobody of that name answers there.
         """
         if scene not in self.source.decisions.scenes:
             raise unknown("decision point", scene, list(self.source.decisions.scenes))
@@ -60,7 +62,9 @@ class Run(Tables):
 
             [seen] = scenes_of(self.source, [scene])
             if seen.id != scene:
-                raise UserError(f"decision point {printable(scene)} comes out otherwise in this simulator")
+                raise UserError(
+                    f"decision point {printable(scene)} comes out otherwise in this simulator"
+                )
         seen.viewer(viewer)  # refuses a name that nobody has
         return DecisionPoint(self, seen, viewer)
 
@@ -85,7 +89,9 @@ class Run(Tables):
         void = [finding.sentence for finding in findings(self.source, Kind.VOID)]
         n = f"n = {crossed(len(self.source.grid.episodes), len(self.source.grid.seeds))}"
         sentences = [words.headline(self.source), *void]
-        return _page(sentences, _frame(pd.DataFrame(rows)), f"{n}; 95 % intervals over episodes; {self.path}")
+        return _page(
+            sentences, _frame(pd.DataFrame(rows)), f"{n}; 95 % intervals over episodes; {self.path}"
+        )
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,9 @@ class DecisionPoint:
     def _repr_html_(self) -> str:
         from harness.report.library import picture
 
-        image = Markup('<img alt="the scene from above" src="{}">').format(picture(self.svg.encode()))
+        image = Markup('<img alt="the scene from above" src="{}">').format(
+            picture(self.svg.encode())
+        )
         answers = self.answers[["viewer", "role", "verdict", "raw", *self._columns("intent_")]]
         columns = ["condition", "action", "triggered", *self._columns("fused_")]
         groups = self.decisions.groupby(columns, observed=True, dropna=False, sort=False).seed
@@ -131,7 +139,9 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Run B against run A. A notebook shows how success changed, how many answers, and the differences."""
+    """Run B against run A. A notebook shows how success changed, how many answers,
+    and the differences.
+    """
 
     report: Mapping[str, Any] = field(repr=False)  # what `harness compare --json` prints
     findings: tuple[str, ...]  # how success changed in each condition, in a sentence
@@ -139,7 +149,9 @@ class Comparison:
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """One row for each answer to the same question that changed: both texts and both verdicts."""
+        """One row for each answer to the same question that changed:
+        both texts and both verdicts.
+        """
         import pandas as pd
 
         from harness.report.compare.text import ANSWERS, changed_answers
@@ -169,7 +181,9 @@ class Comparison:
 
         names = [f"{letter}: {self.report[letter.lower()]['run']}" for letter in "AB"]
         answers = f"answers: {answers_held(self.held)}"
-        return _page([*names, *self.findings, answers, *self.report["caveats"]], _frame(self.differences))
+        return _page(
+            [*names, *self.findings, answers, *self.report["caveats"]], _frame(self.differences)
+        )
 
 
 @dataclass(frozen=True)
@@ -189,16 +203,25 @@ class Study:
             Markup(image).format(file.stem, picture(bytes_of(file, "picture")))
             for file in sorted(self.path.glob("*.svg"))
         ]
-        return _page(self.headline, *figures, *(Markup("<p>{}</p>").format(text) for text in self.about))
+        return _page(
+            self.headline, *figures, *(Markup("<p>{}</p>").format(text) for text in self.about)
+        )
 
 
 def run(
-    *, out: str | PathLike[str] | None = None, cache: bool = True, workers: int = 1, quiet: bool = False,
-    tracker: str | Sequence[str] = (), max_cost: float | None = None, **options: Any,
-) -> Run:  # fmt: skip
+    *,
+    out: str | PathLike[str] | None = None,
+    cache: bool = True,
+    workers: int = 1,
+    quiet: bool = False,
+    tracker: str | Sequence[str] = (),
+    max_cost: float | None = None,
+    **options: Any,
+) -> Run:
     """Evaluate a model with a prompt, on frozen scenes or in closed loop, and return the run.
 
-    A run that was stopped goes on; the same call where it is finished raises UserError, as the command does.
+    A run that was stopped goes on; the same call where it is finished raises UserError,
+    as the command does.
 
     Args:
         out: the run's folder. Default: the command line's, under `reports`.
@@ -207,8 +230,9 @@ def run(
         quiet: whether progress is left out.
         tracker: names of trackers that keep the run as well, as `--tracker` takes them.
         max_cost: what answers may cost before no more are asked for, as `--max-cost` says.
-        options: settings of `harness eval`, or of `harness drive` if one of its own is among them, such as
-            `scenario`: each by its name there, with `_` for `-`; a list where it is repeatable.
+        options: settings of `harness eval`, or of `harness drive` if one of its own is among them,
+            such as `scenario`: each by its name there, with `_` for `-`; a list where it is
+            repeatable.
 
     Raises:
         UserError: a setting is unknown or not allowed, or the folder holds something else.
@@ -223,7 +247,11 @@ def run(
     for world in settings.WORLDS.values():
         names[world] = {each.name: each for each in settings.options(world)}
     frozen, driven = names.values()
-    kind = settings.DriveSettings if set(options) & (driven.keys() - frozen) else settings.FrozenSettings
+    kind = (
+        settings.DriveSettings
+        if set(options) & (driven.keys() - frozen)
+        else settings.FrozenSettings
+    )
     for name in options:
         if name not in names[kind]:
             raise unknown("setting", name, list(names[kind]))
@@ -259,7 +287,8 @@ def load(run: str | PathLike[str]) -> Run:
 
 
 def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
-    """List the runs and studies in a folder, newest first: a row each, as `harness run ls` prints them.
+    """List the runs and studies in a folder, newest first:
+    a row each, as `harness run ls` prints them.
 
     Raises:
         UserError: there is no such folder.
@@ -282,7 +311,9 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
     from harness.report.compare.text import mapping
     from harness.report.compare.words import outcomes
 
-    difference = compared(pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b))))
+    difference = compared(
+        pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b)))
+    )
     return Comparison(
         mapping(difference, (), most=10),
         tuple(sentence for sentence, _ in outcomes(difference)),
@@ -291,10 +322,15 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
 
 
 def sweep(
-    run: str | PathLike[str] | Run, over: str | Sequence[str] = (), grid: str | Sequence[str] = (), *,
-    condition: str | Sequence[str] = "6g", seeds: str | None = None, out: str | PathLike[str] | None = None,
+    run: str | PathLike[str] | Run,
+    over: str | Sequence[str] = (),
+    grid: str | Sequence[str] = (),
+    *,
+    condition: str | Sequence[str] = "6g",
+    seeds: str | None = None,
+    out: str | PathLike[str] | None = None,
     quiet: bool = False,
-) -> Study:  # fmt: skip
+) -> Study:
     """Score a run's stored answers at other operating points; write the study and return it.
 
     Args:
@@ -336,4 +372,5 @@ def _page(sentences: Sequence[str], *parts: Markup | str) -> str:
 
 
 def _frame(frame: "pd.DataFrame") -> Markup:
-    return Markup(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format))  # it escapes texts
+    # it escapes texts
+    return Markup(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format))

@@ -1,4 +1,6 @@
-"""Re-export what extensions build on. A name that goes warns for a release first: docs/extend.md."""
+"""Re-export what extensions build on.
+A name that goes warns for a release first: docs/extend.md.
+"""
 
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
@@ -22,7 +24,17 @@ from harness.runs.folder import read as read_run
 from harness.runs.metrics import Metric
 from harness.studies.study import Study
 from harness.world.parameters import Parameters
-from harness.world.road import Ground, Lane, Path, PathKey, Road, crossings, ground, straights, to_the_left
+from harness.world.road import (
+    Ground,
+    Lane,
+    Path,
+    PathKey,
+    Road,
+    crossings,
+    ground,
+    straights,
+    to_the_left,
+)
 from harness.world.scenario import Draws as LayoutDraws
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import Building
@@ -74,7 +86,8 @@ __all__ = [
     "Study",
     "Table",
     "Turn",
-    "Unit", "UserError",
+    "Unit",
+    "UserError",
     "crossings",
     "finish_study",
     "ground",
@@ -83,4 +96,4 @@ __all__ = [
     "read_run",
     "straights",
     "to_the_left",
-]  # fmt: skip
+]

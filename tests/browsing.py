@@ -66,12 +66,16 @@ def opened(browser):
             heard.append(("request", url))
 
     def open_page(file, where="", size=WIDE, scheme="light"):
-        context = browser.new_context(viewport=size, color_scheme=scheme, offline=True, accept_downloads=True)
+        context = browser.new_context(
+            viewport=size, color_scheme=scheme, offline=True, accept_downloads=True
+        )
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: heard.append(("console", message.text)))
         page.on("pageerror", lambda error: heard.append(("error", str(error))))
-        page.on("dialog", lambda dialog: (heard.append(("dialog", dialog.message)), dialog.dismiss()))
+        page.on(
+            "dialog", lambda dialog: (heard.append(("dialog", dialog.message)), dialog.dismiss())
+        )
         page.on("request", lambda request: asked(request.url))
         page.goto(f"file://{file}{where}")
         wait(page)

@@ -29,7 +29,9 @@ def concerns(files: Iterable[str], extension: str) -> bool:
 
 @cache
 def changed(root: Path) -> tuple[str, ...] | None:
-    """Name files that differ from where main was left, committed or not; None where git cannot say."""
+    """Name files that differ from where main was left, committed or not;
+    None where git cannot say.
+    """
     try:
         [left] = _git(root, "merge-base", "HEAD", "main")
         differing = _git(root, "diff", "--name-only", "--no-renames", left)

@@ -1,4 +1,6 @@
-"""What the workers of a Ray cluster are given to do in tests: they import this, and little with it."""
+"""What the workers of a Ray cluster are given to do in tests:
+they import this, and little with it.
+"""
 
 import os
 import time
@@ -28,7 +30,11 @@ def dies(graves: Path, number: int) -> int:
 def wrong(tried: Path, number: int) -> int:
     (tried / f"{number}-{time.monotonic_ns()}").touch()
     if number == 1:
-        raise (UserError("the weights are missing") if tried.name == "user" else ZeroDivisionError("a bug"))
+        raise (
+            UserError("the weights are missing")
+            if tried.name == "user"
+            else ZeroDivisionError("a bug")
+        )
     return number
 
 

@@ -40,13 +40,13 @@ settings.register_profile("harness", deadline=None, derandomize="CI" in os.envir
 settings.register_profile("quick", settings.get_profile("harness"), max_examples=20)
 settings.load_profile("harness")
 
-# Containers often set this: then every process that a test starts compiles the harness anew, and every worker
-# rewrites all the tests.
+# Containers often set this: then every process that a test starts compiles the harness anew, and
+# every worker rewrites all the tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# Before anyone imports torch: threads of several workers that wait for each other make tiny models a
-# hundred times slower.
+# Before anyone imports torch: threads of several workers that wait for each other make tiny models
+# a hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
@@ -61,7 +61,10 @@ text = cache(Path.read_text)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    what = "fail a test that takes more CPU seconds, with the fixtures that it alone has; name dear files"
+    what = (
+        "fail a test that takes more CPU seconds, with the fixtures that it alone has; name dear "
+        "files"
+    )
     parser.addoption("--cpu-limit", type=float, metavar="S", help=what)
     share = f"of the exhaustive tests, the K-th of {SHARES} shares"
     parser.addoption("--share", type=int, metavar="K", help=share)
@@ -86,7 +89,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Choose a share; then sort files: of engines first, for one worker to import them; then with slow tests.
+    """Choose a share; then sort files: of engines first, for one worker to import them;
+    then with slow tests.
 
     The last tests are short then, and no worker waits long for another.
     """
@@ -109,7 +113,8 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-ALONE_S = 0.01  # what `slowness` works on takes on a core of a server of 2023 that does nothing else
+# what `slowness` works on takes on a core of a server of 2023 that does nothing else
+ALONE_S = 0.01
 SHARED = SimpleNamespace(cpu_s=0.0)  # what fixtures took which several tests have
 
 
@@ -120,7 +125,9 @@ def cpu_s() -> float:
 
 
 def slowness() -> float:
-    """How many times as long a piece of work takes now as on a core of its own; other work shares caches."""
+    """How many times as long a piece of work takes now as on a core of its own;
+    other work shares caches.
+    """
 
     def work_s() -> float:
         start = time.process_time()
@@ -143,7 +150,9 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Generator[None, 
 
 @pytest.fixture(scope="session")
 def shared_work() -> Callable[[], AbstractContextManager[None]]:
-    """What is done within it is several tests' work, and not that of the one at which it is done."""
+    """What is done within it is several tests' work,
+    and not that of the one at which it is done.
+    """
 
     @contextmanager
     def counted() -> Generator[None, None, None]:
@@ -155,7 +164,9 @@ def shared_work() -> Callable[[], AbstractContextManager[None]]:
 
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Fail who takes too long twice: the first may import packages and fill caches for all that follow."""
+    """Fail who takes too long twice: the first may import packages and fill caches for all that
+    follow.
+    """
     limit = item.config.getoption("cpu_limit")
     if not limit:
         return None
@@ -176,10 +187,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         if again > limit and again > limit * slowness():
             tier = "exhaustive" if item.get_closest_marker("slow") else "slow"
             reports[1].outcome = "failed"
-            reports[
-                1
-            ].longrepr = (
-                f"{again:.2f} CPU s, allowed {limit}: make it cheaper (CONTRIBUTING.md), or mark it {tier}"
+            reports[1].longrepr = (
+                f"{again:.2f} CPU s, allowed {limit}: make it cheaper (CONTRIBUTING.md), or mark "
+                f"it {tier}"
             )
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
@@ -188,7 +198,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Skip a test that needs an extension, where the folder of all of them is deleted."""
     report = yield
     if report.failed and not EXTENSIONS.is_dir():
@@ -215,7 +227,9 @@ if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     """Say where the time went: the ten dearest files."""
     if not config.getoption("cpu_limit"):
         return
@@ -225,11 +239,15 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
             if hasattr(report, "cpu_s"):
                 files[report.nodeid.split("::")[0]] += report.cpu_s
     dearest = ", ".join(f"{file} {spent_s:.0f}" for file, spent_s in files.most_common(10))
-    terminalreporter.write_line(f"CPU s of tests: {files.total():.0f}; the ten dearest files: {dearest}")
+    terminalreporter.write_line(
+        f"CPU s of tests: {files.total():.0f}; the ten dearest files: {dearest}"
+    )
 
 
 @pytest.fixture(scope="session")
-def workers_folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+def workers_folder(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Path:
     """The folder of all workers."""
     base = tmp_path_factory.getbasetemp()
     return base.parent if hasattr(request.config, "workerinput") else base
@@ -243,7 +261,9 @@ def _own_cache(workers_folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def once(workers_folder: Path) -> Once:
-    """A folder by name, filled once, by whoever of several workers comes first; tests leave it as it is."""
+    """A folder by name, filled once, by whoever of several workers comes first;
+    tests leave it as it is.
+    """
 
     def filled(name: str, fill: Callable[[Path], object]) -> Path:
         done = workers_folder / f"{name}.done"
@@ -288,14 +308,18 @@ def proxy_run(once: Once, small: Dataset) -> Path:
 
 @pytest.fixture
 def unrebuilt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Build no layouts again, which takes seconds each time; test_tune_is_a_fact.py is about that."""
+    """Build no layouts again, which takes seconds each time;
+    test_tune_is_a_fact.py is about that.
+    """
     monkeypatch.setattr(rebuilt, "differences", lambda dataset: iter(()))
     monkeypatch.setattr(rebuilt, "_reported", lambda scenario: iter(()))
 
 
 @pytest.fixture
 def svg_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Studies draw no PDF and no PNG, which take longest: which kinds a folder has, a few tests look at."""
+    """Studies draw no PDF and no PNG, which take longest:
+    which kinds a folder has, a few tests look at.
+    """
     monkeypatch.setattr("harness.report.drawing.pictures.FORMATS", ("svg",))
 
 
@@ -303,7 +327,9 @@ def svg_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def harness(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Callable[..., tuple[int, str, str]]:
-    """The command as typed, in a folder of its own: its exit code, and what it said on stdout and stderr."""
+    """The command as typed, in a folder of its own:
+    its exit code, and what it said on stdout and stderr.
+    """
     monkeypatch.chdir(tmp_path)
 
     def typed(*args: str | Path) -> tuple[int, str, str]:

@@ -1,4 +1,6 @@
-"""Evaluations as tests make them: the real parts, or the real parts around answers from a script."""
+"""Evaluations as tests make them: the real parts,
+or the real parts around answers from a script.
+"""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -44,7 +46,11 @@ FILES = ("answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv")
 
 
 def spec_of(
-    dataset: Dataset, model: str = "proxy", prompt: str = "v2", limit: int | None = None, **options: Any
+    dataset: Dataset,
+    model: str = "proxy",
+    prompt: str = "v2",
+    limit: int | None = None,
+    **options: Any,
 ) -> Spec:
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
     asked = {name: options.pop(name) for name in ("answer", "thinking") if name in options}
@@ -87,7 +93,9 @@ def figure(done: "Evaluated | Walked", condition: str, metric: str, interval: st
 
 
 def same_files(one: Path, other: Path) -> bool:
-    """Whether two runs have the same tables: bytes, and of decisions.parquet values and their types."""
+    """Whether two runs have the same tables:
+    bytes, and of decisions.parquet values and their types.
+    """
     texts = [name for name in FILES if name != "decisions.parquet"]
     return same_decisions(one, other) and all(
         (one / name).read_bytes() == (other / name).read_bytes() for name in texts
@@ -140,7 +148,9 @@ class Walked:
         return [decision for decision in found if decision.condition == condition]
 
 
-def asker_of(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Asker:
+def asker_of(
+    spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None
+) -> Asker:
     """An asker that has asked about every scene."""
     asker = Asker(spec, lambda: backend, latency, kept)
     assert isinstance(spec.source, FrozenSource)
@@ -153,8 +163,12 @@ def all_scenes(dataset: Dataset) -> list[Scene]:
     return dataset.scenes(dataset.forest.ids)
 
 
-def as_read(stored: folder.Run, dataset: Dataset) -> Iterator[tuple[Answer, Sequence[Any], Sequence[Any]]]:
-    """Each answer of a run, the messages that it heard, and the chat that a reader is shown for it."""
+def as_read(
+    stored: folder.Run, dataset: Dataset
+) -> Iterator[tuple[Answer, Sequence[Any], Sequence[Any]]]:
+    """Each answer of a run, the messages that it heard,
+    and the chat that a reader is shown for it.
+    """
     sent = prompts_of(stored)
     assert sent is not None
     scenes = {scene.id: scene for scene in all_scenes(dataset)}
@@ -171,14 +185,18 @@ def scenes_of(dataset: Dataset) -> list[Scene]:
     return dataset.scenes(dataset.courses())
 
 
-def walked(spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None) -> Walked:
+def walked(
+    spec: Spec, backend: Backend, latency: Latency = A_TENTH, kept: Path | None = None
+) -> Walked:
     """A whole evaluation but for its folder: asked, walked and scored."""
     asker = Asker(spec, lambda: backend, latency, kept)
     assert isinstance(spec.source, FrozenSource)
     world = FrozenWorld(spec.source.dataset, spec.points, spec.seeds)
     parts = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
     made = table(parts, world.columns(), spec.actions)
-    grid = Grid(tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes)
+    grid = Grid(
+        tuple(point.name for point in spec.points), spec.seeds, spec.source.dataset.episodes
+    )
     episodes = counted(grid, made, world.episodes())
     answers = writer.ordered(asker.answers.values(), made)
     return Walked(
@@ -230,7 +248,9 @@ def failed(request_id: str, error: str) -> Completion:
     return Completion(request_id, "", None, None, "error", None, 1, error)
 
 
-def says(p: Sequence[float], role: str = "ego", actions: Sequence[str] = ("SLOWER", "IDLE", "FASTER")) -> str:
+def says(
+    p: Sequence[float], role: str = "ego", actions: Sequence[str] = ("SLOWER", "IDLE", "FASTER")
+) -> str:
     body: dict[str, Any] = {"action_distribution": dict(zip(actions, p, strict=True))}
     return json.dumps(body if role == "ego" else {"evidence": "clear", "risk": "low", **body})
 
@@ -243,9 +263,9 @@ def course(dataset: Dataset, steps: int = 6, outcomes: Mapping[str, Mapping[str,
            driver: str = "cruise", drives: Mapping[str, str] | None = None) -> Dataset:  # fmt: skip
     """Trees with one branch: whatever is decided leads to the next scene of a driver's course.
 
-    Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and action,
-    has how: seconds until cleared, or the failure. At the last step every action does, by default cleared
-    after 5 s.
+    Scenes are called `<episode>-<step>`. An action ends the episode where `outcomes`, by scene and
+    action, has how: seconds until cleared, or the failure. At the last step every action does, by
+    default cleared after 5 s.
 
     Args:
         dataset: whose scenes are taken.

@@ -1,4 +1,6 @@
-"""The dataset and the scenes that were taken by default until 0.3; figures of many tests are of these."""
+"""The dataset and the scenes that were taken by default until 0.3;
+figures of many tests are of these.
+"""
 
 from harness.world import scenarios
 from harness.world.scenario import Scenario

@@ -38,7 +38,9 @@ STANDING = Conflict(
 def graph(
     role: Role, nodes: Sequence[Node], conflicts: Sequence[Conflict], hidden: bool = False
 ) -> SceneGraph:
-    """The ego is v1, 28 m before its first conflict point; the helper is v3, waiting on the right arm."""
+    """The ego is v1, 28 m before its first conflict point;
+    the helper is v3, waiting on the right arm.
+    """
     helper = role == "helper"
     itself = Viewer(0.0, "approach-right", 30.1) if helper else Viewer(13.9, "approach-own", 30.1)
     ego = Ego("v1", 13.9, 14.0, 0.0, 30.1, *((25.0, 31.5) if helper else (0.0, 0.0)))
@@ -47,7 +49,9 @@ def graph(
         Sector("right", 0.87, False, ("b1",)),
         Sector("oncoming", 1.0, False, ()),
     )
-    return SceneGraph("v3" if helper else "v1", role, 2, itself, ego, (*nodes,), (*conflicts,), sectors)
+    return SceneGraph(
+        "v3" if helper else "v1", role, 2, itself, ego, (*nodes,), (*conflicts,), sectors
+    )
 
 
 MESSAGES = (

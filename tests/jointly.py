@@ -27,4 +27,6 @@ def who_list_the_danger(world: World) -> set[str]:
     state = world.state()
     viewers = [v for v in state.vehicles if v.part != "other"]
     graphs = scene_graphs(world.scenario, [(state, v.id) for v in viewers])
-    return {v.approach for v, g in zip(viewers, graphs, strict=True) if world.layout.danger_id in g.seen}
+    return {
+        v.approach for v, g in zip(viewers, graphs, strict=True) if world.layout.danger_id in g.seen
+    }

@@ -18,7 +18,9 @@ unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow]
 
 # Texts that prompts write in the place of a helper's evidence.
 PLACEHOLDERS = (
-    "max 12 words", "Max. 12 words.", "one short sentence", "<evidence>", "...", "string", "low|medium|high",
+    "max 12 words", "Max. 12 words.", 
+        "one short "
+        "sentence", "<evidence>", "...", "string", "low|medium|high",
     "low|medium", "SLOWER or IDLE", "0 to 1",
 )  # fmt: skip
 ROLES = st.sampled_from(["ego", "helper"])
@@ -26,13 +28,17 @@ ROLES = st.sampled_from(["ego", "helper"])
 
 @cache
 def validator(shape: Shape) -> Any:
-    return jsonschema.Draft202012Validator(answer_schema(shape.role, shape.actions, form=shape.form))
+    return jsonschema.Draft202012Validator(
+        answer_schema(shape.role, shape.actions, form=shape.form)
+    )
 
 
 @st.composite
 def hundredths(draw: st.DrawFn, actions: tuple[str, ...] = ACTIONS) -> dict[str, float]:
     """A distribution in steps of 0.01 that sums to 1."""
-    cuts = sorted(draw(st.lists(st.integers(0, 100), min_size=len(actions) - 1, max_size=len(actions) - 1)))
+    cuts = sorted(
+        draw(st.lists(st.integers(0, 100), min_size=len(actions) - 1, max_size=len(actions) - 1))
+    )
     parts = [b - a for a, b in zip([0, *cuts], [*cuts, 100], strict=True)]
     return {action: part / 100 for action, part in zip(actions, parts, strict=True)}
 
@@ -48,7 +54,9 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def judged_strict(text: str, shape: Shape) -> bool:
-    """A judge that shares no code with the parser: JSON, jsonschema, the placeholders, and a sum."""
+    """A judge that shares no code with the parser:
+    JSON, jsonschema, the placeholders, and a sum.
+    """
     try:
         value = json.loads(text, object_pairs_hook=_no_key_twice)
     except (ValueError, RecursionError):

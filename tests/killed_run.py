@@ -1,8 +1,9 @@
-"""Evaluations that are really killed: `python killed_run.py DATASET FOLDER`, a run in each subfolder.
+"""Evaluations that are really killed:
+`python killed_run.py DATASET FOLDER`, a run in each subfolder.
 
 `at-<n>` dies by SIGKILL just before the n-th call that changes the disk, for every n that there is;
-`after-<ms>-<i>` is killed by its parent, whatever it is doing then. Tests import `killed_at`, too, for a kill
-of each kind.
+`after-<ms>-<i>` is killed by its parent, whatever it is doing then. Tests import `killed_at`, too,
+for a kill of each kind.
 """
 
 import itertools

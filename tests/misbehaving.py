@@ -7,7 +7,9 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NamedTuple
 
-LISTED = {"data": [{"id": "m", "owned_by": "tests", "created": 1}, {"id": "n", "owned_by": "tests"}]}
+LISTED = {
+    "data": [{"id": "m", "owned_by": "tests", "created": 1}, {"id": "n", "owned_by": "tests"}]
+}
 
 
 class Asked(NamedTuple):
@@ -29,7 +31,9 @@ class Asked(NamedTuple):
         self.handler.wfile.write(data)
 
     def stream(self, *pieces: Any, between: Callable[[], Any] = lambda: None) -> None:
-        """Answer as a decent server streams: an event a piece, or bytes as they are, and hang up."""
+        """Answer as a decent server streams:
+        an event a piece, or bytes as they are, and hang up.
+        """
         self.raw(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream; charset=utf-8\r\n\r\n")
         for piece in pieces:
             self.raw(piece if isinstance(piece, bytes) else event(piece))
@@ -92,10 +96,16 @@ def event(piece: Any) -> bytes:
     return f"data: {json.dumps(piece)}\n\n".encode()
 
 
-def pieces(*texts: str, finish_reason: str | None = "stop", usage: bool = True, **first: Any) -> list[Any]:
-    """A completion in pieces, as vLLM sends it: who speaks, each text, why it ends, and the tokens' count."""
+def pieces(
+    *texts: str, finish_reason: str | None = "stop", usage: bool = True, **first: Any
+) -> list[Any]:
+    """A completion in pieces, as vLLM sends it:
+    who speaks, each text, why it ends, and the tokens' count.
+    """
     deltas = [{"role": "assistant", "content": "", **first}, *({"content": text} for text in texts)]
-    made: list[Any] = [{"choices": [{"index": 0, "delta": delta, "finish_reason": None}]} for delta in deltas]
+    made: list[Any] = [
+        {"choices": [{"index": 0, "delta": delta, "finish_reason": None}]} for delta in deltas
+    ]
     if finish_reason:
         made.append({"choices": [{"index": 0, "delta": {}, "finish_reason": finish_reason}]})
     if usage:
@@ -104,9 +114,15 @@ def pieces(*texts: str, finish_reason: str | None = "stop", usage: bool = True, 
     return [*made, b"data: [DONE]\n\n"]
 
 
-def completion(content: Any = "hello", finish_reason: str = "stop", **message: Any) -> dict[str, Any]:
+def completion(
+    content: Any = "hello", finish_reason: str = "stop", **message: Any
+) -> dict[str, Any]:
     """What a decent server answers."""
-    choice = {"index": 0, "finish_reason": finish_reason, "message": {"content": content, **message}}
+    choice = {
+        "index": 0,
+        "finish_reason": finish_reason,
+        "message": {"content": content, **message},
+    }
     return {"choices": [choice], "usage": {"prompt_tokens": 12, "completion_tokens": 20}}
 
 

@@ -1,4 +1,6 @@
-"""A backend that does what its prompt says: answers, dies, fails or dawdles. Opened in a child by tests."""
+"""A backend that does what its prompt says: answers, dies, fails or dawdles.
+Opened in a child by tests.
+"""
 
 import os
 import signal

@@ -29,7 +29,9 @@ class Breakdown(AbstractEnv):
         self.road = Road(network, np_random=self.np_random)
 
         def place(kind, lane, at_m, speed):
-            vehicle = kind(self.road, network.get_lane(("a", "b", lane)).position(at_m, 0), speed=speed)
+            vehicle = kind(
+                self.road, network.get_lane(("a", "b", lane)).position(at_m, 0), speed=speed
+            )
             self.road.vehicles.append(vehicle)
             return vehicle
 

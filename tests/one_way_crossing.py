@@ -15,7 +15,16 @@ REACH_M, HALF_M = 100.0, 2.0
 def way(name, start, end, priority):
     points = np.linspace(start, end, 801)
     arc = np.linspace(0.0, 2 * REACH_M, 801)
-    return Path(name, "straight", points, arc, (), (f"street-{name}",), ((name, f"{name}-end", 0),), priority)
+    return Path(
+        name,
+        "straight",
+        points,
+        arc,
+        (),
+        (f"street-{name}",),
+        ((name, f"{name}-end", 0),),
+        priority,
+    )
 
 
 @cache
@@ -45,7 +54,9 @@ def network():
     streets = RoadNetwork()
     for path in road().paths.values():
         (start, end, _) = path.lanes[0]
-        streets.add_lane(start, end, StraightLane(path.points[0], path.points[-1], width=2 * HALF_M))
+        streets.add_lane(
+            start, end, StraightLane(path.points[0], path.points[-1], width=2 * HALF_M)
+        )
     return streets
 
 
@@ -62,7 +73,9 @@ def layout(seed, parameters):
         Spawn("v2", "car", "helper", "west", "straight", REACH_M + 12.0, 6.0),
     ]
     if danger := seed % 2:
-        spawns.append(Spawn("v3", "car", "other", "west", "straight", REACH_M - to_go_m * 10 / 14, 10.0))
+        spawns.append(
+            Spawn("v3", "car", "other", "west", "straight", REACH_M - to_go_m * 10 / 14, 10.0)
+        )
     return Layout(tuple(spawns), (), "west" if danger else None, "v3" if danger else None)
 
 

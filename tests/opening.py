@@ -5,7 +5,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "test-pictures"  # for people to look at; nothing compares them
 WIDE, NARROW = {"width": 1440, "height": 1000}, {"width": 390, "height": 844}
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+]
 # Of what may be wider than its place: whether it is, and whether it says so.
 SCROLLS = """() => [...document.querySelectorAll(".scroll")].filter((e) => e.checkVisibility()).map((e) => [
   e.ariaLabel, e.scrollWidth > e.clientWidth, getComputedStyle(e, "::before").maxHeight !== "0px"])"""

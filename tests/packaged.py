@@ -1,4 +1,6 @@
-"""Packages that add to the harness: importable for a test, and not in the developer's environment."""
+"""Packages that add to the harness:
+importable for a test, and not in the developer's environment.
+"""
 
 import subprocess
 import sys
@@ -9,7 +11,13 @@ PLUGIN = Path(__file__).with_name("plugin")
 
 def install(site: Path) -> None:
     """Put `tests/plugin` into a folder of packages, without what it requires, as pip does."""
-    options = ["--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation"]
+    options = [
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-index",
+        "--no-deps",
+        "--no-build-isolation",
+    ]
     pip = [sys.executable, "-m", "pip", "install", *options, "--target", str(site), str(PLUGIN)]
     subprocess.run(pip, check=True)
 

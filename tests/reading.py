@@ -36,7 +36,9 @@ class Page(HTMLParser):
 
 def packed(text, name):
     """What lies compressed in a page under this id."""
-    found = re.search(rf'<script type="application/gzip" id="{name}">([A-Za-z0-9+/=]+)</script>', text)
+    found = re.search(
+        rf'<script type="application/gzip" id="{name}">([A-Za-z0-9+/=]+)</script>', text
+    )
     return gzip.decompress(base64.b64decode(found[1])).decode()
 
 
@@ -50,7 +52,9 @@ def details(text):
 
 def unpacked(decisions):
     """The details of every decision of a report, before they are packed."""
-    return [d for part in decisions.parts() for block in part.details.blocks(part.ids) for d in block]
+    return [
+        d for part in decisions.parts() for block in part.details.blocks(part.ids) for d in block
+    ]
 
 
 def by_workers(runs, base, monkeypatch, counts=(1, 2)):
@@ -62,4 +66,7 @@ def by_workers(runs, base, monkeypatch, counts=(1, 2)):
         ("page.PARTS_SHARED", 2),
     ):
         monkeypatch.setattr(f"harness.report.{name}", scenes)
-    return [write_report(runs, base / f"{workers}.html", workers=workers).read_text() for workers in counts]
+    return [
+        write_report(runs, base / f"{workers}.html", workers=workers).read_text()
+        for workers in counts
+    ]

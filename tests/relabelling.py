@@ -44,7 +44,9 @@ def relabel(
     dataset: Path, seeds: dict[int, int], of_tree: Callable[[Any], None] | None = None,
     of_scenes: Callable[[Any], None] | None = None, purpose: str = "tune",
 ) -> None:  # fmt: skip
-    """Give a dataset's layouts other seeds, and change trees and scenes, as somebody who means harm would."""
+    """Give a dataset's layouts other seeds, and change trees and scenes,
+    as somebody who means harm would.
+    """
     with ZipFile(dataset / "layouts.zip") as file:
         entries = {each: file.read(each) for each in file.namelist()}
     manifest = json.loads((dataset / "manifest.json").read_text())
@@ -61,7 +63,9 @@ def relabel(
                 state = msgspec.convert(record["state"], WorldState)
                 record["scene"] = point["scene"] = scene_id(number, state)
             entries[name] = "".join(json.dumps(record) + "\n" for record in records).encode()
-        hashes = [sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))]
+        hashes = [
+            sha256_bytes(entries[f"{number:05d}/{n}.jsonl"]) for n in range(len(tree["levels"]))
+        ]
         tree["scenes_sha256"] = hashes
         if of_tree:
             of_tree(tree)

@@ -1,4 +1,6 @@
-"""Runs on disk: one made up, and any run changed by hand. All are written by the harness's one writer."""
+"""Runs on disk: one made up, and any run changed by hand.
+All are written by the harness's one writer.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
@@ -50,7 +52,8 @@ def made_up(
     helpers: int = 3,
     **stated: Any,
 ) -> Path:
-    """A run in which everybody is sure of IDLE, which is safe, and every ego asks under V2V and hears all.
+    """A run in which everybody is sure of IDLE, which is safe,
+    and every ego asks under V2V and hears all.
 
     Args:
         out: its folder.
@@ -115,7 +118,9 @@ def damage(
     episode: Change = lambda row: None,
     answer: Change = lambda row: None,
 ) -> None:
-    """Change each row of a run's tables, and nothing that follows from them; it need not be possible."""
+    """Change each row of a run's tables, and nothing that follows from them;
+    it need not be possible.
+    """
     read, rows, ends, said = _rows(run, decision, episode, answer)
     decisions = _decisions(rows, read.actions, read.decisions.helpers)
     lines = writer.lines(_all(said, Answer))
@@ -141,7 +146,9 @@ def configure(run: Path, **values: object) -> None:
 
 
 def restated(manifest: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
-    """What run.json says, changed; without the table of settings, which would have to say the same."""
+    """What run.json says, changed; without the table of settings,
+    which would have to say the same.
+    """
     return {**{name: value for name, value in manifest.items() if name != "settings"}, **changes}
 
 
@@ -173,10 +180,13 @@ def _write(
 
 
 def _settle(rows: Sequence[Row], ends: Sequence[Row]) -> None:
-    """Let the last decision of each episode leave what became of it, where frozen scenes say what is left."""
+    """Let the last decision of each episode leave what became of it,
+    where frozen scenes say what is left.
+    """
     success = {(end["condition"], end["seed"], end["episode"]): end["success"] for end in ends}
     last = {
-        (row["condition"], row["seed"], row["episode"]): row for row in sorted(rows, key=itemgetter("step"))
+        (row["condition"], row["seed"], row["episode"]): row
+        for row in sorted(rows, key=itemgetter("step"))
     }
     for key, row in last.items():
         if row.get(f"safe_{row['action']}") is not None:
@@ -184,7 +194,9 @@ def _settle(rows: Sequence[Row], ends: Sequence[Row]) -> None:
 
 
 def _decisions(rows: Sequence[Row], actions: Sequence[str], helpers: int) -> Decisions:
-    return Decisions(pa.Table.from_pylist(list(rows), schema(actions, helpers)), tuple(actions), helpers)
+    return Decisions(
+        pa.Table.from_pylist(list(rows), schema(actions, helpers)), tuple(actions), helpers
+    )
 
 
 def _all(rows: Sequence[Row], kind: Any) -> Any:
@@ -218,7 +230,13 @@ def _decision(
         row |= {f"safe_{action}": action == "IDLE" for action in ACTIONS}
         row |= {f"delay_s_{action}": 0.0 if action == "IDLE" else None for action in ACTIONS}
     for place, viewer in enumerate(viewers[1:], 1):
-        sent = {"helper": viewer, "delivered": True, "on_time": True, "arrival_ms": 60.0, "weight": share}
+        sent = {
+            "helper": viewer,
+            "delivered": True,
+            "on_time": True,
+            "arrival_ms": 60.0,
+            "weight": share,
+        }
         row |= {f"{name}_{place}": value if asks else None for name, value in sent.items()}
     return row
 
@@ -226,7 +244,9 @@ def _decision(
 def _answer(scene: str, viewer: str) -> Row:
     helper = viewer != "v1"
     return {
-        "scene": scene, "viewer": viewer, "role": "helper" if helper else "ego", "raw": '{"sure": "IDLE"}',
+        "scene": scene, "viewer": viewer, "role": "helper" if helper else "ego", "raw": 
+            '{"sure": '
+            '"IDLE"}',
         "finish_reason": "stop", "error": None, "prompt_tokens": None, "completion_tokens": None,
         "seconds": None, "batch_size": 1, "label_mass": None, "retries": 0, "cached": False, "slow_s": 0.0,
         "prompt_sha256": "0" * 64, "status": "strict", "verdict": "strict", "repairs": (),

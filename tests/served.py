@@ -1,4 +1,5 @@
-"""A server in a process of its own: `python served.py [ANSWERS]` dies when it is asked for one more.
+"""A server in a process of its own: `python served.py [ANSWERS]` dies when it is asked for one
+more.
 
 It prints its base URL. What it answers depends on the question alone.
 """
@@ -20,7 +21,9 @@ from misbehaving import Asked, completion, serving
 def answer(asked: Asked) -> None:
     digest = hashlib.sha256(json.dumps(asked.body).encode()).digest()
     shares = [1 + byte for byte in digest[:3]]
-    p = dict(zip(("SLOWER", "IDLE", "FASTER"), (share / sum(shares) for share in shares), strict=True))
+    p = dict(
+        zip(("SLOWER", "IDLE", "FASTER"), (share / sum(shares) for share in shares), strict=True)
+    )
     helper = {"evidence": "", "risk": "low"} if "evidence" in json.dumps(asked.body) else {}
     time.sleep(0.002)
     asked.reply(completion(json.dumps({**helper, "action_distribution": p})))
@@ -48,7 +51,10 @@ def llama_cpp_server(gguf: Path, log: Path, **more: str) -> Iterator[str]:
                "verbose": "false", **more}  # fmt: skip
     command = [sys.executable, "-m", "llama_cpp.server"]
     command += [part for name, value in options.items() for part in (f"--{name}", value)]
-    with log.open("w") as file, subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as server:
+    with (
+        log.open("w") as file,
+        subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as server,
+    ):
         try:
             until_s = time.monotonic() + 120
             while server.poll() is None and time.monotonic() < until_s:

@@ -62,7 +62,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(200, json.dumps(told).encode(), {}, body)
         elif path.startswith(f"{name}/tree/"):
             entries = [
-                {"type": "file", "path": f, "size": len(d or b""), "oid": _oid(d)} for f, d in files.items()
+                {"type": "file", "path": f, "size": len(d or b""), "oid": _oid(d)}
+                for f, d in files.items()
             ]
             self._send(200, json.dumps(entries).encode(), {}, body)
         else:
@@ -72,10 +73,15 @@ class _Handler(BaseHTTPRequestHandler):
                 return
             if body:
                 self.server.asked.append(file)
-            commit = revision if len(revision) == len(COMMIT) else COMMIT  # it has every commit, all alike
-            self._send(200, files[file], {"ETag": f'"{_oid(files[file])}"', "X-Repo-Commit": commit}, body)
+            # it has every commit, all alike
+            commit = revision if len(revision) == len(COMMIT) else COMMIT
+            self._send(
+                200, files[file], {"ETag": f'"{_oid(files[file])}"', "X-Repo-Commit": commit}, body
+            )
 
-    def _send(self, status: int, data: bytes | None, headers: Mapping[str, str], body: bool) -> None:
+    def _send(
+        self, status: int, data: bytes | None, headers: Mapping[str, str], body: bool
+    ) -> None:
         self.send_response(status)
         for key, value in {"Content-Type": "application/json", **headers}.items():
             self.send_header(key, value)

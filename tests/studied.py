@@ -109,7 +109,9 @@ TRIALS = {  # of the core; of an extension, `tests/extensions/NAME/trials.py` ha
         "--attacks liar,liar+spoof --rules median,trust --share 1/3 --seeds 7:8",
         "run/trust holds another trust, with other seeds; name another folder",
         {
-            "--prompt v4": "give either RUN, the folder of a finished run, or --model, with its --prompt",
+            "--prompt v4": 
+                "give either RUN, the folder of a finished "
+                "run, or --model, with its --prompt",
             "--share 0,2": "--share 0,2: give shares from 0 to 1",
             "--attacks liar,lair": "unknown --attacks 'lair'",
         },
@@ -123,19 +125,29 @@ TRIALS = {  # of the core; of an extension, `tests/extensions/NAME/trials.py` ha
             "--budget 0": "--budget 0: give a share above 0, 1 at most",
             "--condition single-local": "has no channel",
             "--latency mine": "unknown --latency 'mine'",
-            "--tune run --tune run": "--tune: 2 given for 1 runs; give one for each, in order, or none",
+            "--tune run --tune run": 
+                "--tune: 2 given for 1 runs; give one "
+                "for each, in order, or none",
             "--tune run": "and numbers are reported of that; build one of other seeds",
         },
         "it is a bound and no schedule", out="", folder="run/schedules", beside=ASKED,
     ),
     "repeats": Trial(
-        "eval --dataset data --model swarm-tiny --no-cache", f"--repeats 3 --temperature 0.7 {BOTH}",
-        "--repeats 3 --temperature 0.8", "--out out already holds finished repeats; choose another folder",
+        "eval --dataset data --model "
+        "swarm-tiny --no-cache", f"--repeats 3 --temperature 0.7 {BOTH}",
+        "--repeats 3 --temperature 0.8", 
+            "--out out already holds finished "
+            "repeats; choose another folder",
         {
-            "--repeats 3": "--repeats 3: greedy answers are the same every time; give a --temperature above",
+            "--repeats 3": 
+                "--repeats 3: greedy answers are the same "
+                "every time; give a --temperature above",
             "--repeats 1 --temperature 1": "--repeats 1 is out of range; give 2 to 100",
-            "--repeats 3 --temperature 3": "--temperature 3: give 0, which takes the likeliest token",
-            "--repeats 3 --temperature 1 --latency measured": "--latency measured: it needs an idle",
+            "--repeats 3 --temperature 3": 
+                "--temperature 3: give 0, which "
+                "takes the likeliest token",
+            "--repeats 3 --temperature "
+            "1 --latency measured": "--latency measured: it needs an idle",
             "--repeats 3 --temperature 1 --answer readout": "a readout is a distribution already",
             "--repeats 3 --temperature 1 --model proxy": "proxy has nothing to sample; leave it",
             "--repeats 3 --temperature 1 --workers 2":
@@ -192,7 +204,11 @@ class Writes:
             path, counts = args[0], True
         else:
             return
-        if counts and isinstance(path, str | Path) and os.path.abspath(path).startswith(self._below):
+        if (
+            counts
+            and isinstance(path, str | Path)
+            and os.path.abspath(path).startswith(self._below)
+        ):
             self.count += 1
             if self.count == self._last:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -247,7 +263,9 @@ def digests(here: Path) -> dict[str, str]:
 
 @contextmanager
 def stands_still() -> Iterator[None]:
-    """What runs state about themselves is the same each time, and they are made in many small parts."""
+    """What runs state about themselves is the same each time,
+    and they are made in many small parts.
+    """
     backend = registry.open_backend
 
     def opens(card: Card, **options: Any) -> Any:
@@ -258,9 +276,11 @@ def stands_still() -> Iterator[None]:
         patch.setattr(lifecycle, "datetime", Then)
         patch.setattr(repeats, "open_backend", opens)
         patch.setattr(registry, "open_backend", opens)
-        patch.setattr(rebuilt, "differences", lambda dataset: iter(()))  # which takes seconds each time
+        # which takes seconds each time
+        patch.setattr(rebuilt, "differences", lambda dataset: iter(()))
         patch.setattr(rebuilt, "_reported", lambda scenario: iter(()))
-        patch.setattr(pictures, "FORMATS", ("svg",))  # the pictures of a study take longer than all else
+        # the pictures of a study take longer than all else
+        patch.setattr(pictures, "FORMATS", ("svg",))
         yield
 
 

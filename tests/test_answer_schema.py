@@ -19,12 +19,15 @@ def fits(role: str, answer: Any) -> bool:
 
 @pytest.mark.parametrize("role", ["ego", "helper"])
 def test_the_schema_is_one_of_draft_2020_12(role: str) -> None:
-    jsonschema.Draft202012Validator.check_schema(answer_schema(role, ACTIONS, "occluded-intersection"))
+    jsonschema.Draft202012Validator.check_schema(
+        answer_schema(role, ACTIONS, "occluded-intersection")
+    )
 
 
 def test_the_title_names_role_and_scenario() -> None:
     assert (
-        answer_schema("ego", ACTIONS, "occluded-intersection")["title"] == "ego answer, occluded-intersection"
+        answer_schema("ego", ACTIONS, "occluded-intersection")["title"]
+        == "ego answer, occluded-intersection"
     )
 
 

@@ -11,7 +11,10 @@ from harness.runs.answers import Answers
 from harness.runs.records import Answer
 
 ANSWER = Answer(
-    scene="", viewer="", role="ego", raw="I would wait.", finish_reason="stop", error=None, prompt_tokens=1,
+    scene="", viewer="", role="ego", raw=
+        "I "
+        "would "
+        "wait.", finish_reason="stop", error=None, prompt_tokens=1,
     completion_tokens=None, seconds=None, batch_size=1, label_mass=None, retries=0, cached=False, slow_s=0.0,
     prompt_sha256="", status="strict", verdict="strict", repairs=(), intent=(0.2, 0.3, 0.5), mass=1.0,
     message=None, detail="",
@@ -36,7 +39,8 @@ def test_they_are_read_in_order_and_by_scene(made: list[Answer], between: bytes)
     assert len(answers) == len(made)
     assert [*answers] == [*answers] == made
     by_scene = {
-        scene: [a for a in made if a.scene == scene] for scene in dict.fromkeys(a.scene for a in made)
+        scene: [a for a in made if a.scene == scene]
+        for scene in dict.fromkeys(a.scene for a in made)
     }
     assert dict(answers.by_scene) == by_scene
     assert [*answers.by_scene] == [*by_scene], "in the order of the file"
@@ -67,7 +71,9 @@ def test_an_intent_that_is_no_distribution_is_refused(intent: tuple[float, ...])
 
 METRES = st.floats(-1e6, 1e6) | st.sampled_from([-0.0, -0.04, 0.05, 0.25, 12.35])
 SHARES = st.floats(0.0, 1.0) | st.sampled_from([0.005, 0.045, 0.1, 0.125, 0.995])
-SAYS = st.fixed_dictionaries({"evidence": st.none() | NAMES, "risk": st.none() | NAMES, "confidence": SHARES})
+SAYS = st.fixed_dictionaries(
+    {"evidence": st.none() | NAMES, "risk": st.none() | NAMES, "confidence": SHARES}
+)
 
 
 @given(METRES, METRES, st.none() | st.tuples(SHARES, SHARES, SHARES), st.none() | SAYS, NAMES)

@@ -43,7 +43,8 @@ def test_there_are_few_names_and_importing_loads_nothing_else() -> None:
     code = "import sys, harness; assert not {'numpy', 'pandas', 'msgspec'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
     with pytest.raises(
-        AttributeError, match="no attribute 'evaluation'; it has Extension, Setting, UserError, compare"
+        AttributeError,
+        match="no attribute 'evaluation'; it has Extension, Setting, UserError, compare",
     ):
         _ = harness.evaluation
 
@@ -100,7 +101,10 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
     row: Any = table.loc[("6g", "success_rate")]
     assert row.b - row.a == pytest.approx(row.difference)
     assert row.low <= row.difference <= row.high
-    assert [sentence.partition(":")[0] for sentence in difference.findings] == ["single-local", "6g"]
+    assert [sentence.partition(":")[0] for sentence in difference.findings] == [
+        "single-local",
+        "6g",
+    ]
     page = difference._repr_html_()
     assert all(sentence.replace("'", "&#39;") in page for sentence in difference.findings)
     shown = repr(difference)
@@ -166,7 +170,9 @@ def test_a_run_is_evaluated_with_the_command_lines_names(small_path: Path, tmp_p
         out=tmp_path / "driven", quiet=True,
     )  # fmt: skip
     assert driven.config["world"]["scenario"]["name"] == "hard-brake-ahead"
-    with pytest.raises(harness.UserError, match="unknown setting 'dataest'; did you mean 'dataset'"):
+    with pytest.raises(
+        harness.UserError, match="unknown setting 'dataest'; did you mean 'dataset'"
+    ):
         harness.run(dataest="x")
     with pytest.raises(harness.UserError, match="unknown setting 'dataset'"):
         harness.run(scenario="blind-merge", dataset="x")

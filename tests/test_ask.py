@@ -1,4 +1,6 @@
-"""Asking only the helpers whose answers are used: the same decisions as asking all, with fewer questions."""
+"""Asking only the helpers whose answers are used:
+the same decisions as asking all, with fewer questions.
+"""
 
 import shutil
 from pathlib import Path
@@ -29,8 +31,8 @@ from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.trust import run_bench
 
-# Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what helpers
-# intended before; and some hear other helpers, or blind ones.
+# Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what
+# helpers intended before; and some hear other helpers, or blind ones.
 POINTS = (
     "single-local", "v2x", "v2x:max_helpers=1", "v2x:helper_rounds=true", "6g:schedule=deadline",
     "6g:schedule=coverage,max_helpers=1", "6g:schedule=random", "v2x:attack=stale", "v2x:attack=sybil",
@@ -46,7 +48,9 @@ def spec(source: Source, ask: str, names: tuple[str, ...] = POINTS, model: str =
 
 def frozen(episodes: int = 8) -> FrozenSource:
     selection = Selection(episodes, None, None, None, 0)
-    return FrozenSource(selection.of(load.load(load.find("occluded-intersection-v2"), episodes)), selection)
+    return FrozenSource(
+        selection.of(load.load(load.find("occluded-intersection-v2"), episodes)), selection
+    )
 
 
 def tables(folder: Path) -> list[bytes]:
@@ -58,7 +62,9 @@ def n_answers(folder: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [frozen(2), LiveSource(1_000_000, 1)], ids=["frozen", "closed loop"])
+@pytest.mark.parametrize(
+    "source", [frozen(2), LiveSource(1_000_000, 1)], ids=["frozen", "closed loop"]
+)
 def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
     names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
     for ask in ("all", "used"):
@@ -78,7 +84,12 @@ def test_workers_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(run, "EPISODES_AT_ONCE", 2)
     source = LiveSource(1_000_000, 4)
     for workers in (1, 2):
-        evaluate(spec(source, "used", ("v2x",)), tmp_path / str(workers), lambda done: None, workers=workers)
+        evaluate(
+            spec(source, "used", ("v2x",)),
+            tmp_path / str(workers),
+            lambda done: None,
+            workers=workers,
+        )
     names = [*TABLES, "answers.jsonl"]
     one, two = ([(tmp_path / w / name).read_bytes() for name in names] for w in "12")
     assert one == two
@@ -115,7 +126,9 @@ def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None
     evaluate(wanted, tmp_path / "stopped", lambda done: None, opens=opening("resumed", -1))
     assert batches["stopped"] + batches["resumed"] == batches["whole"]
     for name in (*TABLES, "answers.jsonl"):
-        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+        assert (tmp_path / "stopped" / name).read_bytes() == (
+            tmp_path / "whole" / name
+        ).read_bytes()
 
 
 @pytest.mark.parametrize("ask", ["all", "used"])
@@ -125,7 +138,9 @@ def test_the_command_that_repeats_a_run_asks_alike(ask: str) -> None:
     assert "--ask used" not in typed  # the default
 
 
-STUDIED = [Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats=0.2", "6g:attack=stale")]
+STUDIED = [
+    Setting(name, named_point(name), 4) for name in ("v2x", "v2x:tau_nats=0.2", "6g:attack=stale")
+]
 
 
 @pytest.mark.slow
@@ -144,7 +159,9 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
             for name, values in getattr(one, of).items():
                 np.testing.assert_array_equal(values, getattr(other, of)[name])
     assert sum(watched["used"].asked) > sum(watched["all"].asked) > 0
-    with pytest.raises(UserError, match=r"--no-model: .* did not ask; leave it out, .* --ask all$") as told:
+    with pytest.raises(
+        UserError, match=r"--no-model: .* did not ask; leave it out, .* --ask all$"
+    ) as told:
         list(ReplayedRun(tmp_path / "alone", asks=False).walked(STUDIED, (0, 1)))
     assert "\n" not in str(told.value)
     assert not (tmp_path / "alone" / replayed_run.MORE).exists()
@@ -158,7 +175,9 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     evaluate(spec(frozen(8), "all", ("single-local",)), out, lambda done: None)
     monkeypatch.setattr(replayed_run, "open_backend", None)  # nothing opens a model
     source = ReplayedRun(out, asks=False)
-    bench = run_bench(source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust", Watched())
+    bench = run_bench(
+        source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust", Watched()
+    )
     left = np.isnan(bench.at("linear", "liar", 1 / 3).success)
     assert 0 < left.sum() < left.size
     assert np.array_equal(left, np.isnan(bench.at("linear", "liar", 1 / 3).nats))
@@ -170,7 +189,9 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
 @pytest.mark.parametrize("ask", ["used", "all"])
 def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    evaluate(spec(frozen(1), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None)
+    evaluate(
+        spec(frozen(1), ask, ("single-local",), "swarm-tiny"), tmp_path / "run", lambda done: None
+    )
     watched = Watched()
     list(ReplayedRun(tmp_path / "run", progress=watched).walked(STUDIED[:1], (0,)))
     owed, text, *others = watched.events

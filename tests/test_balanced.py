@@ -1,4 +1,6 @@
-"""The price of caution: success balanced over danger and none, the four outcomes, misses and false alarms."""
+"""The price of caution: success balanced over danger and none, the four outcomes,
+misses and false alarms.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,7 +70,8 @@ def test_balanced_success_is_the_mean_of_both_halves_with_their_intervals(tmp_pa
     assert (both.value, both.low, both.high) == (mean.value, mean.low, mean.high)
     assert both.value == pytest.approx((1 / 3 + 4 / 5) / 2)
     assert (both.n, both.n_excluded, both.interval) == (8, 0, "episodes")
-    assert [s.n for s in done.scores if (s.condition, s.metric) == ("6g", BALANCED)] == [2, 8]  # seeds first
+    # seeds first
+    assert [s.n for s in done.scores if (s.condition, s.metric) == ("6g", BALANCED)] == [2, 8]
     plain = done.score("6g", "success_rate")
     assert plain is not None
     assert plain.value == 5 / 8
@@ -83,7 +86,9 @@ def test_the_gain_is_paired_by_episode_in_either_half(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("danger", ["none", "left"])
-def test_without_episodes_of_both_kinds_nothing_is_said_by_danger(tmp_path: Path, danger: str) -> None:
+def test_without_episodes_of_both_kinds_nothing_is_said_by_danger(
+    tmp_path: Path, danger: str
+) -> None:
     """Environments know no dangers: all of their episodes are without one."""
     done = read(made_up(tmp_path / "run", episode=lambda row: row.update(danger=danger)))
     assert BY_DANGER.isdisjoint({s.metric for s in done.scores})
@@ -108,7 +113,10 @@ def test_what_counts_by_single_episodes_is_what_a_summary_states(tmp_path: Path)
     done = made(tmp_path / "run", 0, 1, 7)
     how = Success.of(done.episodes[:8], lead_of(done))
     alone, best = of_ends(METRICS[SUCCESS], done.grid, done.episodes)
-    for e, metric in ((how.estimate(best), BALANCED), (how.difference(best, alone), GAINS[BALANCED])):
+    for e, metric in (
+        (how.estimate(best), BALANCED),
+        (how.difference(best, alone), GAINS[BALANCED]),
+    ):
         stated = done.score("6g", metric)
         assert stated is not None
         assert (e.value, e.low, e.high, e.n) == (stated.value, stated.low, stated.high, stated.n)
@@ -124,7 +132,9 @@ def test_what_counts_by_single_episodes_is_what_a_summary_states(tmp_path: Path)
 
 
 def test_the_best_of_several_runs_has_the_most_balanced_success(tmp_path: Path) -> None:
-    """One loses all 8 dangers and the other 10 of 32 harmless ones: by plain success 80 and 75 %."""
+    """One loses all 8 dangers and the other 10 of 32 harmless ones:
+    by plain success 80 and 75 %.
+    """
 
     def change(*lost: int) -> Callable[[Row], None]:
         def end(row: Row) -> None:
@@ -143,7 +153,9 @@ def test_the_best_of_several_runs_has_the_most_balanced_success(tmp_path: Path) 
     assert headline(found).startswith("Best by balanced success under ")
     [worse] = [line.behind for line in found if line.behind and line.condition == "6g"]
     assert worse.change.value == pytest.approx(1 / 2 - 27 / 32)
-    assert [listed.success for listed in runs(tmp_path) if listed.name == "fair"] == [pytest.approx(27 / 32)]
+    assert [listed.success for listed in runs(tmp_path) if listed.name == "fair"] == [
+        pytest.approx(27 / 32)
+    ]
 
 
 def test_who_is_stuck_is_unsafe_in_older_runs_only(tmp_path: Path) -> None:
@@ -205,13 +217,19 @@ def test_the_headline_has_what_cooperation_does_where_there_is_a_danger_and_wher
 
     done = read(made_up(tmp_path / "run", episode=end, episodes=40))
     pairs = plays([done], BALANCED).pairs("6g", "single-local")
-    danger, price = (shown(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False))
+    danger, price = (
+        shown(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False)
+    )
     assert danger.startswith("+60.0 [")
     assert price.startswith("-10.0 [")
     said = of_one(done)
     assert (
-        f"succeeds in 60.0 % of the layouts with a danger, {danger} points against single-local, and" in said
+        f"succeeds in 60.0 % of the layouts with a danger, {danger} points against single-local, "
+        f"and" in said
     )
-    assert f"and in 90.0 % of those without, {price} points; the mean of both is 75.0 %, +25.0 [" in said
+    assert (
+        f"and in 90.0 % of those without, {price} points; the mean of both is 75.0 %, +25.0 ["
+        in said
+    )
     assert said.endswith("points, a clear difference.")
     assert "With a danger, success" not in " ".join(saturated(done))

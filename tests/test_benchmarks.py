@@ -20,7 +20,8 @@ import rows  # noqa: E402
 import table  # noqa: E402
 
 SCRIPTS = table.scripts()
-# What the documents have somebody type is theirs; each line of what a benchmark prints last is one of JSON.
+# What the documents have somebody type is theirs; each line of what a benchmark prints last is one
+# of JSON.
 pytestmark = pytest.mark.filterwarnings("default")
 
 
@@ -56,7 +57,9 @@ def test_a_benchmark_runs_at_its_smallest(
 
 def test_the_page_names_every_benchmark() -> None:
     page = (BENCHMARKS / "README.md").read_text("utf-8")
-    assert set(re.findall(r"python benchmarks/(\w+)\.py", page)) == {script.stem for script in SCRIPTS}
+    assert set(re.findall(r"python benchmarks/(\w+)\.py", page)) == {
+        script.stem for script in SCRIPTS
+    }
 
 
 @pytest.mark.slow

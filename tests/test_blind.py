@@ -76,12 +76,15 @@ def test_a_prior_keeps_its_gain_and_perception_loses_it(
 ) -> None:
     """Whoever does not brake at the first step collides; the ego alone keeps its speed.
 
-    Three helpers that are sure of SLOWER turn it. A prior says the same with nothing to see, so its gain
-    stays under `blind` and is gone with no messages; helpers that judge by what they see lose it under both.
+    Three helpers that are sure of SLOWER turn it. A prior says the same with nothing to see, so its
+    gain stays under `blind` and is gone with no messages; helpers that judge by what they see lose
+    it under both.
     """
     crash = {f"{n:05d}-0": {"IDLE": "collision", "FASTER": "collision"} for n in range(4)}
     data = course(small, 1, crash)
-    told = walked(spec_of(data, points=points(["single-local", "6g"], ["blind"]), seeds=(0,)), who({}))
+    told = walked(
+        spec_of(data, points=points(["single-local", "6g"], ["blind"]), seeds=(0,)), who({})
+    )
     assert success(told) == {"single-local": 0.0, "6g": 1.0, "6g:messages=blind": kept}
     silent = walked(spec_of(data, points=points(["6g"], ["no-messages"]), seeds=(0,)), who({}))
     assert success(silent) == {"6g": 1.0, "6g:loss=1": 0.0}
@@ -128,7 +131,9 @@ def test_each_helper_is_asked_once_where_a_blind_condition_asks(done: Evaluated)
     assert {s.metric for s in done.scores} > {"strict_rate_helper", "strict_rate_blind"}
 
 
-def test_other_conditions_are_the_same_without_it(done: Evaluated, small: Dataset, tmp_path: Path) -> None:
+def test_other_conditions_are_the_same_without_it(
+    done: Evaluated, small: Dataset, tmp_path: Path
+) -> None:
     less = tuple(point for point in CONDITIONS if not point.blind_helpers)
     without = run(spec_of(small, points=less), tmp_path / "less")
     assert not [a for a in answers_of(without.out) if a.role == "blind"]
@@ -179,7 +184,9 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
     point = CONDITIONS[2]
     assert point.blind_helpers
     blind = [Setting(point.name, point, 4)]
-    with pytest.raises(UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"):
+    with pytest.raises(
+        UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"
+    ):
         list(ReplayedRun(less, asks=False).walked(blind, (0, 1)))
     watched = Watched()
     [[more]] = ReplayedRun(less, progress=watched).walked(blind, (0, 1))
@@ -242,9 +249,9 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
     replayed = spec_of(small, f"replay:{done.out}", points=both)
     assert same_decisions(run(replayed, tmp_path / "replay").out, done.out)
     details = unpacked(Decisions(gather([done.out])))
-    assert all(answer["prompt"] is not None for d in details for answer in d["runs"][0]["answers"]), (
-        "each as it was sent"
-    )
+    assert all(
+        answer["prompt"] is not None for d in details for answer in d["runs"][0]["answers"]
+    ), "each as it was sent"
 
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:

@@ -47,7 +47,9 @@ def refused(run: Path, file: str) -> str:
 
 
 @pytest.mark.parametrize("file", READERS)
-@pytest.mark.parametrize("data", [b"", b"\xff\xfe\x00", b"{", b"[" * 100_000, b'a\n1,2,3\n"', b"PAR1PAR1"])
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xfe\x00", b"{", b"[" * 100_000, b'a\n1,2,3\n"', b"PAR1PAR1"]
+)
 def test_no_bytes_are_taken_for_a_file(file: str, data: bytes, run: Path) -> None:
     if file != "answers.jsonl" or data:  # a replay may have none
         (run / file).write_bytes(data)
@@ -139,7 +141,9 @@ def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, ru
         (lambda text: text.replace("failure", "fail"), "it lacks failure"),
     ],
 )
-def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str, run: Path) -> None:
+def test_wrong_episodes_say_what_is_wrong(
+    wrong: Callable[[str], str], said: str, run: Path
+) -> None:
     file = run / "episodes.csv"
     file.write_text(wrong(file.read_text()))
     assert said in refused(run, "episodes.csv")
@@ -152,8 +156,13 @@ def test_wrong_episodes_say_what_is_wrong(wrong: Callable[[str], str], said: str
         {"actions": []}, {"conditions": []}, {"conditions": [{}]}, {"model": {}},
         {"prompt": {"version": "v2"}}, {"conditions": [{"name": "a", "profile": 3}]},
         {"model": {"name": 3, "engine": "x"}}, {"model": {"name": " ", "engine": "x"}},
-        {"model": {"name": "m" * 301, "engine": "x"}}, {"model": {"name": "m · v2 · json", "engine": "x"}},
-        {"prompt": {"version": "", "sha256": "x"}}, {"prompt": {"version": "v2 · json", "sha256": "x"}},
+        {"model": {"name": "m" * 301, "engine": "x"}}, {"model": {"name": 
+            "m · v2 "
+            "· json", "engine": "x"}},
+        {"prompt": {"version": "", "sha256": "x"}}, {"prompt": {"version": 
+            "v2 "
+            "· "
+            "json", "sha256": "x"}},
     ],
 )  # fmt: skip
 def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) -> None:
@@ -169,20 +178,31 @@ def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) 
         ({"prompt": "v9\x1b"}, "its settings have prompt v9\\x1b, and beside them it is v2"),
         ({"seeds": "3,7"}, "its settings have seeds 3,7, and beside them it is"),
         ({"condition": []}, "its settings have condition [], and beside them it is"),
-        ({"world": {"kind": "closed-loop"}}, "its settings have world.kind closed-loop, and beside them it"),
+        (
+            {"world": {"kind": "closed-loop"}},
+            "its settings have world.kind closed-loop, and beside them it",
+        ),
         ({"batch_size": "many"}, "its settings have batch_size many, and beside them it is 8"),
         ({"server": 3}, "settings.server"),
         ({"model": "qwen3-4b"}, "its settings have model qwen3-4b, and beside them it is made-up"),
-        ({"model": "models/prox.gguf"}, "its settings have model models/prox.gguf, and beside them"),
+        (
+            {"model": "models/prox.gguf"},
+            "its settings have model models/prox.gguf, and beside them",
+        ),
         ({"model": 3}, "its settings have model 3, and beside them it is made-up"),
-        ({"world": {"dataset": "unsignalised"}}, "its settings have world.dataset unsignalised, and beside"),
+        (
+            {"world": {"dataset": "unsignalised"}},
+            "its settings have world.dataset unsignalised, and beside",
+        ),
     ],
 )
 def test_settings_that_say_otherwise_than_what_stands_beside_them(
     settings: dict[str, Any], said: str, run: Path
 ) -> None:
     stated = json.loads((run / "run.json").read_text())
-    (run / "run.json").write_text(json.dumps({**stated, "settings": {**stated["settings"], **settings}}))
+    (run / "run.json").write_text(
+        json.dumps({**stated, "settings": {**stated["settings"], **settings}})
+    )
     assert said in refused(run, "run.json")
 
 
@@ -215,7 +235,13 @@ WRONG = (None, -1, "x\x1b", [], {"a": 1})
 
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Where each value of a JSON text stands."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, inner in pairs:
         yield (*at, key)
         yield from places(inner, (*at, key))
@@ -265,12 +291,17 @@ def test_whatever_the_manifest_says_the_run_is_read_or_refused_in_a_line(
 def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_that_is_read_compared(
     closed_loop: bool, tmp_path: Path
 ) -> None:
-    """Every other value of a run with one condition; where it was driven, what is said of its world."""
-    run = made_up(tmp_path / "run", closed_loop=closed_loop, points=(POINTS["6g"],), episodes=1, steps=1)
+    """Every other value of a run with one condition;
+    where it was driven, what is said of its world.
+    """
+    run = made_up(
+        tmp_path / "run", closed_loop=closed_loop, points=(POINTS["6g"],), episodes=1, steps=1
+    )
     stated = json.loads((run / "run.json").read_text())
     compared = 0
     for at in [*places(stated)][:: 1 if closed_loop else 2]:
-        if at[0] == "settings" or (closed_loop and at[0] != "world"):  # the table has tests of its own
+        # the table has tests of its own
+        if at[0] == "settings" or (closed_loop and at[0] != "world"):
             continue
         fresh = True
         for changed in wrong_values(stated, at):
@@ -283,7 +314,9 @@ def test_whatever_the_manifest_says_the_run_is_refused_in_a_line_or_the_first_th
 
 @pytest.mark.parametrize("episodes", [0, 1, 3, 5, 10**9])
 @pytest.mark.parametrize("closed_loop", [False, True])
-def test_another_number_of_episodes_is_refused(closed_loop: bool, episodes: int, tmp_path: Path) -> None:
+def test_another_number_of_episodes_is_refused(
+    closed_loop: bool, episodes: int, tmp_path: Path
+) -> None:
     run = made_up(tmp_path / "run", closed_loop=closed_loop)
     world = json.loads((run / "run.json").read_text())["world"]
     configure(run, world={**world, "episodes": episodes})
@@ -294,7 +327,9 @@ def test_a_first_seed_that_is_not_the_episodes_is_refused(tmp_path: Path) -> Non
     run = made_up(tmp_path / "run", closed_loop=True)
     world = json.loads((run / "run.json").read_text())["world"]
     configure(run, world={**world, "first_seed": 7})
-    assert "a layout that is none of run.json's, whose first seed is 7" in refused(run, "episodes.csv")
+    assert "a layout that is none of run.json's, whose first seed is 7" in refused(
+        run, "episodes.csv"
+    )
 
 
 def test_a_summary_with_a_figure_twice_is_refused(run: Path) -> None:
@@ -306,7 +341,9 @@ def test_a_summary_with_a_figure_twice_is_refused(run: Path) -> None:
 @pytest.mark.parametrize("old", ["swarmdrive-run/1", "swarmdrive-drive/1"])
 def test_a_run_of_an_older_format_names_the_version_that_reads_it(old: str, run: Path) -> None:
     configure(run, format=old)
-    with pytest.raises(UserError, match=r"harness 0\.1 reads it: run again, or install that version$"):
+    with pytest.raises(
+        UserError, match=r"harness 0\.1 reads it: run again, or install that version$"
+    ):
         folder.read(run)
 
 
@@ -328,7 +365,9 @@ def test_a_manifest_that_is_no_object_is_refused(text: str, run: Path) -> None:
 @pytest.mark.parametrize("file", [name for name in READERS if name != "run.json"])
 def test_tables_raise_the_same(file: str, run: Path) -> None:
     (run / file).write_bytes(b"\xff")
-    table = {"decisions.parquet": "decisions", "answers.jsonl": "answers"}.get(file, Path(file).stem)
+    table = {"decisions.parquet": "decisions", "answers.jsonl": "answers"}.get(
+        file, Path(file).stem
+    )
     with pytest.raises(harness.UserError, match=file):
         getattr(harness.load(run), table)
 
@@ -341,12 +380,16 @@ def test_names_of_folders_are_no_columns(tmp_path: Path) -> None:
 def test_text_of_any_kind_is_read_as_it_was_written(run: Path) -> None:
     said = 'a "b",\n\r\n=1 null NaN \u202e'
     damage(run, episode=lambda row: row.update(failure=said, partner=said))
-    assert {(e.failure, e.partner, e.fault) for e in folder.read(run).episodes} == {(said, said, None)}
+    assert {(e.failure, e.partner, e.fault) for e in folder.read(run).episodes} == {
+        (said, said, None)
+    }
 
 
 def test_a_change_by_hand_is_read_again(run: Path) -> None:
     damage(
-        run, decision=lambda row: row.update(latency_ms=3.0), episode=lambda row: row.update(failure="late")
+        run,
+        decision=lambda row: row.update(latency_ms=3.0),
+        episode=lambda row: row.update(failure="late"),
     )
     read = folder.read(run)
     assert (read.decisions["latency_ms"] == 3.0).all()
@@ -364,7 +407,9 @@ def test_a_change_by_hand_is_read_again(run: Path) -> None:
         ({"on_demand": 1}, "conditions: on_demand = 1; allowed: true or false"),
     ],
 )
-def test_a_condition_of_another_type_is_named(setting: dict[str, Any], said: str, run: Path) -> None:
+def test_a_condition_of_another_type_is_named(
+    setting: dict[str, Any], said: str, run: Path
+) -> None:
     stated = json.loads((run / "run.json").read_text())
     stated["conditions"][0] |= setting
     (run / "run.json").write_text(json.dumps(stated))

@@ -1,4 +1,6 @@
-"""A model by its URL: the server is asked what it has and what it is, and is believed no further."""
+"""A model by its URL: the server is asked what it has and what it is,
+and is believed no further.
+"""
 
 import json
 import re
@@ -25,7 +27,9 @@ from harness.world import scenarios
 
 KEY = "sk-of-mine-5ecret"
 OTHERS = {
-    "llama-cpp-python": {"/openapi.json": {"info": {"title": "🦙 llama.cpp Python API", "version": "0.3"}}},
+    "llama-cpp-python": {"/openapi.json": {"info": {"title": 
+        "🦙 llama.cpp "
+        "Python API", "version": "0.3"}}},
 }  # fmt: skip
 NEEDED = ("llama_cpp", "fastapi", "starlette_context", "sse_starlette", "pydantic_settings")
 
@@ -62,7 +66,12 @@ def test_each_kind_of_server_is_told_by_what_it_alone_answers(kind: Kind) -> Non
 @pytest.mark.parametrize(
     ("kind", "path", "says", "thinking"),
     [
-        ("llama-server", "/props", {"chat_template": "{% if enable_thinking %}{% endif %}"}, "switch"),
+        (
+            "llama-server",
+            "/props",
+            {"chat_template": "{% if enable_thinking %}{% endif %}"},
+            "switch",
+        ),
         ("ollama", "/api/show", {"capabilities": ["completion", "thinking"]}, "always"),
         ("ollama", "/api/show", {"capabilities": ["completion"]}, "none"),
     ],
@@ -70,7 +79,9 @@ def test_each_kind_of_server_is_told_by_what_it_alone_answers(kind: Kind) -> Non
 def test_a_model_thinks_as_its_server_says(kind: Kind, path: str, says: Any, thinking: str) -> None:
     paths = SERVERS[kind] | {path: SERVERS[kind][path] | says}
     with serving(never, answering(paths)) as there:
-        assert cards.resolve(f"{there.url}#m" if kind == "ollama" else there.url).thinking == thinking
+        assert (
+            cards.resolve(f"{there.url}#m" if kind == "ollama" else there.url).thinking == thinking
+        )
 
 
 @pytest.mark.parametrize(("heeds", "thinking"), [(True, "switch"), (False, "none")])
@@ -134,11 +145,15 @@ def endless(asked: Asked) -> None:
 @pytest.mark.parametrize(
     ("play", "error", "words"),
     [
-        (refusing(401), Unanswered, r"refuses the key \(HTTP 401: no, \[key\] is wrong\); set OPENAI"),
+        (refusing(401), Unanswered, 
+            r"refuses the key \(HTTP 401: no, "
+            r"\[key\] is wrong\); set OPENAI"),
         (refusing(503), Unanswered, r"no server answers at .*HTTP 503"),
         (endless, Unanswered, r"no server answers at .* \(no whole answer within 0.3 s\)"),
         (lambda asked: asked.reply(b" " * (http.MOST_BYTES + 1)), UserError, "longer than"),
-        (lambda asked: asked.reply(b'{"data": ' + b"[" * 10**5), UserError, "the answer is no JSON"),
+        (lambda asked: asked.reply(b'{"data": ' + b"[" * 10**5), UserError, 
+            "the answer "
+            "is no JSON"),
         (lambda asked: asked.reply({"data": {"id": "m"}}), UserError, "lists no model"),
     ],
 )  # fmt: skip
@@ -182,7 +197,8 @@ def test_an_address_without_a_scheme_is_told_the_url_that_it_means(typed: str, m
 
 
 @pytest.mark.parametrize(
-    "typed", ["me:hunter22@127.0.0.1:80/v1", "127.0.0.1:80/v1?key=hunter22", "127.0.0.1:80/v1#hunter22"]
+    "typed",
+    ["me:hunter22@127.0.0.1:80/v1", "127.0.0.1:80/v1?key=hunter22", "127.0.0.1:80/v1#hunter22"],
 )
 def test_an_address_with_a_secret_is_not_shown_with_a_scheme(typed: str) -> None:
     with pytest.raises(ValueError, match="give one such as http") as raised:
@@ -193,7 +209,9 @@ def test_an_address_with_a_secret_is_not_shown_with_a_scheme(typed: str) -> None
     assert "give http://" not in str(refused.value)
 
 
-def test_a_name_that_is_no_address_is_told_the_models(harness: Callable[..., tuple[int, str, str]]) -> None:
+def test_a_name_that_is_no_address_is_told_the_models(
+    harness: Callable[..., tuple[int, str, str]],
+) -> None:
     assert "did you mean 'qwen3-4b'?" in harness("eval", "--model", "qwen3:4b")[2]
     assert "no hub id; give an existing path" in harness("eval", "--model", "not/there/at:all")[2]
 
@@ -202,14 +220,26 @@ def test_a_name_that_is_no_address_is_told_the_models(harness: Callable[..., tup
 def test_a_run_by_url_states_its_card_and_can_be_typed_again(
     small_path: Path, harness: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    what = ["--dataset", small_path, "--limit", "1", "--condition", "single-local", "--seeds", "0:1"]
+    what = [
+        "--dataset",
+        small_path,
+        "--limit",
+        "1",
+        "--condition",
+        "single-local",
+        "--seeds",
+        "0:1",
+    ]
     quiet = ("--no-cache", "--quiet")
     with serving(answer, listing("lab/tiny:q4")) as there:
         code, _, said = harness("eval", "--model", there.url, *what, *quiet, "--out", "one")
         assert code == 0, said
         record = json.loads(Path("one/run.json").read_text())
         assert record["model"]["server"]["base_url"] == there.url
-        assert (record["model"]["name"], record["model"]["weights"]) == ("served:lab/tiny:q4", "lab/tiny:q4")
+        assert (record["model"]["name"], record["model"]["weights"]) == (
+            "served:lab/tiny:q4",
+            "lab/tiny:q4",
+        )
         assert all(asked.headers["Authorization"] == f"Bearer {KEY}" for asked in there.asked)
         typed = shlex.split(record["command"])
         assert typed[typed.index("--model") + 1] == f"{there.url}#lab/tiny:q4"
@@ -245,7 +275,16 @@ def test_a_run_of_what_the_user_brought_runs_again_as_the_first_line_of_its_file
     Path("models").mkdir()
     Path("models/mine.toml").write_text(CARD)
     Path("swarmdrive.toml").touch()
-    what = ["--dataset", small_path, "--limit", "1", "--condition", "single-local", "--seeds", "0:1"]
+    what = [
+        "--dataset",
+        small_path,
+        "--limit",
+        "1",
+        "--condition",
+        "single-local",
+        "--seeds",
+        "0:1",
+    ]
     quiet = ("--no-cache", "--quiet")
     with serving(answer, listing("lab/tiny:q4")) as there:
         words = {
@@ -257,7 +296,9 @@ def test_a_run_of_what_the_user_brought_runs_again_as_the_first_line_of_its_file
         first = Path("one/run.toml").read_text().partition("\n")[0]
         asked = len(there.asked)
         code, _, refused = harness("eval", "one/run.toml", *quiet, "--out", "two")
-        assert (code, refused.count("\n"), len(there.asked)) == (2, 1, asked), "a file alone asks nobody"
+        assert (code, refused.count("\n"), len(there.asked)) == (2, 1, asked), (
+            "a file alone asks nobody"
+        )
         _, command, _ = first.split("`")
         assert command.startswith("harness eval run.toml --")
         assert f"`{command.replace('run.toml', 'one/run.toml')}`" in refused
@@ -282,16 +323,30 @@ def wavering(asked: Asked) -> None:
     [(chatting, "v2", "v10"), (chatting, "v10", "VERSION"), (wavering, "v2", None)],
 )
 def test_a_model_whose_first_answers_cannot_be_read_is_told_at_once_and_goes_on(
-    play: Play, prompt: str, tries: str | None, small_path: Path, harness: Callable[..., tuple[int, str, str]]
+    play: Play,
+    prompt: str,
+    tries: str | None,
+    small_path: Path,
+    harness: Callable[..., tuple[int, str, str]],
 ) -> None:
-    what = ["--dataset", small_path, "--condition", "single-local", "--seeds", "0:1", "--prompt", prompt]
+    what = [
+        "--dataset",
+        small_path,
+        "--condition",
+        "single-local",
+        "--seeds",
+        "0:1",
+        "--prompt",
+        prompt,
+    ]
     with serving(play, listing("lab/tiny:q4")) as there:
         typed = ("--model", there.url, *what, "--no-cache", "--quiet", "--out", "run")
         code, _, said = harness("eval", *typed)
     assert (code, Path("run/report.html").is_file()) == (0, True)
     command = f"harness prompt check {tries} --model '{there.url}#lab/tiny:q4'"
     assert said == (
-        f"harness: none of the first answers of served:lab/tiny:q4 to prompt {prompt} could be read, and "
+        f"harness: none of the first answers of served:lab/tiny:q4 to prompt {prompt} could be "
+        "read, and "
         f"the run goes on; try another: `{command}`; `harness prompt list` shows all\n"
         if tries else ""
     )  # fmt: skip
@@ -300,11 +355,16 @@ def test_a_model_whose_first_answers_cannot_be_read_is_told_at_once_and_goes_on(
 def test_the_prompt_that_is_to_be_tried_is_there_for_every_scenario() -> None:
     prompt = prompts.load(WITH_EXAMPLES)
     assert prompt.released
-    assert all(prompts.unfit(prompt, scenario) is None for scenario in map(scenarios.get, scenarios.names()))
+    assert all(
+        prompts.unfit(prompt, scenario) is None
+        for scenario in map(scenarios.get, scenarios.names())
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(any(find_spec(name) is None for name in NEEDED), reason=f"needs {', '.join(NEEDED)}")
+@pytest.mark.skipif(
+    any(find_spec(name) is None for name in NEEDED), reason=f"needs {', '.join(NEEDED)}"
+)
 def test_a_real_server_is_known_and_evaluated_by_its_url(
     small_path: Path, harness: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:

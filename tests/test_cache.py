@@ -1,4 +1,6 @@
-"""The completion cache: what is asked again and what is not, and that nothing depends on the file."""
+"""The completion cache: what is asked again and what is not,
+and that nothing depends on the file.
+"""
 
 import json
 import multiprocessing
@@ -100,7 +102,8 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "cache" / "completions.sqlite"
 
 
-# -- what is in the key -------------------------------------------------------------------------------------
+# -- what is in the key
+# -------------------------------------------------------------------------------------
 
 
 def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None:
@@ -114,7 +117,9 @@ def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None
 
 
 @pytest.mark.parametrize("name", sorted(set(CHANGED) - set(READ_BY_NO_MODEL)))
-def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str, file: Path) -> None:
+def test_a_question_that_differs_in_anything_the_model_reads_is_asked(
+    name: str, file: Path
+) -> None:
     talker = Talker()
     Cached(talker, file).complete([BASE])
     [again] = Cached(talker, file).complete([BASE])
@@ -122,7 +127,9 @@ def test_a_question_that_differs_in_anything_the_model_reads_is_asked(name: str,
     assert (again.cached, other.cached, len(talker.asked)) == (True, False, 2)
 
 
-def test_the_same_question_from_another_place_of_a_run_is_answered_under_its_own_id(file: Path) -> None:
+def test_the_same_question_from_another_place_of_a_run_is_answered_under_its_own_id(
+    file: Path,
+) -> None:
     talker = Talker()
     Cached(talker, file).complete([BASE])
     [again] = Cached(talker, file).complete([replace(BASE, id="00007-3/v1")])
@@ -146,12 +153,14 @@ def test_another_model_in_any_respect_is_asked(tmp_path: Path) -> None:
     assert key(identity, "prompt, as another template writes it", BASE) != base
 
 
-# -- what comes out -----------------------------------------------------------------------------------------
+# -- what comes out
+# -----------------------------------------------------------------------------------------
 
 
 def test_what_was_answered_is_not_asked_again_and_the_order_holds(file: Path) -> None:
     asked = [
-        replace(BASE, id=f"s{i}/v1", messages=({"role": "user", "content": f"Scene {i}"},)) for i in range(6)
+        replace(BASE, id=f"s{i}/v1", messages=({"role": "user", "content": f"Scene {i}"},))
+        for i in range(6)
     ]
     lines = {f"s{i}/v1": f"answer {i}" for i in range(6)}
     first = Talker(dict(lines))
@@ -165,7 +174,9 @@ def test_what_was_answered_is_not_asked_again_and_the_order_holds(file: Path) ->
 
 def test_an_answer_from_the_cache_has_all_but_its_times(file: Path) -> None:
     times: Any = {"seconds": 0.7, "first_token_s": 0.3, "token_s": 0.1}
-    said = Completion(BASE.id, "x", 12, 5, "length", batch_size=1, label_mass=0.5, retries=2, **times)
+    said = Completion(
+        BASE.id, "x", 12, 5, "length", batch_size=1, label_mass=0.5, retries=2, **times
+    )
     assert Cached(Talker({BASE.id: said}), file).complete([BASE]) == [said]
     [again] = Cached(Talker(), file).complete([BASE])
     assert again == replace(said, **dict.fromkeys(times), retries=0, cached=True)
@@ -180,7 +191,9 @@ def test_errors_are_asked_again(file: Path) -> None:
 
 
 @given(text=st.text(st.characters(codec=None, exclude_categories=())))
-def test_any_text_comes_back_as_it_was_said(text: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_any_text_comes_back_as_it_was_said(
+    text: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     store = CompletionFile(tmp_path_factory.getbasetemp() / "texts.sqlite")
     name = str(hash(text))
     said = Completion("", text, None, None, "stop", None, 1)  # which holds no lone surrogate
@@ -201,7 +214,8 @@ def test_neither_prompt_nor_model_can_be_read_in_the_file(file: Path) -> None:
 FORGED = [
     '{"text": 5}', '{"text": null}', '{"finish_reason": "error"}', '{"error": "x"}',
     '{"slow_s": -5.0}', '{"slow_s": 1e9}', '{"slow_s": "a"}', '{"completion_tokens": -9}',
-    f'{{"prompt_tokens": {10**400}}}', '{"label_mass": NaN}', '{"batch_size": "x"}', "[" * 10**5, "5",
+    f'{{"prompt_tokens": '
+    f'{10**400}}}', '{"label_mass": NaN}', '{"batch_size": "x"}', "[" * 10**5, "5",
 ]  # fmt: skip
 
 
@@ -225,7 +239,9 @@ def test_a_file_that_computes_is_left_alone(
     kind: str, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Cached(Talker(), file).complete([BASE])
-    endless = "WITH RECURSIVE r(key, answer) AS (SELECT '', '' UNION ALL SELECT * FROM r) SELECT * FROM r"
+    endless = (
+        "WITH RECURSIVE r(key, answer) AS (SELECT '', '' UNION ALL SELECT * FROM r) SELECT * FROM r"
+    )
     with sqlite3.connect(file) as opened:
         opened.executescript(
             f"DROP TABLE completions; CREATE VIEW completions AS {endless}"
@@ -237,7 +253,8 @@ def test_a_file_that_computes_is_left_alone(
     assert "a view or a trigger" in capsys.readouterr().err
 
 
-# -- the file is no more than a help ------------------------------------------------------------------------
+# -- the file is no more than a help
+# ------------------------------------------------------------------------
 
 
 def test_a_deleted_file_is_an_empty_cache_also_while_a_run_goes_on(file: Path) -> None:
@@ -251,7 +268,9 @@ def test_a_deleted_file_is_an_empty_cache_also_while_a_run_goes_on(file: Path) -
     assert [c.cached for c in cached.complete([BASE])] == [True]
 
 
-@pytest.mark.parametrize("damage", ["no database", "torn", "another table", "no answer", "no folder"])
+@pytest.mark.parametrize(
+    "damage", ["no database", "torn", "another table", "no answer", "no folder"]
+)
 def test_a_file_that_gives_trouble_is_one_line_and_the_run_goes_on(
     damage: str, file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -290,7 +309,9 @@ def _write(path: str, first: int) -> None:
 
 
 @pytest.mark.slow
-def test_processes_that_write_at_once_lose_nothing(file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_processes_that_write_at_once_lose_nothing(
+    file: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     context = multiprocessing.get_context("fork")
     writers = [context.Process(target=_write, args=(str(file), 20 * n)) for n in range(4)]
     for writer in writers:
@@ -303,7 +324,9 @@ def test_processes_that_write_at_once_lose_nothing(file: Path, capfd: pytest.Cap
     assert all(c.cached for c in done)
 
 
-def test_the_file_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_lies_where_the_environment_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "mine"))
     assert default_file() == tmp_path / "mine" / "completions.sqlite"
     monkeypatch.delenv("SWARMDRIVE_CACHE")
@@ -314,7 +337,8 @@ def test_the_file_lies_where_the_environment_says(tmp_path: Path, monkeypatch: p
     assert default_file() == tmp_path / ".cache" / "swarmdrive-harness" / "completions.sqlite"
 
 
-# -- runs ---------------------------------------------------------------------------------------------------
+# -- runs
+# ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -343,7 +367,8 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     asked = tiny_run(tiny, data, tmp_path / "asked", None)
     first = tiny_run(tiny, data, tmp_path / "first", file)
     again = tiny_run(tiny, data, tmp_path / "again", file)
-    # Decision points that a viewer cannot tell apart have one prompt, so a run meets its own answers.
+    # Decision points that a viewer cannot tell apart have one prompt, so a run meets its own
+    # answers.
     alike = [
         [
             msgspec.structs.replace(a, batch_size=0, cached=False, **UNTIMED)
@@ -355,7 +380,9 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     for name in ("first", "again"):
         assert same_decisions(tmp_path / name, tmp_path / "asked")
     for table in ("summary.csv", "episodes.csv"):
-        assert (tmp_path / "again" / table).read_bytes() == (tmp_path / "asked" / table).read_bytes()
+        assert (tmp_path / "again" / table).read_bytes() == (
+            tmp_path / "asked" / table
+        ).read_bytes()
     count = len(answers_of(tmp_path / "asked"))
     assert all(a.cached for a in answers_of(tmp_path / "again"))
     assert (asked.manifest.cached_answers, again.manifest.cached_answers) == (0, count)
@@ -402,13 +429,17 @@ def test_answers_of_a_strangers_server_are_not_those_of_ones_own(
         assert asked_at([evil], file) == "evil"
         assert len(better.asked) == 1
         monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", better.url)
-        assert asked_at([better], file) == "better", "the user says no more of what was kept of the other"
+        assert asked_at([better], file) == "better", (
+            "the user says no more of what was kept of the other"
+        )
 
 
 def test_an_answer_is_kept_where_one_server_gave_it(file: Path) -> None:
     """The orders of a read-out's list may come from several, if one breaks down on the way."""
     for server, asked in ((None, [1, 1]), ("http://other/v1", [1, 1]), ("http://a/v1", [1, 0])):
-        talker = Talker({"00000-0/v1": Completion("00000-0/v1", "x", 1, 1, "stop", None, 1, server=server)})
+        talker = Talker(
+            {"00000-0/v1": Completion("00000-0/v1", "x", 1, 1, "stop", None, 1, server=server)}
+        )
         talker.several = ("http://a/v1", "http://b/v1")
         for count in asked:
             before = len(talker.asked)
@@ -426,9 +457,12 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
         card = cards.load("openai-example")
         assert card.server is not None
         card = replace(card, server=replace(card.server, base_url=there.url))
-        spec = Spec(Agent(card, prompts.load("v2")), FrozenSource(data), tuple(POINTS.values()), (0,))
+        spec = Spec(
+            Agent(card, prompts.load("v2")), FrozenSource(data), tuple(POINTS.values()), (0,)
+        )
         manifests = [
-            evaluate(spec, tmp_path / name, lambda done: None, file).manifest for name in ("first", "again")
+            evaluate(spec, tmp_path / name, lambda done: None, file).manifest
+            for name in ("first", "again")
         ]
     asked = len(answers_of(tmp_path / "first"))
     assert [m.cached_answers for m in manifests] == [0, asked]
@@ -457,7 +491,9 @@ def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, fil
 
 
 @pytest.mark.slow
-def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_path: Path, file: Path) -> None:
+def test_engines_without_a_language_model_are_not_cached(
+    small: Dataset, tmp_path: Path, file: Path
+) -> None:
     for model in ("proxy", "local-view"):
         card = cards.load(model)
         backend = open_backend(card)
@@ -467,7 +503,9 @@ def test_engines_without_a_language_model_are_not_cached(small: Dataset, tmp_pat
     assert isinstance(cached(Talker(), cards.load("openai-example"), file), Cached)
 
 
-@pytest.mark.parametrize(("dtype", "asked_again"), [("float32", False), ("bfloat16", True), ("Q4_1", True)])
+@pytest.mark.parametrize(
+    ("dtype", "asked_again"), [("float32", False), ("bfloat16", True), ("Q4_1", True)]
+)
 def test_a_batch_size_is_part_of_a_question_unless_weights_are_float32(
     dtype: str, asked_again: bool, file: Path
 ) -> None:

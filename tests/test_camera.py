@@ -1,4 +1,6 @@
-"""What a vehicle's cameras see: nothing that its sensors do not, and everything else where it is."""
+"""What a vehicle's cameras see: nothing that its sensors do not,
+and everything else where it is.
+"""
 
 from io import BytesIO
 from pathlib import Path
@@ -34,14 +36,16 @@ DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/
 WIDTH, HEIGHT = SIZE_PX
 FOCAL_PX = focal_px(WIDTH)
 FEW, MANY = 2, 12  # decision points of a dataset, four viewers each
-# The latest dataset of each scenario stands for those before it: only layouts and numbers are others there.
+# The latest dataset of each scenario stands for those before it: only layouts and numbers are
+# others there.
 LATEST = sorted({name.rpartition("-v")[0]: name for name in DATASETS}.values())
 ROAD = scenarios.get("hard-brake-ahead")
 
 
 SOME = [pytest.param((name, FEW), marks=pytest.mark.slow, id=name) for name in LATEST]
 EVERY = [
-    pytest.param((name, MANY), marks=pytest.mark.exhaustive, id=f"{name}-{MANY}-moments") for name in DATASETS
+    pytest.param((name, MANY), marks=pytest.mark.exhaustive, id=f"{name}-{MANY}-moments")
+    for name in DATASETS
 ]
 
 
@@ -104,7 +108,9 @@ def vehicle(name: str, x_m: float, y_m: float = 0.0, **others: Any) -> VehicleSt
     approach, route = ROAD.road().ego
     stated: dict[str, Any] = {"kind": "car", "part": "other", "heading_rad": 0.0, "speed_mps": 20.0}
     stated |= {"approach": approach, "route": route}
-    return VehicleState(**{"id": name, "crashed": False, "x_m": x_m, "y_m": y_m, **stated, **others})
+    return VehicleState(
+        **{"id": name, "crashed": False, "x_m": x_m, "y_m": y_m, **stated, **others}
+    )
 
 
 def seen_by_the_first(*vehicles: VehicleState, ambient: str = "day") -> Frame:
@@ -131,12 +137,17 @@ def test_what_is_behind_is_in_the_lower_half():
 
 
 def test_a_truck_shows_above_a_car_only_if_a_ray_reaches_it():
-    hidden = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, kind="truck"))
+    hidden = seen_by_the_first(
+        vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, kind="truck")
+    )
     assert set(hidden.boxes()) == {"v2"}
     beside = seen_by_the_first(
         vehicle("v1", 0.0), vehicle("v2", 12.0), vehicle("v3", 40.0, 4.0, kind="truck")
     )
-    [(_, car_top, car_right, _)], [(truck_left, truck_top, _, _)] = beside.boxes()["v2"], beside.boxes()["v3"]
+    [(_, car_top, car_right, _)], [(truck_left, truck_top, _, _)] = (
+        beside.boxes()["v2"],
+        beside.boxes()["v3"],
+    )
     assert truck_top < car_top
     assert truck_left <= car_right
 
@@ -205,7 +216,9 @@ def test_lamps_shine_at_night():
 
 
 def test_a_light_that_there_is_not_is_refused():
-    with pytest.raises(UserError, match="ambient is dusk; it must be day or night or rain or fog or glare"):
+    with pytest.raises(
+        UserError, match="ambient is dusk; it must be day or night or rain or fog or glare"
+    ):
         scenarios.get("occluded-intersection:ambient=dusk")
 
 

@@ -40,7 +40,9 @@ nan = 0.5
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/model-cards.md"
 TO_COPY = dict(
-    re.findall(r"^### `([^`]+)`\n\n```toml\n(.*?)^```\n", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    re.findall(
+        r"^### `([^`]+)`\n\n```toml\n(.*?)^```\n", PAGE.read_text(), re.MULTILINE | re.DOTALL
+    )
 )
 MINIMAL = """\
 engine = "driver"
@@ -102,7 +104,8 @@ def test_a_card_that_no_longer_ships_says_where_it_is_and_runs_again_once_it_is_
 ) -> None:
     file = "models/qwen3-8b.toml"
     said = (
-        f"model 'qwen3-8b' no longer ships; copy its card from {PAGE} to {file} in your project's folder, "
+        f"model 'qwen3-8b' no longer ships; copy its card from {PAGE} to {file} in your project's "
+        "folder, "
         "which `harness init` makes, and it runs again\n"
     )
     (project / "run.toml").write_text('[helpers]\nmodel = "proxy, qwen3-8b"\n')
@@ -124,7 +127,9 @@ def test_language_models_declare_no_latency_that_was_not_measured() -> None:
     for card in cards.load_all():
         if capabilities(card.engine).renders:
             assert card.latency.source in ("paper", "cited"), card.name
-            assert (card.latency.source == "cited") == card.latency.basis.startswith("cited: "), card.name
+            assert (card.latency.source == "cited") == card.latency.basis.startswith("cited: "), (
+                card.name
+            )
             from_hub = capabilities(card.engine).has_weights and "/" in str(card.weights)
             assert card.licence or not from_hub, card.name
 
@@ -178,19 +183,28 @@ basis = "b"
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("= 256", "= 255"), "[vision]: height_px is 255, wants an even number: two cameras share it"),
+        (("= 256", "= 255"), 
+            "[vision]: height_px is 255, wants an "
+            "even number: two cameras share it"),
         (("= 512", "= 0"), "[vision]: width_px = 0; allowed: 1 or more"),
         (("= 512", "= 5000"), "[vision]: a picture of 5000 x 256 pixels; allowed: 4096 a side"),
         (("merge = 2", ""), "[vision] has no merge; add it"),
         (("merge = 2", "merg = 2"), "unknown key in "),
-        (('"transformers"', '"llama-cpp"'), "[vision] and projector go together on llama-cpp: give the name "
+        (('"transformers"', '"llama-cpp"'), 
+            "[vision] and projector go together "
+            "on llama-cpp: give the name "
          "of its mmproj file, or leave both out"),
-        (("merge = 2", 'merge = 2\n[engines.llama-cpp]\nweights = "a/b"\nfile = "f.gguf"'), "go together on"),
+        (("merge = 2", 
+            'merge = '
+            '2\n[engines.llama-cpp]\nweights = '
+            '"a/b"\nfile = "f.gguf"'), "go together on"),
         (("[vision]", 'projector = "p.gguf"\n[vision]'), "projector goes with engine = llama-cpp"),
         (('"transformers"\n', '"proxy"\n'), "goes with engine = "),
     ],
 )  # fmt: skip
-def test_a_mistake_about_pictures_is_one_line(shelf: Path, change: tuple[str, str], said: str) -> None:
+def test_a_mistake_about_pictures_is_one_line(
+    shelf: Path, change: tuple[str, str], said: str
+) -> None:
     assert change[0] in SEES
     write_card(shelf, SEES.replace(*change, 1))
     with pytest.raises(UserError) as refused:
@@ -233,23 +247,43 @@ def test_a_card_may_have_weights_for_another_engine() -> None:
         "qwen3-4b:llama-cpp", "Qwen/Qwen3-4B-GGUF", "Qwen3-4B-Q4_K_M.gguf",
     )  # fmt: skip
     assert (q4.quantisation, q4.dtype, qwen.file, qwen.sha256) == ("Q4_K_M", "auto", None, None)
-    assert (q4.thinking, q4.licence, q4.context_tokens) == (qwen.thinking, qwen.licence, qwen.context_tokens)
-    assert cards.resolve("qwen3-4b", "transformers") == cards.resolve("qwen3-4b:transformers") == qwen
-    assert cards.resolve("qwen3-4b:llama-cpp") == cards.resolve("qwen3-4b:llama-cpp", "llama-cpp") == q4
+    assert (q4.thinking, q4.licence, q4.context_tokens) == (
+        qwen.thinking,
+        qwen.licence,
+        qwen.context_tokens,
+    )
+    assert (
+        cards.resolve("qwen3-4b", "transformers") == cards.resolve("qwen3-4b:transformers") == qwen
+    )
+    assert (
+        cards.resolve("qwen3-4b:llama-cpp")
+        == cards.resolve("qwen3-4b:llama-cpp", "llama-cpp")
+        == q4
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "engine", "said"),
     [
         ("qwen3-4b", "llama", ["engine 'llama'", "did you mean 'llama-cpp'"]),
-        ("qwen3-4b", "openai", ["engine of model qwen3-4b 'openai'", "known: llama-cpp, transformers"]),
+        (
+            "qwen3-4b",
+            "openai",
+            ["engine of model qwen3-4b 'openai'", "known: llama-cpp, transformers"],
+        ),
         ("qwen3-4b:openai", None, ["engine of model qwen3-4b 'openai'"]),
         ("qwen3-4b:llama-cpp", "transformers", ["'qwen3-4b:llama-cpp' runs on llama-cpp"]),
         ("proxy", "transformers", ["engine of model proxy 'transformers'", "known: proxy"]),
-        ("someone/model", "llama-cpp", ["--engine llama-cpp", "'someone/model' runs on transformers"]),
+        (
+            "someone/model",
+            "llama-cpp",
+            ["--engine llama-cpp", "'someone/model' runs on transformers"],
+        ),
     ],
 )
-def test_an_engine_that_a_model_has_not_is_one_line(text: str, engine: str | None, said: list[str]) -> None:
+def test_an_engine_that_a_model_has_not_is_one_line(
+    text: str, engine: str | None, said: list[str]
+) -> None:
     with pytest.raises(UserError) as caught:
         cards.resolve(text, engine)
     for part in said:
@@ -278,9 +312,13 @@ def test_what_was_said_of_one_engines_weights_says_nothing_of_anothers(shelf: Pa
 
 def test_an_adapter_changes_the_weights_on_every_engine_that_can_take_one(shelf: Path) -> None:
     write_card(shelf, TWO_ENGINES.replace("[latency]", 'adapter = "taught"\n[latency]'))
-    assert (cards.load("mine").adapter, cards.load("mine:llama-cpp").adapter) == ("taught", "taught")
+    assert (cards.load("mine").adapter, cards.load("mine:llama-cpp").adapter) == (
+        "taught",
+        "taught",
+    )
     write_card(
-        shelf, TWO_ENGINES.replace("[latency]", 'adapter = "taught"\n[latency]') + 'adapter = "other"\n'
+        shelf,
+        TWO_ENGINES.replace("[latency]", 'adapter = "taught"\n[latency]') + 'adapter = "other"\n',
     )
     assert cards.load("mine:llama-cpp").adapter == "other"
 
@@ -290,10 +328,16 @@ def test_an_adapter_changes_the_weights_on_every_engine_that_can_take_one(shelf:
     [
         (("llama-cpp", "proxy"), ["engine in", "'proxy'", "known: decisions, llama-cpp, openai"]),
         (("llama-cpp", "transformers"), ["'transformers'", "known: decisions, llama-cpp"]),
-        (('file = "b.gguf"', 'dtype = "float32"'), ["[engines.llama-cpp]", "dtype", "transformers"]),
+        (
+            ('file = "b.gguf"', 'dtype = "float32"'),
+            ["[engines.llama-cpp]", "dtype", "transformers"],
+        ),
         (('file = "b.gguf"', "licence = 'MIT'"), ["[engines.llama-cpp]", "licence"]),
         (('weights = "a/b-GGUF"', ""), ["[engines.llama-cpp]", "weights", "goes with"]),
-        (('[engines.llama-cpp]\nweights = "a/b-GGUF"', "[engines]\nllama-cpp = 3"), ["= '3'", "a table"]),
+        (
+            ('[engines.llama-cpp]\nweights = "a/b-GGUF"', "[engines]\nllama-cpp = 3"),
+            ["= '3'", "a table"],
+        ),
         (
             ('source = "paper"', 'source = "card"\ninference_s = 0.1'),
             ["[engines.llama-cpp] has no latency; add it"],
@@ -312,10 +356,17 @@ def test_a_gguf_file_is_a_model_named_after_it(tmp_path: Path) -> None:
     file = tmp_path / "small-Q8_0.gguf"
     file.write_bytes(b"GGUF")
     plain = cards.resolve(str(file))
-    assert (plain.name, plain.engine, plain.weights) == ("small-Q8_0", "llama-cpp", str(file.resolve()))
+    assert (plain.name, plain.engine, plain.weights) == (
+        "small-Q8_0",
+        "llama-cpp",
+        str(file.resolve()),
+    )
     assert (plain.thinking, plain.latency.source, plain.file) == ("none", "paper", None)
     template, key = b"{% if enable_thinking %}", b"tokenizer.chat_template"
-    said = struct.pack(f"<4sIQQQ{len(key)}sIQ", b"GGUF", 3, 0, 1, len(key), key, 8, len(template)) + template
+    said = (
+        struct.pack(f"<4sIQQQ{len(key)}sIQ", b"GGUF", 3, 0, 1, len(key), key, 8, len(template))
+        + template
+    )
     file.write_bytes(said)
     assert cards.resolve(str(file)).thinking == "switch"
 
@@ -324,10 +375,15 @@ def test_a_directory_with_a_checkpoint_and_a_gguf_file_runs_on_either(tmp_path: 
     folder = tmp_path / "small"
     folder.mkdir()
     (folder / "small-f16.gguf").write_bytes(b"GGUF")
-    assert (cards.resolve(str(folder)).engine, cards.resolve(str(folder)).name) == ("llama-cpp", "small-f16")
+    assert (cards.resolve(str(folder)).engine, cards.resolve(str(folder)).name) == (
+        "llama-cpp",
+        "small-f16",
+    )
     (folder / "config.json").write_text("{}")
     assert cards.resolve(str(folder)).engine == "transformers"
-    assert cards.resolve(str(folder), "llama-cpp").weights == str((folder / "small-f16.gguf").resolve())
+    assert cards.resolve(str(folder), "llama-cpp").weights == str(
+        (folder / "small-f16.gguf").resolve()
+    )
     (folder / "small-q4.gguf").write_bytes(b"GGUF")
     with pytest.raises(UserError, match=r"holds 2 \.gguf files; give one of them"):
         cards.resolve(str(folder), "llama-cpp")
@@ -345,7 +401,10 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
     ("change", "said"),
     [
         (("engine =", "motor ="), ["mine.toml", "motor", "engine"]),
-        (('basis = "declared: none"', 'basis = "b"\nspeed = 3'), ["[latency]", "speed", "inference_s"]),
+        (
+            ('basis = "declared: none"', 'basis = "b"\nspeed = 3'),
+            ["[latency]", "speed", "inference_s"],
+        ),
         (('"driver"', '"drivr"'), ["engine", "drivr", "did you mean 'driver'"]),
         (('source = "card"', 'source = "guess"'), ["source", "guess", "paper"]),
         (('description = "d"', "description = 3"), ["description", "3", "a text"]),
@@ -354,7 +413,10 @@ def test_a_card_of_ones_own_is_one_file(shelf: Path) -> None:
             ('description = "d"', 'description = "d"\ncontext_tokens = true'),
             ["context_tokens", "whole number"],
         ),
-        (('description = "d"', 'description = "d"\nmax_new_tokens = 0'), ["max_new_tokens = 0", "1 or more"]),
+        (
+            ('description = "d"', 'description = "d"\nmax_new_tokens = 0'),
+            ["max_new_tokens = 0", "1 or more"],
+        ),
         (('description = "d"', 'description = "d"\nweights = "a/b"'), ["weights", "transformers"]),
         (('"driver"', '"transformers"'), ["weights", "transformers"]),
         (('"driver"', '"proxy"\nprivileged = true'), ["privileged", "driver"]),
@@ -408,8 +470,14 @@ def test_a_served_model_has_a_server_with_defaults_that_are_stated(shelf: Path) 
         (("models.example", "models.example:port"), ["base_url", "no URL"]),
         (("/v1", "/v1#top"), ["base_url", "fragment"]),
         (('"https://models.example/v1"', "[]"), ["[server]", "base_url is an empty list"]),
-        (('"https://models.example/v1"', '["http://a/v1", "ftp://b"]'), ["base_url", "http or https"]),
-        (('"https://models.example/v1"', '["http://a/v1", "http://a/v1/"]'), ["base_url", "a server twice"]),
+        (
+            ('"https://models.example/v1"', '["http://a/v1", "ftp://b"]'),
+            ["base_url", "http or https"],
+        ),
+        (
+            ('"https://models.example/v1"', '["http://a/v1", "http://a/v1/"]'),
+            ["base_url", "a server twice"],
+        ),
         (("[server]", '[server]\nkind = "vlm"'), ["kind", "vlm", "did you mean 'vllm'"]),
         (("[server]", "[server]\ntimeout_s = 0"), ["timeout_s = 0", "more than 0"]),
         (("[server]", "[server]\ntimeout_s = inf"), ["timeout_s = inf", "more than 0"]),
@@ -438,14 +506,18 @@ def test_a_mistake_about_a_server_is_one_line_that_names_it(
         ("[server]", '[server]\napi_key = "sk-5ecret"'),
     ],
 )
-def test_a_secret_in_a_card_is_refused_and_not_repeated(shelf: Path, change: tuple[str, str]) -> None:
+def test_a_secret_in_a_card_is_refused_and_not_repeated(
+    shelf: Path, change: tuple[str, str]
+) -> None:
     assert "5ecret" not in refused(shelf, SERVED, change, ["[server]"])
 
 
 def test_a_server_and_failures_go_with_their_engines_only(shelf: Path) -> None:
     served = ("[latency]", '[server]\nbase_url = "http://a/v1"\n[latency]')
     refused(shelf, MINIMAL, served, ["[server]", "openai"])
-    refused(shelf, MINIMAL, ("[latency]", "[failures]\nnan = 0.5\n[latency]"), ["[failures]", "proxy"])
+    refused(
+        shelf, MINIMAL, ("[latency]", "[failures]\nnan = 0.5\n[latency]"), ["[failures]", "proxy"]
+    )
 
 
 def test_a_faulty_proxy_is_declared_by_its_shares(shelf: Path) -> None:
@@ -473,7 +545,11 @@ def test_a_faulty_proxy_is_declared_by_its_shares(shelf: Path) -> None:
 def test_a_mistake_about_failures_is_one_line_that_names_it(
     shelf: Path, change: tuple[str, str], said: list[str]
 ) -> None:
-    card = FAULTY.replace("nan = 0.5", "slow_tail = 0.5\nslow_s = 1") if "source" in change[0] else FAULTY
+    card = (
+        FAULTY.replace("nan = 0.5", "slow_tail = 0.5\nslow_s = 1")
+        if "source" in change[0]
+        else FAULTY
+    )
     refused(shelf, card, change, ["[failures]", *said])
 
 
@@ -482,13 +558,19 @@ def test_a_directory_with_a_config_is_a_transformers_model_named_after_it(tmp_pa
     checkpoint.mkdir()
     (checkpoint / "config.json").write_text("{}")
     card = cards.resolve(str(checkpoint))
-    assert (card.name, card.engine, card.weights) == ("my-model", "transformers", str(checkpoint.resolve()))
+    assert (card.name, card.engine, card.weights) == (
+        "my-model",
+        "transformers",
+        str(checkpoint.resolve()),
+    )
     assert (card.latency.source, card.thinking, card.dtype) == ("paper", "none", "auto")
 
 
 def test_a_directorys_thinking_switch_is_read_from_its_chat_template(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{}")
-    (tmp_path / "tokenizer_config.json").write_text(json.dumps({"chat_template": "{{ enable_thinking }}"}))
+    (tmp_path / "tokenizer_config.json").write_text(
+        json.dumps({"chat_template": "{{ enable_thinking }}"})
+    )
     assert cards.resolve(str(tmp_path)).thinking == "switch"
 
 
@@ -515,7 +597,8 @@ def test_a_run_is_replayed_by_its_directory(tmp_path: Path) -> None:
         ("./no/such/dir", ["'./no/such/dir'", "no directory", ".gguf", "hub id"]),
         ("./no/such.gguf", ["'./no/such.gguf'", "no .gguf file"]),
         ("replay:nowhere", ["'replay:nowhere'", "no such run directory"]),
-        ("no/such.gguf", ["'no/such.gguf'", "no .gguf file"]),  # and no hub id, though it could be one
+        # and no hub id, though it could be one
+        ("no/such.gguf", ["'no/such.gguf'", "no .gguf file"]),
         ("replay:", ["'replay:'", "no such run directory"]),
         ("../models/proxy", ["'../models/proxy'", "no directory"]),
     ],
@@ -528,7 +611,9 @@ def test_a_model_that_is_nothing_says_what_would_be_one(text: str, said: list[st
 
 
 def test_a_directory_without_a_config_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"holds no config\.json and no \.gguf file; give the directory of"):
+    with pytest.raises(
+        UserError, match=r"holds no config\.json and no \.gguf file; give the directory of"
+    ):
         cards.resolve(str(tmp_path))
 
 

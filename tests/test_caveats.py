@@ -1,4 +1,6 @@
-"""What is said before a run's numbers: its answers could not be read, or its model reads no prompt."""
+"""What is said before a run's numbers:
+its answers could not be read, or its model reads no prompt.
+"""
 
 import json
 from collections.abc import Callable
@@ -36,7 +38,9 @@ nan = 1.0
 @pytest.fixture(scope="module")
 def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
     points = (POINTS["single-local"], POINTS["6g"])
-    return evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path_factory.mktemp("sound") / "run")
+    return evaluate(
+        spec_of(small, points=points, seeds=(0,)), tmp_path_factory.mktemp("sound") / "run"
+    )
 
 
 def said_of(run: Run, *kinds: Kind) -> list[str]:
@@ -66,13 +70,16 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
     assert told() == []
     assert told(share("failed_rate_ego", 0.49)) == []
     assert told(share("failed_rate_ego", 0.5)) == [
-        "Only 50.0 % of the ego's 1440 answers could be read: it drives by the fallback, and success says "
+        "Only 50.0 % of the ego's 1440 answers could be read: it drives by the fallback, and "
+        "success says "
         "little about the model."
     ]
     assert [line.split(":")[0] for line in told(
         share("failed_rate_ego", 1.0), share("failed_rate_helper", 1.0), share("failed_rate_merge", 0.984)
     )] == [
-        "None of the ego's 1440 answers could be read", "None of the helpers' 1440 answers could be read",
+        "None of the ego's 1440 answers could be read", 
+            "None of the helpers' 1440 "
+            "answers could be read",
         "Only 1.6 % of the fusion calls' 1440 answers could be read",
     ]  # fmt: skip
 
@@ -85,7 +92,10 @@ def test_a_rule_reads_no_prompt_and_says_so(done: Evaluated, engine: str) -> Non
 def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
     def under(prompt: str, model: str = "proxy") -> Manifest:
         manifest = done.manifest
-        names = {"model": {**manifest.model, "name": model}, "prompt": {**manifest.prompt, "version": prompt}}
+        names = {
+            "model": {**manifest.model, "name": model},
+            "prompt": {**manifest.prompt, "version": prompt},
+        }
         return replace(manifest, **names)
 
     assert without_prompt(done, under("v1"), under("v2")) == [NO_PROMPT.replace("v2", "v1 or v2")]
@@ -97,12 +107,17 @@ def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
 
 def test_a_driver_that_looks_at_nothing_does_not_decide_by_the_scene_graph(done: Evaluated) -> None:
     def driven(name: str) -> Manifest:
-        return replace(done.manifest, model={**done.manifest.model, "engine": "driver", "name": name})
+        return replace(
+            done.manifest, model={**done.manifest.model, "engine": "driver", "name": name}
+        )
 
-    told = without_prompt(done, *map(driven, ("local-view", "cruise", "brake", "uniform", "constant")))
+    told = without_prompt(
+        done, *map(driven, ("local-view", "cruise", "brake", "uniform", "constant"))
+    )
     assert told == [
         NO_PROMPT.replace("proxy", "local-view"),
-        "cruise, brake, uniform and constant read no prompt: they decide without looking, whatever v2 says.",
+        "cruise, brake, uniform and constant read no prompt: they decide without looking, "
+        "whatever v2 says.",
     ]
     assert without_prompt(done, driven("uniform")) == [
         "uniform reads no prompt: it decides without looking, whatever v2 says."
@@ -163,12 +178,17 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     assert said.index(UNREAD) < said.index("condition")
     assert "mute reads no prompt: it decides by the scene graph, whatever v2 says." in said
     assert "None of the helpers' 72 answers could be read: they send no message." in said
-    cause = "24 of the ego's 24 answers could not be read. The commonest cause, 24 of 24: a probability"
+    cause = (
+        "24 of the ego's 24 answers could not be read. The commonest cause, 24 of 24: a probability"
+    )
     assert said.index(cause) < said.index("condition")
     page = unescape(Path("reports/mute/report.html").read_text())
     assert page.index(cause) < page.index("Under 6g, mute")
     assert page.index(UNREAD) < page.index("Under 6g, mute")
-    assert "none of the ego's answers could be read: it drives by the fallback" in harness("run", "ls")[1]
+    assert (
+        "none of the ego's answers could be read: it drives by the fallback"
+        in harness("run", "ls")[1]
+    )
     sound = ("--prompt", "v1", "--json", "--out", "reports/sound")
     code, out, err = harness("eval", "--model", "proxy", *options, *sound)
     few = "Only 4 episodes: the interval of a rate may reach 49 points to either side."
@@ -177,7 +197,9 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     both = ("reports/mute", "reports/sound")
     assert f"A: {UNREAD}" in " ".join(harness("compare", *both)[1].split())
     assert f"A: {UNREAD}" in harness("compare", *both, "--markdown")[1]
-    assert json.loads(harness("compare", *both, "--json")[1])["caveats"][0].startswith(f"A: {UNREAD}")
+    assert json.loads(harness("compare", *both, "--json")[1])["caveats"][0].startswith(
+        f"A: {UNREAD}"
+    )
     assert harness("compare", *both, "--html", "both.html")[0] == 0
     assert f"A: {UNREAD}" in unescape(Path("both.html").read_text())
     assert harness("report", *both, "--out", "matrix.html")[0] == 0
@@ -185,17 +207,22 @@ def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
 
 
 def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path) -> None:
-    """Four episodes; decisions over v2x take longer than the dataset's lag; two conditions are controls."""
+    """Four episodes; decisions over v2x take longer than the dataset's lag;
+    two conditions are controls.
+    """
     points = (POINTS["v2x"], *map(named_point, ("6g:messages=shuffled", "6g:messages=blind")))
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
     assert said_of(folder.read(done.out), Kind.LIMIT) == [
         "Only 4 episodes: the interval of a rate may reach 49 points to either side.",
-        "Without a danger, success is 100.0 % under every condition in 1 layout: none changes that half of "
+        "Without a danger, success is 100.0 % under every condition in 1 layout: none changes that "
+        "half of "
         "the balance here. In other layouts one may, by as much as the interval of its gain says.",
-        "6g:messages=shuffled is a control: the ego hears what helpers say in another layout, while a "
+        "6g:messages=shuffled is a control: the ego hears what helpers say in another layout, "
+        "while a "
         "decision's page shows what its own helpers say.",
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
-        "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop success may "
+        "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop "
+        "success may "
         "differ. harness study fidelity compares the two.",
     ]
 
@@ -209,7 +236,8 @@ def test_a_window_that_no_reply_keeps_is_said(small: Dataset, tmp_path: Path) ->
     assert scheduled.value
     [said] = unheard(run)
     assert said == (
-        f"Under {points[-1].name}, nobody is heard: of {scheduled.value:.0f} messages that arrived, none "
+        f"Under {points[-1].name}, nobody is heard: of {scheduled.value:.0f} messages that "
+        "arrived, none "
         "came within the decision window, so that the ego decided alone."
     )
     assert said in said_of(run, Kind.LIMIT)

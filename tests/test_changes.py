@@ -24,7 +24,9 @@ from changes import changed, concerns, stayed
         ("README.md", set()),
     ],
 )
-def test_a_change_concerns_its_extension_or_all_of_them_or_none(file: str, concerned: set[str]) -> None:
+def test_a_change_concerns_its_extension_or_all_of_them_or_none(
+    file: str, concerned: set[str]
+) -> None:
     assert {name for name in ("learn", "view") if concerns([file], name)} == concerned
 
 
@@ -41,7 +43,9 @@ def test_an_extension_that_nobody_changed_since_main_is_stayed(tmp_path: Path) -
 
     def run() -> list[str]:
         changed.cache_clear()
-        folders = (tmp_path / "tests/extensions" / name for name in ("committed", "edited", "new", "same"))
+        folders = (
+            tmp_path / "tests/extensions" / name for name in ("committed", "edited", "new", "same")
+        )
         return [folder.name for folder in folders if not stayed(folder, tmp_path)]
 
     assert run() == ["committed", "edited", "new", "same"], "without git all run"

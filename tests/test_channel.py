@@ -21,7 +21,9 @@ NONE_S = np.zeros(3)
 
 
 def reply_delay_s(channel, asked, ready_s, range_m, payload_bits, jitter, roadside_edge=False):
-    links = Links(asked, ready_s, range_m, payload_bits, in_radius=asked, rounds=np.zeros_like(asked))
+    links = Links(
+        asked, ready_s, range_m, payload_bits, in_radius=asked, rounds=np.zeros_like(asked)
+    )
     channel = replace(channel, roadside_edge=roadside_edge)
     return channel.deliver(links, Draws(np.zeros((*asked.shape, 2)), jitter)).delay_s
 
@@ -62,7 +64,9 @@ def test_nothing_crosses_without_a_channel():
 
 def test_v2x_serves_the_nearest_first_and_the_kth_pays_k_slots():
     """1000 bits at 10 Mbit/s are 0.1 ms, so a slot is 25.1 ms."""
-    delay_s = reply_delay_s(V2X, ALL, NONE_S, np.array([30.0, 10.0, 20.0]), np.full(3, 1000.0), NONE_S)
+    delay_s = reply_delay_s(
+        V2X, ALL, NONE_S, np.array([30.0, 10.0, 20.0]), np.full(3, 1000.0), NONE_S
+    )
     assert delay_s == pytest.approx([0.0753, 0.0251, 0.0502])
 
 
@@ -87,7 +91,9 @@ def test_a_medium_that_fell_idle_is_taken_when_the_helper_is_ready():
 
 def test_6g_serves_all_at_once_with_up_to_1_9_ms_of_jitter():
     """1000 bits at 200 Mbit/s are 5 us."""
-    delay_s = reply_delay_s(SIXG, ALL, NONE_S, RANGE_M, np.full(3, 1000.0), np.array([0.0, 0.5, 1.0]))
+    delay_s = reply_delay_s(
+        SIXG, ALL, NONE_S, RANGE_M, np.full(3, 1000.0), np.array([0.0, 0.5, 1.0])
+    )
     assert delay_s == pytest.approx([0.005005, 0.005955, 0.006905])
 
 
@@ -97,7 +103,9 @@ def test_a_roadside_edge_adds_a_second_hop_to_the_slot():
     jitter = np.array([0.0, 0.5, 1.0])
     parallel_s = reply_delay_s(SIXG, ALL, NONE_S, RANGE_M, bits, jitter, roadside_edge=True)
     assert serial_s == pytest.approx([0.0502, 0.1004, 0.1506])
-    assert parallel_s == pytest.approx([0.01001, 0.01191, 0.01381]), "twice 5.005 ms and twice the jitter"
+    assert parallel_s == pytest.approx([0.01001, 0.01191, 0.01381]), (
+        "twice 5.005 ms and twice the jitter"
+    )
 
 
 def test_the_declared_6g_jitter_puts_the_mean_decision_at_the_papers_151_4_ms():
@@ -110,7 +118,9 @@ def test_the_declared_6g_jitter_puts_the_mean_decision_at_the_papers_151_4_ms():
 
 
 slots = st.lists(
-    st.tuples(st.booleans(), st.floats(0, 0.2), st.floats(1, 100), st.floats(0, 8000)), min_size=1, max_size=6
+    st.tuples(st.booleans(), st.floats(0, 0.2), st.floats(1, 100), st.floats(0, 8000)),
+    min_size=1,
+    max_size=6,
 )
 
 

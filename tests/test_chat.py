@@ -22,7 +22,10 @@ from harness.core.resources import find
 from harness.dataset.load import Dataset
 
 Harness = Callable[..., tuple[int, str, str]]
-TURNS = "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content | trim }}<|im_end|>\n{% endfor %}"
+TURNS = (
+    "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content | trim }}<|im_end|>\n{% endfor "
+    "%}"
+)
 OPENING = "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
 REFUSES = (
     "{% if messages[0].role == 'system' %}{{ raise_exception('no system role') }}{% endif %}"
@@ -50,17 +53,23 @@ def test_all_is_said_whatever_white_space_is_around_it() -> None:
 
 
 def test_a_thought_of_an_earlier_turn_may_be_left_out() -> None:
-    forgets = TURNS.replace("| trim", ".split('</think>')[-1] | trim").replace("m.content .", "m.content.")
+    forgets = TURNS.replace("| trim", ".split('</think>')[-1] | trim").replace(
+        "m.content .", "m.content."
+    )
     assert "hm" not in Chat("forgets", Words(forgets)).render(CHAT, thinking=False)
 
 
 @pytest.mark.parametrize(
     ("template", "said"),
     [(DROPS, "message 1 of 4, the system's"), (CUTS, "message 1 of 4"),
-     (LAST, "message 2 of 4, the user's"), (TURNS.replace("messages", "messages[:3]"), "message 4 of 4"),
+     (LAST, 
+         "message 2 of "
+         "4, the user's"), (TURNS.replace("messages", "messages[:3]"), "message 4 of 4"),
      (TURNS.replace("| trim", "| upper"), "message 1 of 4"), ("", "message 1 of 4")],
 )  # fmt: skip
-def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(template: str, said: str) -> None:
+def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(
+    template: str, said: str
+) -> None:
     with pytest.raises(
         UserError, match="model 'bad': its chat template leaves out or changes the text"
     ) as refused:
@@ -69,7 +78,9 @@ def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(template:
     assert str(refused.value).isprintable()
 
 
-@pytest.mark.parametrize(("template", "helps"), [(REFUSES, True), (DROPS, True), ("", False), (CUTS, False)])
+@pytest.mark.parametrize(
+    ("template", "helps"), [(REFUSES, True), (DROPS, True), ("", False), (CUTS, False)]
+)
 def test_the_way_out_is_named_where_it_helps(template: str, helps: bool) -> None:
     with pytest.raises(UserError) as refused:
         Chat("bad", Words(template)).render(CHAT, thinking=False)
@@ -79,7 +90,9 @@ def test_the_way_out_is_named_where_it_helps(template: str, helps: bool) -> None
 @pytest.mark.parametrize("template", [REFUSES, DROPS])
 def test_the_system_text_begins_the_first_user_turn_where_the_card_says_so(template: str) -> None:
     prompt = Chat("old", Words(template), system="first-user").render(CHAT, thinking=False)
-    text = "user\nYou drive car v1. Answer with JSON only.\n\n\nScene 1: nothing in sight.<|im_end|>"
+    text = (
+        "user\nYou drive car v1. Answer with JSON only.\n\n\nScene 1: nothing in sight.<|im_end|>"
+    )
     assert prompt.startswith(f"<|im_start|>{text}")
     assert with_system(CHAT[1:], "first-user") == CHAT[1:]
     assert with_system(CHAT, None) == CHAT
@@ -121,7 +134,8 @@ def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
     assert Chat("m", Marked(template)).turn_end == (7 if end else None)
 
 
-# -- real weights --------------------------------------------------------------------------------------------
+# -- real weights
+# --------------------------------------------------------------------------------------------
 
 
 def with_template(folder: Path, template: str) -> Path:
@@ -132,7 +146,9 @@ def with_template(folder: Path, template: str) -> Path:
     options = ["--force", "--chat-template-file", str(folder / "template.jinja")]
     program = "from gguf.scripts.gguf_new_metadata import main; main()"
     subprocess.run(
-        [sys.executable, "-c", program, *options, str(shipped), str(made)], check=True, capture_output=True
+        [sys.executable, "-c", program, *options, str(shipped), str(made)],
+        check=True,
+        capture_output=True,
     )
     return made
 
@@ -144,13 +160,25 @@ def test_a_gguf_file_without_a_system_role_is_run_and_said_to_be(
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     model = with_template(tmp_path, REFUSES)
     assert cards.resolve(str(model)).system == "first-user"
-    args = ("--model", model, "--dataset", small_path, "--limit", "1", "--answer", "readout", "--out", "RUN")
+    args = (
+        "--model",
+        model,
+        "--dataset",
+        small_path,
+        "--limit",
+        "1",
+        "--answer",
+        "readout",
+        "--out",
+        "RUN",
+    )
     code, out, err = harness("eval", *args)
     assert code == 0, err
     assert "reads the system text at the beginning of the first" in " ".join(out.split())
     assert json.loads(Path("RUN/run.json").read_text())["model"]["system"] == "first-user"
     assert (
-        "reads the system text at the beginning of the first user turn" in Path("RUN/report.html").read_text()
+        "reads the system text at the beginning of the first user turn"
+        in Path("RUN/report.html").read_text()
     )
     scene = next(iter(small.forest.place))
     shown = ("prompt", "show", "v2", "--scene", scene, "--dataset", small_path, "--viewer", "v1")

@@ -58,7 +58,9 @@ def test_answers_come_from_another_process_with_its_seconds_and_identity(tmp_pat
     child.close()
 
 
-def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_answered(tmp_path: Path) -> None:
+def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_answered(
+    tmp_path: Path,
+) -> None:
     child = mortal(tmp_path)
     first, killer, last = child.complete([ask("first", "a"), ask("die", "b"), ask("last", "c")])
     assert (first.text, last.text) == ("first", "last")
@@ -127,7 +129,9 @@ def test_deaths_while_loading_are_tried_again_and_then_said(tmp_path: Path) -> N
     child = mortal(tmp_path, deaths=LOADS - 1)
     assert born(tmp_path) == LOADS
     child.close()
-    with pytest.raises(UserError, match=f"'mortal': engine died: signal 9 while it loaded, {LOADS} times"):
+    with pytest.raises(
+        UserError, match=f"'mortal': engine died: signal 9 while it loaded, {LOADS} times"
+    ):
         mortal(tmp_path, deaths=1000)
     assert born(tmp_path) == 2 * LOADS
 
@@ -191,7 +195,10 @@ def interruptible() -> Iterator[None]:
     "blow",
     [
         signal.SIGKILL,
-        *(pytest.param(each, marks=pytest.mark.exhaustive) for each in (signal.SIGINT, signal.SIGTERM)),
+        *(
+            pytest.param(each, marks=pytest.mark.exhaustive)
+            for each in (signal.SIGINT, signal.SIGTERM)
+        ),
     ],
 )
 def test_whatever_ends_the_run_ends_the_engine(tmp_path: Path, blow: signal.Signals) -> None:

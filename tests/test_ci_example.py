@@ -1,4 +1,6 @@
-"""The workflow of `examples/ci.yml`: its steps in a repository with a pull request, GitHub's part played."""
+"""The workflow of `examples/ci.yml`: its steps in a repository with a pull request,
+GitHub's part played.
+"""
 
 import json
 import os
@@ -17,7 +19,8 @@ import yaml
 ROOT = Path(__file__).parents[1]
 WORKFLOW = yaml.safe_load((ROOT / "examples/ci.yml").read_text())
 STEPS = {step["name"]: step for step in WORKFLOW["jobs"]["prompt"]["steps"] if "run" in step}
-# A pull request's comments, as GitHub's API lists them: of others, and of a stranger who typed the mark.
+# A pull request's comments, as GitHub's API lists them: of others, and of a stranger who typed the
+# mark.
 COMMENTS: list[dict[str, Any]] = [
     {"id": 1, "user": {"login": "github-actions[bot]"}, "body": "of another workflow"},
     {"id": 2, "user": {"login": "stranger"}, "body": "<!-- swarmdrive mine -->"},
@@ -51,7 +54,9 @@ pytestmark = [
 
 def git(repo: Path, *words: str) -> str:
     who = ("-c", "user.name=me", "-c", "user.email=me@example.org")
-    done = subprocess.run(["git", *who, *words], cwd=repo, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", *who, *words], cwd=repo, check=True, capture_output=True, text=True
+    )
     return done.stdout.strip()
 
 
@@ -65,7 +70,9 @@ def repo(tmp_path: Path) -> Path:
     (programs / "harness").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m harness "$@"\n')
     for program in programs.iterdir():
         program.chmod(0o755)
-    subprocess.run([sys.executable, "-m", "harness", "init", folder], check=True, env=environment(tmp_path))
+    subprocess.run(
+        [sys.executable, "-m", "harness", "init", folder], check=True, env=environment(tmp_path)
+    )
     git(folder, "init", "--quiet")
     git(folder, "add", "--all")
     git(folder, "commit", "--quiet", "--message", "as it was")
@@ -86,10 +93,15 @@ def played(step: str, repo: Path, github: dict[str, str]) -> int:
     def filled(value: Any) -> str:
         return re.sub(r"\$\{\{ (\S+) \}\}", lambda found: github[found[1]], str(value))
 
-    more = {name: filled(value) for name, value in (WORKFLOW["env"] | STEPS[step].get("env", {})).items()}
+    more = {
+        name: filled(value)
+        for name, value in (WORKFLOW["env"] | STEPS[step].get("env", {})).items()
+    }
     more |= {"SETTINGS": "--limit 2 --condition 6g --seeds 0:1"}  # of 40 layouts
     command = ["bash", "--noprofile", "--norc", "-e", "-c", STEPS[step]["run"]]
-    return subprocess.run(command, cwd=repo, env=environment(repo.parent) | more, check=False).returncode
+    return subprocess.run(
+        command, cwd=repo, env=environment(repo.parent) | more, check=False
+    ).returncode
 
 
 def github_of(base: str) -> dict[str, str]:
@@ -97,12 +109,16 @@ def github_of(base: str) -> dict[str, str]:
     return {f"{pull}.base.sha": base, f"{pull}.number": "7", "github.token": "none"}
 
 
-DRY = "--dry-run --no-deps --no-index --no-build-isolation --ignore-installed --report installed.json"
+DRY = (
+    "--dry-run --no-deps --no-index --no-build-isolation --ignore-installed --report installed.json"
+)
 PIP = f'#!/bin/sh\nexec "{sys.executable}" -m pip "$@" {DRY}\n'
 
 
 @pytest.mark.exhaustive
-def test_it_installs_the_harness_from_where_the_repository_has_it(repo: Path, tmp_path: Path) -> None:
+def test_it_installs_the_harness_from_where_the_repository_has_it(
+    repo: Path, tmp_path: Path
+) -> None:
     (tmp_path / "programs/pip").write_text(PIP)
     (tmp_path / "programs/pip").chmod(0o755)
     assert played("Install", repo, {}) > 0, "there is nothing at the place that the example names"
@@ -131,7 +147,9 @@ def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) 
     assert played(evaluate, repo, github) == 0
     assert played(compare, repo, github) == int(breaks), "the gates decide"
     assert [played(step, repo, github) for step in says] == [0, 0]
-    assert all("!cancelled()" in STEPS[step]["if"] for step in says), "a failed gate is said as well"
+    assert all("!cancelled()" in STEPS[step]["if"] for step in says), (
+        "a failed gate is said as well"
+    )
     comparison = (repo / "comparison.md").read_text()
     assert "fallback" in comparison if breaks else comparison
     assert (tmp_path / "summary.md").read_text() == comparison
@@ -147,7 +165,9 @@ def test_the_workflow_guards_a_prompt(breaks: bool, repo: Path, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_prompt_that_is_new_is_compared_with_nothing_and_that_is_said(repo: Path, tmp_path: Path) -> None:
+def test_a_prompt_that_is_new_is_compared_with_nothing_and_that_is_said(
+    repo: Path, tmp_path: Path
+) -> None:
     git(repo, "rm", "-r", "--quiet", "prompts/mine")
     git(repo, "commit", "--quiet", "--message", "before it was there")
     base = git(repo, "rev-parse", "HEAD")

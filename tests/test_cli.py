@@ -41,7 +41,9 @@ Harness = Callable[..., Said]
 
 
 @pytest.fixture
-def harness(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Harness:
+def harness(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Harness:
     """Runs a command line in an empty folder."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
@@ -72,7 +74,9 @@ def one_line(said: Said) -> str:
     [
         (["eval", "--model", "proxi"], "unknown model 'proxi'; did you mean 'proxy'?"),
         (["eval", "--model", "replay:nowhere"], "no such run directory"),
-        (["eval", "--model", "swarm-"], "did you mean one of swarm-smol, swarm-tiny, swarm-tiny-six, "),
+        (["eval", "--model", "swarm-"], 
+            "did you mean one of swarm-smol, "
+            "swarm-tiny, swarm-tiny-six, "),
         (["eval", "--prompt", "v22"], "unknown prompt 'v22'; did you mean 'v2'?"),
         (["eval", "--prompt", "../prompts/v2"], "unknown prompt '../prompts/v2'"),
         (["eval", "--condition", "5g"], "unknown operating point '5g'; known: 6g, cloud, "),
@@ -82,7 +86,9 @@ def one_line(said: Said) -> str:
         (["eval", "--limit", "ten"], "Invalid value for '--limit'"),
         (["eval", "--seeds", ""], "--seeds : give a range such as 0:5, or a list"),
         (["eval", "--seeds", "5:0"], "--seeds 5:0: give a range"),
-        (["eval", "--seeds", "5"], "--seeds 5: give 0:5 for seeds from 0 on, or 5:6 for seed 5 alone"),
+        (["eval", "--seeds", "5"], 
+            "--seeds 5: give 0:5 for seeds from 0 "
+            "on, or 5:6 for seed 5 alone"),
         (["eval", "--danger", "up"], "unknown --danger 'up'; known: left, none, oncoming, right"),
         (["eval", "--only", "3:9999"], "--only 3:9999: give episodes from 0 to 3, such as 3,10:20"),
         (["eval", "--sample", "201"], "--sample 201: give 1 to 4 episodes"),
@@ -91,17 +97,26 @@ def one_line(said: Said) -> str:
         (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
         (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),
         (["eval", "--batch-size", "0"], "--batch-size 0: give 1 or more"),
-        (["eval", "--workers", "0"], "--workers 0: give 1 to 256 processes, or ray for a Ray cluster"),
+        (["eval", "--workers", "0"], 
+            "--workers 0: give 1 to 256 "
+            "processes, or ray for a Ray cluster"),
         (
             ["eval", "--model", "swarm-tiny", "--workers", "2"],
-            "--workers 2: rules and servers answer to several processes, and swarm-tiny is a language model "
+            "--workers 2: rules and servers answer to several processes, and swarm-tiny is a "
+            "language model "
             "of one; give --batch-size",
         ),
         (["eval", "--thinking"], "--thinking: proxy cannot think; leave it out"),
-        (["eval", "--device", "cuda"], "--device cuda: proxy has no weights here (engines transformers"),
-        (["eval", "--dtype", "int3"], "--dtype int3: proxy has no weights here (engines transformers"),
+        (["eval", "--device", "cuda"], 
+            "--device cuda: proxy has no weights "
+            "here (engines transformers"),
+        (["eval", "--dtype", "int3"], 
+            "--dtype int3: proxy has no weights "
+            "here (engines transformers"),
         (["eval", "--modle", "proxy"], "No such option: --modle"),
-        (["eval", "extra"], "settings extra: there is no such file; give a run.toml or the folder of a run"),
+        (["eval", "extra"], 
+            "settings extra: there is no such file; give "
+            "a run.toml or the folder of a run"),
         (["eval", "run.toml", "extra"], "unexpected extra argument"),
         (["evaluate"], "No such command 'evaluate'"),
         (["--verbose"], "No such option: --verbose"),
@@ -109,7 +124,10 @@ def one_line(said: Said) -> str:
         (["dataset", "show", "small"], "Missing argument 'scene'"),
         (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
-        (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], "unknown viewer of scene"),
+        (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], 
+            "unknown "
+            "viewer of "
+            "scene"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
         (["prompt", "release", "v2"], "prompt v2 is released already; copy it to a new version"),
         (["prompt", "release", "v99"], "unknown prompt 'v99'"),
@@ -140,7 +158,9 @@ def broken(small_path: Path, tmp_path: Path) -> Path:
 def test_a_dataset_that_is_none_is_one_line(harness: Harness, tmp_path: Path) -> None:
     assert "unknown dataset 'nowhere'" in one_line(harness("eval", "--dataset", "nowhere"))
     (tmp_path / "empty").mkdir()
-    assert "is no dataset (no manifest.json)" in one_line(harness("eval", "--dataset", tmp_path / "empty"))
+    assert "is no dataset (no manifest.json)" in one_line(
+        harness("eval", "--dataset", tmp_path / "empty")
+    )
 
 
 @pytest.mark.parametrize("keep", [0, 1, -1, -4000])
@@ -178,21 +198,29 @@ def test_a_manifest_that_is_none_is_one_line(harness: Harness, broken: Path) -> 
     (broken / "manifest.json").write_text("{")
     assert "manifest.json cannot be read" in one_line(harness("eval", "--dataset", broken))
     (broken / "manifest.json").write_text('{"\\u001b[31m": 1}')
-    assert "manifest.json: unknown key in manifest " in one_line(harness("eval", "--dataset", broken))
+    assert "manifest.json: unknown key in manifest " in one_line(
+        harness("eval", "--dataset", broken)
+    )
 
 
-def test_a_tokenizer_that_is_none_is_one_line(harness: Harness, small_path: Path, tmp_path: Path) -> None:
+def test_a_tokenizer_that_is_none_is_one_line(
+    harness: Harness, small_path: Path, tmp_path: Path
+) -> None:
     (tmp_path / "t.gguf").write_bytes(b"GGUF")
     args = ("eval", "--dry-run", "--dataset", small_path, "--tokenizer", tmp_path / "t.gguf")
     assert "is no readable tokenizer" in one_line(harness(*args))
 
 
-def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, small_path: Path) -> None:
+def test_a_dry_run_counts_calls_no_model_and_writes_nothing(
+    harness: Harness, small_path: Path
+) -> None:
     scenes = len(load(small_path, 2).courses())
     said = harness("eval", "--dry-run", "--dataset", small_path, "--limit", "2", "--seeds", "7,9")
     assert (said.code, said.err, os.listdir()) == (0, "", [])
     on_courses = f"for the {scenes} scenes on the reference drivers' courses"
-    assert f"{scenes} requests to the ego and at most {3 * scenes} to helpers {on_courses}" in said.out
+    assert (
+        f"{scenes} requests to the ego and at most {3 * scenes} to helpers {on_courses}" in said.out
+    )
     assert "; would score 3 conditions × 2 channel seeds; no model was called" in said.out
     assert "prompt tokens not counted" in said.out
     counted = ("eval", "--dry-run", "--dataset", small_path, "--limit", "2")
@@ -202,7 +230,11 @@ def test_a_dry_run_counts_calls_no_model_and_writes_nothing(harness: Harness, sm
     said = harness("eval", "--dry-run", "--dataset", small_path, "--model", "brake", "--json")
     told = json.loads(said.out)
     scenes = len(load(small_path).courses())
-    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (scenes, [0, 1, 2, 3, 4], None)
+    assert (told["requests"], told["seeds"], told["world"]["limit"]) == (
+        scenes,
+        [0, 1, 2, 3, 4],
+        None,
+    )
     assert told["requests_by_role"] == {"ego": scenes}
     assert [c["name"] for c in told["conditions"]] == ["single-local", "v2x", "6g"]
 
@@ -249,13 +281,19 @@ def test_the_version_is_printed(harness: Harness) -> None:
 
 def test_people_read_the_same_in_eighty_columns(harness: Harness, small_path: Path) -> None:
     said = harness("prompt", "list")
-    assert [line.split()[:2] for line in said.out.splitlines()] == [[v, "released"] for v in versions.names()]
+    assert [line.split()[:2] for line in said.out.splitlines()] == [
+        [v, "released"] for v in versions.names()
+    ]
     assert max(map(len, said.out.splitlines())) <= 80
-    said = harness("prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path)
+    said = harness(
+        "prompt", "show", "v2", "--scene", "00001-0", "--viewer", "v1", "--dataset", small_path
+    )
     assert said.out.startswith("--- v1 system\nYou drive car v1")
     said = harness("prompt", "check", "v2", "--dataset", small_path)
     scenes = len(load(small_path).courses())
-    assert said.out.startswith(f"v2: renders for every viewer of {scenes} scenes; budget 200 to 400 tokens\n")
+    assert said.out.startswith(
+        f"v2: renders for every viewer of {scenes} scenes; budget 200 to 400 tokens\n"
+    )
     assert "tokens not counted" in said.out
 
 
@@ -264,7 +302,15 @@ def test_a_prompt_outside_its_budget_ends_with_one(
 ) -> None:
     """A tokenizer that takes a whole prompt for one word."""
     Tokenizer(models.WordLevel({"?": 0}, unk_token="?")).save(str(tmp_path / "words.json"))
-    args = ("prompt", "check", "v2", "--dataset", small_path, "--tokenizer", tmp_path / "words.json")
+    args = (
+        "prompt",
+        "check",
+        "v2",
+        "--dataset",
+        small_path,
+        "--tokenizer",
+        tmp_path / "words.json",
+    )
     said, data = harness(*args), load(small_path)
     scenes, first = len(data.courses()), data.forest.ids[0]
     every = 7 * scenes  # four viewers, and the ego with the messages of one, two and three
@@ -277,7 +323,8 @@ def test_a_prompt_outside_its_budget_ends_with_one(
     told = json.loads(harness(*args, "--json").out)
     two = {"least": 2, "mean": 2.0, "most": 2}
     assert told["tokens"] == {
-        role: {"n": each * scenes, **two} for role, each in (("ego", 1), ("helper", 3), ("fusion", 3))
+        role: {"n": each * scenes, **two}
+        for role, each in (("ego", 1), ("helper", 3), ("fusion", 3))
     }
     assert {o["messages"] for o in told["outside"]} == {0, 1, 2, 3}
     assert len(told["outside"]) == every
@@ -360,7 +407,8 @@ def test_help_and_lists_load_no_heavy_package(args: list[str]) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.lstrip().startswith("Usage: ") == ("--help" in args)
-    needs = ["jinja2"] if args == ["prompt", "list"] else []  # whether each prompt is a template at all
+    # whether each prompt is a template at all
+    needs = ["jinja2"] if args == ["prompt", "list"] else []
     assert done.stderr == f"{needs}\n"
 
 
@@ -371,7 +419,9 @@ def test_help_and_lists_load_no_heavy_package(args: list[str]) -> None:
         (["single-local", "6g"], ["shuffled-messages"], "single-local 6g 6g:messages=shuffled"),
         (["6g", "6g:tau=0"], ["no-messages"], "6g 6g:tau=0 6g:loss=1 6g:tau=0,loss=1"),
         (["6g", "6g:loss=1"], ["no-messages"], "6g 6g:loss=1"),
-        (["v2x", "v2x"], ["no-messages", "shuffled-messages"], "v2x v2x:loss=1 v2x:messages=shuffled"),
+        (["v2x", "v2x"], ["no-messages", "shuffled-messages"], 
+            "v2x v2x:loss=1 "
+            "v2x:messages=shuffled"),
     ],
 )  # fmt: skip
 def test_a_control_stands_beside_every_condition_with_a_channel(

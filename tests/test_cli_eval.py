@@ -20,12 +20,20 @@ Said = tuple[int, str, str]
 
 
 @pytest.mark.slow
-def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said], small_path: Path) -> None:
+def test_it_prints_a_table_and_where_the_report_is(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "2", "--seeds", "0:2")
     folder = Path("reports/proxy-v2-small")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
-    for part in ("success % [95 % CI]", "single-local", "v2x", "6g", "n = 2 episodes × 2 channel seeds"):
+    for part in (
+        "success % [95 % CI]",
+        "single-local",
+        "v2x",
+        "6g",
+        "n = 2 episodes × 2 channel seeds",
+    ):
         assert part in out
     assert out.splitlines()[-1] == f"wrote {folder / 'report.html'}"
     assert {p.name for p in folder.iterdir()} >= {
@@ -36,7 +44,9 @@ def test_it_prints_a_table_and_where_the_report_is(harness: Callable[..., Said],
         "summary.csv",
         "report.html",
     }
-    assert "gain, points" in out, "and of balanced success there is none: both layouts have a danger"
+    assert "gain, points" in out, (
+        "and of balanced success there is none: both layouts have a danger"
+    )
 
 
 @pytest.mark.slow
@@ -54,14 +64,20 @@ def test_the_gain_is_of_what_leads(harness: Callable[..., Said], small_path: Pat
     assert plain is not None
     assert gain.value != plain.value
     assert written(gain) in row
-    _, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0", "--condition", "6g", "--out", "6g")
+    _, out, _ = harness(
+        "eval", "--dataset", small_path, "--seeds", "0", "--condition", "6g", "--out", "6g"
+    )
     assert "balanced success" in out
     assert "gain" not in out, "there is no condition to gain over"
 
 
 @pytest.mark.slow
-def test_json_is_the_manifest_and_the_summary(harness: Callable[..., Said], small_path: Path) -> None:
-    code, out, err = harness("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--json")
+def test_json_is_the_manifest_and_the_summary(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
+    code, out, err = harness(
+        "eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--json"
+    )
     told = json.loads(out, parse_constant=pytest.fail)
     assert (code, err) == (0, "")
     assert told["run"] == "reports/proxy-v2-small"
@@ -80,13 +96,17 @@ def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
     assert code == 0
     code, out, err = harness(*args)
     assert (code, out) == (2, "")
-    assert err == "harness: --out run already holds a finished run; choose another folder or delete it\n"
+    assert (
+        err
+        == "harness: --out run already holds a finished run; choose another folder or delete it\n"
+    )
     Path("run/.work").mkdir()  # as if it was killed while it wrote the report
     Path("run/report.html").unlink()
     code, out, err = harness(*args[:-4], "--seeds", "0:2", "--out", "run")
     assert (code, out) == (2, "")
     assert err.startswith(
-        "harness: --out run was begun with --seeds 0:1, and not with --seeds 0,1; repeat its settings, "
+        "harness: --out run was begun with --seeds 0:1, and not with --seeds 0,1; repeat its "
+        "settings, "
     )
     code, again, err = harness(*args)
     assert (code, again, err) == (0, first, "")
@@ -95,8 +115,21 @@ def test_the_same_again_is_refused_and_goes_on_where_it_was_stopped(
 
 
 @pytest.mark.slow
-def test_a_number_behind_the_usual_name_is_said(harness: Callable[..., Said], small_path: Path) -> None:
-    typed = ("eval", "--model", "brake", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--quiet")
+def test_a_number_behind_the_usual_name_is_said(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
+    typed = (
+        "eval",
+        "--model",
+        "brake",
+        "--dataset",
+        small_path,
+        "--limit",
+        "1",
+        "--seeds",
+        "0",
+        "--quiet",
+    )
     assert harness(*typed, "--condition", "single-local")[2] == ""
     code, out, err = harness(*typed, "--condition", "single-local")
     first = "reports/brake-v2-small"
@@ -125,7 +158,17 @@ def test_the_command_in_the_manifest_runs_it_again(
     harness: Callable[..., Said], small_path: Path, tmp_path: Path
 ) -> None:
     harness(
-        "eval", "--dataset", small_path, "--limit", "1", "--seeds", "0,3", "--condition", "6g", "--out", "a b"
+        "eval",
+        "--dataset",
+        small_path,
+        "--limit",
+        "1",
+        "--seeds",
+        "0,3",
+        "--condition",
+        "6g",
+        "--out",
+        "a b",
     )
     manifest = json.loads((tmp_path / "a b" / "run.json").read_text())
     (tmp_path / "a b").rename(tmp_path / "first")
@@ -153,6 +196,9 @@ def test_an_evaluation_loads_no_pandas_and_nothing_that_numpy_loads_late(tmp_pat
         "print(numpy.f2py.__name__, numpy.testing.__name__, file=sys.stderr)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "run")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, str(tmp_path / "run")],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stderr.splitlines()[-2:] == ["['scipy.special']", "numpy.f2py numpy.testing"]

@@ -65,9 +65,18 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
     ("change", "said"),
     [
         ({"nmae": "x"}, "unknown key in r 'nmae'; known: by_name, hops, link, size"),
-        ({"name": "x"}, "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, size"),
-        ({"sise": 1}, "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, size"),
-        ({"link": {"los": 1}}, "unknown key in r [link] 'los'; did you mean 'loss'? known: loss, model"),
+        (
+            {"name": "x"},
+            "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, size",
+        ),
+        (
+            {"sise": 1},
+            "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, size",
+        ),
+        (
+            {"link": {"los": 1}},
+            "unknown key in r [link] 'los'; did you mean 'loss'? known: loss, model",
+        ),
         (
             {"hops": [{"delay": 1}]},
             "unknown key in r [hops.0] 'delay'; did you mean 'delay_s'? known: delay_s",
@@ -92,7 +101,10 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
         ({"size": True}, "r: size = True; allowed: a whole number"),
         ({"size": 0}, "r: size = 0; allowed: a whole number >= 1"),
         ({"size": "1"}, "r: size = '1'; allowed: a whole number"),
-        ({"hops": [{"delay_s": 1}, {"delay_s": "x"}]}, "r [hops.1]: delay_s = 'x'; allowed: a number"),
+        (
+            {"hops": [{"delay_s": 1}, {"delay_s": "x"}]},
+            "r [hops.1]: delay_s = 'x'; allowed: a number",
+        ),
         ({"hops": [{"delay_s": -1}]}, "r [hops.0]: delay_s is negative; give seconds, 0 or more"),
     ],
 )
@@ -141,7 +153,9 @@ KEYS = st.sampled_from(["a", "x.y", "[0]", "...", "with blank", "`"])
 @st.composite
 def kinds(draw: st.DrawFn, depth: int = 3) -> tuple[Any, Any]:
     """A type, and a value that fits it."""
-    shape = draw(st.sampled_from(["leaf", "list", "pair", "table", "optional", "dataclass", "struct"]))
+    shape = draw(
+        st.sampled_from(["leaf", "list", "pair", "table", "optional", "dataclass", "struct"])
+    )
     if not depth or shape == "leaf":
         leaf: tuple[Any, Any] = draw(st.sampled_from(list(LEAVES.items())))
         return leaf
@@ -157,14 +171,18 @@ def kinds(draw: st.DrawFn, depth: int = 3) -> tuple[Any, Any]:
     if shape == "pair":
         return GenericAlias(tuple, (str, kind)), ["x", value]
     if shape == "table":
-        return GenericAlias(dict, (str, kind)), dict.fromkeys(draw(st.sets(KEYS, min_size=1)), value)
+        return GenericAlias(dict, (str, kind)), dict.fromkeys(
+            draw(st.sets(KEYS, min_size=1)), value
+        )
     return kind | None, value
 
 
 def paths(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The paths of all leaves of a value."""
     pairs: Any = (
-        value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ())
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value if isinstance(value, list) else ())
     )
     return [leaf for key, inner in pairs for leaf in paths(inner, (*path, key))] or [path]
 
@@ -175,7 +193,9 @@ def with_other(value: Any, path: tuple[Any, ...], other: Any) -> Any:
         return other
     if isinstance(value, dict):
         return {**value, path[0]: with_other(value[path[0]], path[1:], other)}
-    return [with_other(each, path[1:], other) if n == path[0] else each for n, each in enumerate(value)]
+    return [
+        with_other(each, path[1:], other) if n == path[0] else each for n, each in enumerate(value)
+    ]
 
 
 @given(st.data())
@@ -197,7 +217,9 @@ def test_a_wrong_leaf_anywhere_in_any_record_is_one_line_that_names_it(data: st.
 
 @pytest.mark.parametrize("number", ["nan", "inf"])
 def test_a_number_is_finite_also_where_it_has_no_bounds(number: str) -> None:
-    with pytest.raises(UserError, match=rf"r \[hops\.0\]: delay_s = {number}; allowed: a finite number"):
+    with pytest.raises(
+        UserError, match=rf"r \[hops\.0\]: delay_s = {number}; allowed: a finite number"
+    ):
         convert({**GOOD, "hops": [{"delay_s": float(number)}]}, Route, "r", name="r")
 
 

@@ -30,7 +30,10 @@ def test_a_helper_not_heard_has_no_weight_even_where_its_distance_is_unknown():
 
 
 def test_the_ego_alone_has_all_the_weight():
-    assert inverse_distance_weights(np.array([7.0, 3.0]), np.array([False]), 1.0).tolist() == [1.0, 0.0]
+    assert inverse_distance_weights(np.array([7.0, 3.0]), np.array([False]), 1.0).tolist() == [
+        1.0,
+        0.0,
+    ]
     assert inverse_distance_weights(np.array([7.0]), np.zeros(0, bool), 1.0).tolist() == [1.0]
 
 
@@ -53,7 +56,9 @@ def test_the_logarithmic_pool_is_the_weighted_geometric_mean():
     p = np.array([[0.9, 0.1], [0.1, 0.9]])
     assert log_pool(p, np.array([0.5, 0.5])) == pytest.approx([0.5, 0.5])
     odds = (9 ** (2 / 3)) * ((1 / 9) ** (1 / 3))  # of the first action
-    assert log_pool(p, np.array([2 / 3, 1 / 3])) == pytest.approx([odds / (1 + odds), 1 / (1 + odds)])
+    assert log_pool(p, np.array([2 / 3, 1 / 3])) == pytest.approx(
+        [odds / (1 + odds), 1 / (1 + odds)]
+    )
 
 
 def test_in_a_logarithmic_pool_a_rounded_zero_is_no_veto():
@@ -97,7 +102,9 @@ def heard(draw: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("rule", POOLS)
 @given(case=heard())
 @settings(max_examples=30)
-def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_heard(rule: str, case: Any):
+def test_whatever_the_rule_a_policy_is_a_distribution_and_lies_between_those_heard(
+    rule: str, case: Any
+):
     p, weights = case
     fused = POOLS[rule](p, weights)
     assert fused.sum(axis=-1) == pytest.approx(1.0)

@@ -41,7 +41,9 @@ def schema(asked: Request) -> Any:
 
 compact = st.sampled_from(FORMS).flatmap(lambda form: st.tuples(st.just(form), st.from_regex(
     regex(request(*form)), fullmatch=True)))  # fmt: skip
-numbers = st.floats(0, 1).map(json.dumps) | st.sampled_from(["0", "1", "0.5", "5e-1", "1E0", "0.25e+0"])
+numbers = st.floats(0, 1).map(json.dumps) | st.sampled_from(
+    ["0", "1", "0.5", "5e-1", "1E0", "0.25e+0"]
+)
 
 
 @st.composite
@@ -64,7 +66,8 @@ def loose(draw: st.DrawFn) -> tuple[tuple[str, str], str]:
     return form, f"{draw(blank)}{written(schema(request(*form)))}{draw(blank)}"
 
 
-# -- what fits ----------------------------------------------------------------------------------------------
+# -- what fits
+# ----------------------------------------------------------------------------------------------
 
 
 @given(compact, st.sampled_from(PATTERNS), st.data())
@@ -91,9 +94,12 @@ def test_what_the_schema_allows_fits_and_so_does_its_beginning(
     assert broken(kind, asked, cut, ended=True)
 
 
-# -- what does not ------------------------------------------------------------------------------------------
+# -- what does not
+# ------------------------------------------------------------------------------------------
 
-spoilt = st.tuples(st.integers(0, 200), st.integers(0, 3), st.text(' {}":,0159.-eSLOWERIx\n', max_size=3))
+spoilt = st.tuples(
+    st.integers(0, 200), st.integers(0, 3), st.text(' {}":,0159.-eSLOWERIx\n', max_size=3)
+)
 
 
 def changed(text: str, how: tuple[int, int, str]) -> str:
@@ -108,7 +114,9 @@ def test_it_judges_a_changed_answer_as_the_pattern_does(
 ) -> None:
     form, text = made
     asked, text = request(*form), changed(text, how)
-    assert (broken("vllm", asked, text, ended=True) is None) == bool(re.fullmatch(regex(asked), text))
+    assert (broken("vllm", asked, text, ended=True) is None) == bool(
+        re.fullmatch(regex(asked), text)
+    )
 
 
 @given(loose(), spoilt)
@@ -133,16 +141,26 @@ def test_it_judges_a_changed_answer_as_a_validator_does(
 @pytest.mark.parametrize(
     ("kind", "text", "said"),
     [
-        ("vllm", '{"action_distribution": {"SLOWER":0.70', "' {\"SLOWER\":0.70' after 23 characters"),
+        (
+            "vllm",
+            '{"action_distribution": {"SLOWER":0.70',
+            "' {\"SLOWER\":0.70' after 23 characters",
+        ),
         ("vllm", "The gap is short.", "'The gap is short.' after 0 characters"),
         ("vllm", '{"action_distribution":{"SLOWER":0.7,', "'0.7,' after 33 characters"),
         ("vllm", '{"action_distribution":{"IDLE":', "'\"IDLE\":' after 24 characters"),
         ("generic", '{"action_distribution":{"SLOWER":1.5,', "'1.5,' after 33 characters"),
-        ("generic", '{"action_distribution":{"SLOWER":0.5,"SLOWER"', "'\"SLOWER\"' after 37 characters"),
+        (
+            "generic",
+            '{"action_distribution":{"SLOWER":0.5,"SLOWER"',
+            "'\"SLOWER\"' after 37 characters",
+        ),
         ("generic", '```json\n{"action', "'```json\\n{\"action' after 0 characters"),
     ],
 )
-def test_a_cut_answer_that_can_never_fit_is_said_with_its_place(kind: Kind, text: str, said: str) -> None:
+def test_a_cut_answer_that_can_never_fit_is_said_with_its_place(
+    kind: Kind, text: str, said: str
+) -> None:
     assert broken(kind, request(), text, ended=False) == said
 
 
@@ -154,10 +172,13 @@ def test_what_may_still_become_an_answer_is_cut_off_and_not_broken(kind: Kind, t
     assert broken(kind, request(), text, ended=False) is None
 
 
-# -- through the backend ------------------------------------------------------------------------------------
+# -- through the backend
+# ------------------------------------------------------------------------------------
 
 
-def asked_for(kind: Kind, made: Any, monkeypatch: pytest.MonkeyPatch, thinking: Any = "none") -> Completion:
+def asked_for(
+    kind: Kind, made: Any, monkeypatch: pytest.MonkeyPatch, thinking: Any = "none"
+) -> Completion:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with serving(lambda asked: asked.reply(made)) as there:
         card = Card("mine", "openai", "d", Latency("paper", None, "b"), "m", thinking=thinking,
@@ -180,7 +201,9 @@ def test_a_server_that_drops_the_constraint_gives_no_constrained_answer(
     assert done.error is not None
     assert done.error.startswith("the server did not keep to the constraint that was sent: ")
     assert "; use --answer json, or a server that keeps to it" in done.error
-    assert asked_for("generic", completion(FREE), monkeypatch).text == FREE, "the schema allows blanks"
+    assert asked_for("generic", completion(FREE), monkeypatch).text == FREE, (
+        "the schema allows blanks"
+    )
 
 
 def test_a_constrained_answer_that_was_cut_off_stays_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,5 +240,8 @@ def test_model_check_says_so_in_its_table(
     lines = {line.split(" ")[0]: line for line in out.splitlines()}
     assert code == 1, "its answer in json has actions that are none"
     assert FREE in lines["json"]
-    assert "no answer: the server did not keep to the constraint that was sent: ' {" in lines["constrained"]
+    assert (
+        "no answer: the server did not keep to the constraint that was sent: ' {"
+        in lines["constrained"]
+    )
     assert "no answer: the server gives no log-probabilities" in lines["readout"]

@@ -46,7 +46,9 @@ from harness.world.perception.shared import NOBODY, Heard, merged, stated
 from harness.world.scene_graph import SceneGraph
 from harness.world.state import Part, VehicleState, WorldState
 
-OBJECTS, BOTH, ORACLE = (named_point(f"6g:content={name}") for name in ("objects", "both", "oracle"))
+OBJECTS, BOTH, ORACLE = (
+    named_point(f"6g:content={name}") for name in ("objects", "both", "oracle")
+)
 LOSSLESS = {name: named_point(f"6g:loss=0,content={name}") for name in OF_HELPERS}
 
 
@@ -99,19 +101,26 @@ def test_ids_do_not_say_what_is_one_object(small: Dataset) -> None:
             for graph in case.helpers
         ]
         plain, other = merged(small.scenario, [case, case._replace(helpers=renamed)])
-        places = [[(n.forward_m, n.left_m, n.speed_mps) for n in graph.nodes] for graph in (plain, other)]
+        places = [
+            [(n.forward_m, n.left_m, n.speed_mps) for n in graph.nodes] for graph in (plain, other)
+        ]
         assert places[0] == places[1]
 
 
 @pytest.mark.slow
 def test_what_only_a_helper_sees_is_where_it_is_and_meets_the_ego(small: Dataset) -> None:
-    """The danger behind the corner: its conflict is that of the truth, up to errors of sensors and places."""
+    """The danger behind the corner: its conflict is that of the truth,
+    up to errors of sensors and places.
+    """
     met = 0
     for scene, graph in zip(all_scenes(small), shared(small, all_scenes(small)), strict=True):
         truth = {c.vehicle: c for c in truth_graph(small.scenario, scene.state).conflicts}
         own = {c.vehicle for c in scene.graphs[scene.viewers[0]].conflicts}
         for conflict in graph.conflicts:
-            if conflict.vehicle in truth.keys() - own and conflict.vehicle == scene.record.danger.vehicle:
+            if (
+                conflict.vehicle in truth.keys() - own
+                and conflict.vehicle == scene.record.danger.vehicle
+            ):
                 met += 1
                 true = truth[conflict.vehicle]
                 assert conflict.sector == true.sector
@@ -141,13 +150,17 @@ def test_the_more_precise_report_of_an_object_stands() -> None:
     assert mine.sensors == ("radar",)
     assert node.sensors == ("v2v:v2",)
     assert math.hypot(node.forward_m - 110.0, node.left_m) < 0.5
-    assert math.hypot(mine.forward_m - 110.0, mine.left_m) > math.hypot(node.forward_m - 110.0, node.left_m)
+    assert math.hypot(mine.forward_m - 110.0, mine.left_m) > math.hypot(
+        node.forward_m - 110.0, node.left_m
+    )
 
 
 def test_a_region_is_as_much_in_sight_as_to_who_sees_most_of_it(small: Dataset) -> None:
     for scene, graph in zip(scenes_of(small), shared(small, scenes_of(small)), strict=True):
         for n, sector in enumerate(graph.sectors):
-            assert sector.seen_share == max(scene.graphs[v].sectors[n].seen_share for v in scene.viewers)
+            assert sector.seen_share == max(
+                scene.graphs[v].sectors[n].seen_share for v in scene.viewers
+            )
 
 
 def test_a_message_says_where_its_sender_is_with_the_errors_of_a_beacon(small: Dataset) -> None:
@@ -166,7 +179,9 @@ def test_a_message_says_where_its_sender_is_with_the_errors_of_a_beacon(small: D
 # Who is heard, and when
 
 
-def intents(own: Sequence[float], helpers: Sequence[Sequence[float]], object_bits: float = 800.0) -> Intents:
+def intents(
+    own: Sequence[float], helpers: Sequence[Sequence[float]], object_bits: float = 800.0
+) -> Intents:
     """One decision whose helpers take 5 s to think."""
     n = len(helpers)
     shape = np.ones((1, n))
@@ -183,7 +198,9 @@ CLEAR = Draws(np.full((1, 3, 2), 0.9), np.zeros((1, 3)))
 def decided(point: OperatingPoint, answer: Sequence[float]) -> Any:
     said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
     said = said if point.content.intent else said.without_models()
-    said = replace(said, payload_bits=reply_bits(point.radio.encoding, point.content, said, headers=False))
+    said = replace(
+        said, payload_bits=reply_bits(point.radio.encoding, point.content, said, headers=False)
+    )
     call = lambda on_time: (np.array([answer]), np.full(1, 0.05))  # noqa: E731
     return coordinate(point, said, CLEAR, FusionInputs(call))
 
@@ -206,16 +223,25 @@ def test_what_is_sent_is_paid_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "intent", "objects"), [("etsi", "etsi-intent", "CPM"), ("sae", "sae-intent", "SDSM")]
+    ("encoding", "intent", "objects"),
+    [("etsi", "etsi-intent", "CPM"), ("sae", "sae-intent", "SDSM")],
 )
-def test_a_standards_encoding_has_the_sizes_of_its_messages(encoding: str, intent: str, objects: str) -> None:
+def test_a_standards_encoding_has_the_sizes_of_its_messages(
+    encoding: str, intent: str, objects: str
+) -> None:
     """Three objects, 40 bytes of text, three actions; a message and its signed envelope."""
     counts = Counts(objects=3, actions=3, text_bytes=40)
     sizes = {name: size(name, counts) for name in (intent, objects)}
     packets = {name: float(each.message + each.envelope) for name, each in sizes.items()}
-    by_content = {"intent": packets[intent], "objects": packets[objects], "both": sum(packets.values())}
+    by_content = {
+        "intent": packets[intent],
+        "objects": packets[objects],
+        "both": sum(packets.values()),
+    }
     for content, bits in by_content.items():
-        sent = decided(named_point(f"6g:loss=0,content={content},encoding={encoding}"), [0.0, 1.0, 0.0])
+        sent = decided(
+            named_point(f"6g:loss=0,content={content},encoding={encoding}"), [0.0, 1.0, 0.0]
+        )
         assert sent.reply_bits[0] == 3 * bits
         assert sent.request_bits[0] != 400
 
@@ -225,11 +251,15 @@ def test_headers_count_under_a_physical_radio() -> None:
     content = CONTENTS["both"]
     paper, radio = (reply_bits("etsi", content, said, headers) for headers in (False, True))
     assert (radio > paper + 2 * 8 * 40).all()
-    assert (reply_bits("json", content, said, True) == reply_bits("json", content, said, False)).all()
+    assert (
+        reply_bits("json", content, said, True) == reply_bits("json", content, said, False)
+    ).all()
 
 
 def test_with_both_the_ego_votes_as_it_sees_now() -> None:
-    """Three helpers are sure of the first action; the ego's new answer is one of four voices at 10 m."""
+    """Three helpers are sure of the first action;
+    the ego's new answer is one of four voices at 10 m.
+    """
     point = LOSSLESS["both"].changed(window_s=10.0)
     both, failed = decided(point, [0.0, 0.0, 1.0]), decided(point, [math.nan] * 3)
     assert both.fused[0].tolist() == pytest.approx([0.75, 0.0, 0.25])
@@ -255,16 +285,25 @@ class Planner:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         self.asked += requests
         views = {r.id: r.view for r in requests if r.view is not None}
-        intents = {name: [*distribution(self.scenario, view).values()] for name, view in views.items()}
-        return [Completion(r.id, says(intents[r.id], r.role), None, None, "stop", None, 1) for r in requests]
+        intents = {
+            name: [*distribution(self.scenario, view).values()] for name, view in views.items()
+        }
+        return [
+            Completion(r.id, says(intents[r.id], r.role), None, None, "stop", None, 1)
+            for r in requests
+        ]
 
     def identity(self) -> dict[str, Any]:
         return {"engine": "scripted"}
 
 
 @pytest.mark.slow
-def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(pair: Dataset) -> None:
-    """`objects` and `both` ask the same; a helper's model is asked only where its intent is sent."""
+def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer(
+    pair: Dataset,
+) -> None:
+    """`objects` and `both` ask the same;
+    a helper's model is asked only where its intent is sent.
+    """
     asked = {}
     for point in (OBJECTS, BOTH):
         backend = Planner(pair)
@@ -276,7 +315,9 @@ def test_a_set_of_messages_is_one_question_whatever_else_is_done_with_its_answer
     assert {r.id for r in both.asked} == {*asked[OBJECTS], *asked[BOTH]}
     assert not [name for name in asked[OBJECTS] if "/v1" not in name]
     assert [name for name in asked[BOTH] if "/v1" not in name]
-    assert [name for name in asked[OBJECTS] if name.endswith("/v1+v2!objects+v3!objects+v4!objects")]
+    assert [
+        name for name in asked[OBJECTS] if name.endswith("/v1+v2!objects+v3!objects+v4!objects")
+    ]
 
 
 def test_a_larger_graph_is_a_prompts_graph(pair: Dataset) -> None:
@@ -297,9 +338,12 @@ def test_a_larger_graph_is_a_prompts_graph(pair: Dataset) -> None:
             assert all(f"\n{name} " in shown for name in names if name in new)
 
 
-def test_the_truth_is_no_worse_than_objects_and_these_no_worse_than_nothing(planner: Walked) -> None:
+def test_the_truth_is_no_worse_than_objects_and_these_no_worse_than_nothing(
+    planner: Walked,
+) -> None:
     alone, objects, oracle = (
-        figure(planner, name, "success_rate").value for name in ("single-local", OBJECTS.name, ORACLE.name)
+        figure(planner, name, "success_rate").value
+        for name in ("single-local", OBJECTS.name, ORACLE.name)
     )
     assert alone <= objects <= oracle
 
@@ -314,7 +358,9 @@ def test_the_truth_has_every_sector_of_the_ego_in_sight(pair: Dataset) -> None:
         assert request.view is not None
         own = scenes[request.id.partition("/")[0]].graphs["v1"]
         assert [s.sector for s in request.view.sectors] == [s.sector for s in own.sectors]
-        assert {(s.seen_share, s.occluded, s.by) for s in request.view.sectors} == {(1.0, False, ())}
+        assert {(s.seen_share, s.occluded, s.by) for s in request.view.sectors} == {
+            (1.0, False, ())
+        }
         assert "100% seen" in request.messages[-1]["content"]
 
 
@@ -331,7 +377,9 @@ def test_helpers_that_see_nothing_add_but_themselves(pair: Dataset) -> None:
 
 
 def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(pair: Dataset) -> None:
-    """Every question but the ego's own has the list of one other layout, in which the ego is left out."""
+    """Every question but the ego's own has the list of one other layout,
+    in which the ego is left out.
+    """
     backend, scenes = Planner(pair), {scene.id: scene for scene in all_scenes(pair)}
     walked(spec_of(pair, points=(OBJECTS.changed(messages="shuffled"),), ask="used"), backend)
     sets = [r for r in backend.asked if "!objects" in r.id]
@@ -342,14 +390,19 @@ def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(pair:
         source = scenes[source_of(name, senders)]
         assert source.record.episode != scenes[name].record.episode
         assert source.record.step == scenes[name].record.step
-        own, there = scenes[name].graphs["v1"], [source.graphs[s.partition("!")[0]] for s in senders]
+        own, there = (
+            scenes[name].graphs["v1"],
+            [source.graphs[s.partition("!")[0]] for s in senders],
+        )
         assert request.view is not None
         assert "v1" not in request.view.seen
         for sender, graph in zip(senders, there, strict=True):
             place = stated(pair.scenario.parameters, source.state, sender.partition("!")[0])
             new = {*request.view.nodes} - {*own.nodes}
             assert place.id in {node.id for node in new} or place.id in own.seen
-            assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {*own.seen}, graph
+            assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {
+                *own.seen
+            }, graph
 
 
 @pytest.mark.slow
@@ -358,7 +411,8 @@ def test_with_shuffled_objects_and_words_nothing_is_won(small: Dataset) -> None:
     points = [OBJECTS, OBJECTS.changed(name="shuffled", messages="shuffled")]
     rows = walked(spec_of(small, points=(POINTS["single-local"], *points)), Planner(small))
     alone, own, shuffled = (
-        figure(rows, name, "success_rate").value for name in ("single-local", OBJECTS.name, "shuffled")
+        figure(rows, name, "success_rate").value
+        for name in ("single-local", OBJECTS.name, "shuffled")
     )
     assert shuffled <= alone < own
 
@@ -370,7 +424,9 @@ def test_a_shuffled_run_is_read_as_it_was_asked(small: Dataset, tmp_path: Path) 
     stored = folder.read(run(spec_of(small, points=(point,)), tmp_path / "run").out)
     counted = count(spec_of(small, points=(point,), ask="used"), small, None)
     assert counted["requests_by_role"]["fusion"] == 2 * 7 * counted["scenes"], "of two seeds"
-    asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    asked = {
+        answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers
+    }
     pairs = pytest.importorskip("harness.extensions.learn.training.pairs").pairs
     shuffled = [pair for pair in pairs(stored) if "&from:" in pair["viewer"]]
     assert shuffled
@@ -406,7 +462,9 @@ def test_a_dry_run_counts_the_questions_of_a_content(small: Dataset) -> None:
         ("ghost", lambda true, said: "v99" in said - true),
         (
             "hide",
-            lambda true, said: not said - {"v2", "v3", "v4"} - true and said <= true | {"v2", "v3", "v4"},
+            lambda true, said: (
+                not said - {"v2", "v3", "v4"} - true and said <= true | {"v2", "v3", "v4"}
+            ),
         ),
     ],
 )
@@ -428,7 +486,10 @@ def test_a_ghost_stops_who_believes_it_and_none_is_believed_of_nobody(small: Dat
     points = [OBJECTS.changed(name=f"{share}", attack=f"ghost:share={share}") for share in (0, 1)]
     rows = walked(spec_of(small, points=tuple(points)), Planner(small))
     honest = walked(spec_of(small, points=(OBJECTS,)), Planner(small))
-    assert figure(rows, "0", "success_rate").value == figure(honest, OBJECTS.name, "success_rate").value
+    assert (
+        figure(rows, "0", "success_rate").value
+        == figure(honest, OBJECTS.name, "success_rate").value
+    )
     assert figure(rows, "1", "success_rate").value < figure(rows, "0", "success_rate").value
 
 
@@ -457,7 +518,9 @@ def test_whoever_hides_all_and_invents_a_car_lists_that_car_alone(pair: Dataset,
         assert {*request.view.seen} - {*scenes[name].graphs["v1"].seen} - helpers == {NOBODY}
 
 
-def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(small: Dataset, proxy_run: Path) -> None:
+def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(
+    small: Dataset, proxy_run: Path
+) -> None:
     scene = all_scenes(small)[0]
     answer = structs.replace(next(iter(folder.read(proxy_run).answers)), role="merge", viewer="v1")
     alone, moved = (
@@ -475,7 +538,8 @@ def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(small: Dataset, pr
 def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
     points = (POINTS["single-local"], OBJECTS, BOTH)
     one, many = (
-        run(spec_of(pair, points=points, batch_size=size), tmp_path / f"{size}").out for size in (1, 8)
+        run(spec_of(pair, points=points, batch_size=size), tmp_path / f"{size}").out
+        for size in (1, 8)
     )
     assert same_files(one, many)
 
@@ -483,31 +547,45 @@ def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_whoever_reads_a_run_sees_what_the_ego_was_asked(pair: Dataset, tmp_path: Path) -> None:
     """The prompt of every answer can be shown as it was sent, and a pair for training has it."""
-    spec = spec_of(pair, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to")))
+    spec = spec_of(
+        pair, points=(OBJECTS, BOTH, OBJECTS.changed(attack="ghost:share=1/3", name="lied to"))
+    )
     stored = folder.read(run(spec, tmp_path / "run").out)
     shared = 0
     for answer, _, messages in as_read(stored, pair):
         assert digest(messages) == answer.prompt_sha256
         shared += any("objects" in key for key in answer.heard)
     assert shared > 10
-    asked = {answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers}
+    asked = {
+        answer.prompt_sha256 for answers in stored.answers_by_scene.values() for answer in answers
+    }
     pairs = pytest.importorskip("harness.extensions.learn.training.pairs").pairs
     assert {digest(pair["prompt"]) for pair in pairs(stored)} <= asked
 
 
 @pytest.mark.parametrize("heard", ["v9!objects", "v2!shift:offset_m=x&objects"])
-def test_a_stranger_who_heard_nobody_is_one_line(small: Dataset, proxy_run: Path, heard: str) -> None:
-    answer = structs.replace(next(iter(folder.read(proxy_run).answers)), role="merge", heard=(heard,))
+def test_a_stranger_who_heard_nobody_is_one_line(
+    small: Dataset, proxy_run: Path, heard: str
+) -> None:
+    answer = structs.replace(
+        next(iter(folder.read(proxy_run).answers)), role="merge", heard=(heard,)
+    )
     with pytest.raises(UserError) as error:
         as_asked(small.scenario, all_scenes(small)[0], answer)
     assert "\n" not in str(error.value)
 
 
-def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, proxy_run: Path) -> None:
+def test_a_stranger_who_names_two_attacks_at_once_gets_both(
+    small: Dataset, proxy_run: Path
+) -> None:
     scene = all_scenes(small)[0]
     answer = next(iter(folder.read(proxy_run).answers))
     twice, apart = (
-        as_asked(small.scenario, scene, structs.replace(answer, role="merge", heard=(f"v2!{text}&objects",)))
+        as_asked(
+            small.scenario,
+            scene,
+            structs.replace(answer, role="merge", heard=(f"v2!{text}&objects",)),
+        )
         for text in ("shift:offset_m=6+hide", "shift:offset_m=6&hide")
     )
     assert twice.graphs == apart.graphs
@@ -524,10 +602,19 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(small: Dataset, prox
         ("6g:content=objects,attack=liar", "some of ghost, hide, shift and absent"),
         ("6g:attack=ghost", "one on intents where content lists no objects"),
         ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),
-        ("6g:content=objects,attack=ghost:share=1/3+hide:share=1", "attacks of one share where content is"),
+        (
+            "6g:content=objects,attack=ghost:share=1/3+hide:share=1",
+            "attacks of one share where content is",
+        ),
         ("6g:content=both,attack=liar+ghost:share=1", "attacks of one share where content is both"),
-        ("mode2:content=both,edge=fusion", "none or relay where content is both: a unit sends a policy"),
-        ("6g:content=objects,round_trip=us-drive", "left out where content is objects, which asks twice"),
+        (
+            "mode2:content=both,edge=fusion",
+            "none or relay where content is both: a unit sends a policy",
+        ),
+        (
+            "6g:content=objects,round_trip=us-drive",
+            "left out where content is objects, which asks twice",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_one_line(text: str, wrong: str) -> None:

@@ -44,11 +44,15 @@ def test_another_licence_and_a_longer_context_are_a_line_each(tiny: Card) -> Non
         ([], 0),
     ],
 )
-def test_a_checkpoint_says_its_context_in_its_config(config: object, lines: int, tmp_path: Path) -> None:
+def test_a_checkpoint_says_its_context_in_its_config(
+    config: object, lines: int, tmp_path: Path
+) -> None:
     for name in ("model.safetensors", "tokenizer.json"):
         (tmp_path / name).write_text("{}")
     (tmp_path / "config.json").write_text(json.dumps(config))
-    card = Card("mine", "transformers", "Mine", cards.load("swarm-tiny").latency, weights=str(tmp_path))
+    card = Card(
+        "mine", "transformers", "Mine", cards.load("swarm-tiny").latency, weights=str(tmp_path)
+    )
     assert len(list(contradictions(replace(card, context_tokens=101)))) == lines
 
 

@@ -1,8 +1,8 @@
 """Cooperative decisions played by hand: read them as the specification.
 
-One scene throughout. The ego is 20 m from the conflict zone and in doubt. Three helpers at 10, 20 and
-30 m from the ego, and 10, 20 and 5 m from the zone, answer in 1000 bits each. Everybody infers for
-145 ms. The request has 400 bits. Actions are SLOWER, IDLE, FASTER.
+One scene throughout. The ego is 20 m from the conflict zone and in doubt. Three helpers at 10, 20
+and 30 m from the ego, and 10, 20 and 5 m from the zone, answer in 1000 bits each. Everybody infers
+for 145 ms. The request has 400 bits. Actions are SLOWER, IDLE, FASTER.
 """
 
 from dataclasses import fields
@@ -40,7 +40,9 @@ def play(
         np.full(len(valid), 1000.0),
         np.array(inference_s),
     )
-    return coordinate(point, intents, Draws(np.array(link), np.array(jitter)), FusionInputs(fusion_call))
+    return coordinate(
+        point, intents, Draws(np.array(link), np.array(jitter)), FusionInputs(fusion_call)
+    )
 
 
 def test_alone_the_ego_acts_on_its_own_intent_after_its_own_inference():
@@ -110,7 +112,9 @@ def test_a_helper_whose_request_or_reply_is_lost_keeps_its_slot_and_is_not_fused
 
 
 def test_a_request_is_one_message_of_its_own_and_costs_bits_and_airtime():
-    """Over v2x 400 bits are 40 us and three replies of 1000 bits 300 us; the paper counts replies alone."""
+    """Over v2x 400 bits are 40 us and three replies of 1000 bits 300 us;
+    the paper counts replies alone.
+    """
     decision = play(V2X)
     assert (decision.requests, decision.messages) == (1, 3)
     assert (decision.request_bits, decision.reply_bits) == (400, 3000)
@@ -119,15 +123,26 @@ def test_a_request_is_one_message_of_its_own_and_costs_bits_and_airtime():
     assert (twice.requests, twice.reply_bits) == (1, 3000)
     assert twice.airtime_s == pytest.approx(640e-6), "replies go twice, the request once"
     long = play(V2X.changed(request_bits=10_000.0))
-    assert long.arrival_s == pytest.approx([0.1711, 0.1962, 0.2213]), "a request of 1 ms holds up every reply"
-    slow = play(SIXG.changed(request_bits=2e6), inference_s=(0.145, 0.145, 0.150, 0.165), jitter=(0, 0, 0))
-    assert slow.arrival_s == pytest.approx([0.160005, 0.160005, 0.170005]), "none leaves before it is heard"
+    assert long.arrival_s == pytest.approx([0.1711, 0.1962, 0.2213]), (
+        "a request of 1 ms holds up every reply"
+    )
+    slow = play(
+        SIXG.changed(request_bits=2e6), inference_s=(0.145, 0.145, 0.150, 0.165), jitter=(0, 0, 0)
+    )
+    assert slow.arrival_s == pytest.approx([0.160005, 0.160005, 0.170005]), (
+        "none leaves before it is heard"
+    )
 
 
 @pytest.mark.parametrize("quiet", [{"own": (0.9, 0.05, 0.05)}, {"valid": (False, False, False)}])
 def test_who_asks_nobody_sends_nothing(quiet):
     decision = play(V2X, **quiet)
-    assert (decision.requests, decision.request_bits, decision.reply_bits, decision.airtime_s) == (0, 0, 0, 0)
+    assert (decision.requests, decision.request_bits, decision.reply_bits, decision.airtime_s) == (
+        0,
+        0,
+        0,
+        0,
+    )
     assert decision.latency_s == 0.145
 
 
@@ -237,7 +252,9 @@ def test_a_points_own_loss_replaces_the_profiles():
 
 
 def test_the_papers_proxy_stands_for_the_egos_distance_in_equation_2():
-    """Over 6g everybody is heard. Weights are 1/3.5 : 1/10 : 1/20 : 1/5, the ego's .449 and not .125."""
+    """Over 6g everybody is heard. Weights are 1/3.5 : 1/10 : 1/20 :
+    1/5, the ego's .449 and not .125.
+    """
     near = play(SIXG.changed(ego_distance_m=3.5))
     closeness = np.array([1 / 3.5, 1 / 10, 1 / 20, 1 / 5])
     assert near.weights == pytest.approx(closeness / closeness.sum())
@@ -322,21 +339,27 @@ def test_a_second_answer_that_failed_leaves_the_ego_its_own_intent_but_not_the_t
         ("linear", (0.3125, 0.1, 0.5875)),
         # Products of p^w, p floored at 0.001: .02414, .01297, .39560, over their sum.
         ("log-pool", (0.05578, 0.02997, 0.91425)),
-        # Helpers' 0 of weight 1/2 is SLOWER's lower middle, 0.3 its upper: 0.15; IDLE 0.05; FASTER 0.65.
+        # Helpers' 0 of weight 1/2 is SLOWER's lower middle, 0.3 its upper: 0.15; IDLE 0.05; FASTER
+        # 0.65.
         ("median", (0.15 / 0.85, 0.05 / 0.85, 0.65 / 0.85)),
-        # The middle half of the weight. SLOWER: 0 for .25, .3 for .125, .6 for .125, so .225; .05 and .625.
+        # The middle half of the weight. SLOWER: 0 for .25, .3 for .125, .6 for .125, so .225; .05
+        # and .625.
         ("trimmed-mean", (0.225 / 0.9, 0.05 / 0.9, 0.625 / 0.9)),
     ],
 )
 def test_each_rule_makes_another_policy_of_the_same_messages(rule, policy):
-    """Weights 1/8, 1/4, 1/8, 1/2 of DOUBT, (.8, .1, .1), (.6, .2, .2), (0, 0, 1). None takes time."""
+    """Weights 1/8, 1/4, 1/8, 1/2 of DOUBT, (.8, .1, .1), (.6, .2, .2), (0, 0, 1).
+    None takes time.
+    """
     decision = play(SIXG.changed(consensus=rule))
     assert decision.fused == pytest.approx(policy, abs=2e-4)
     assert decision.latency_s == decision.exchange_s
 
 
 def test_block_fading_is_one_draw_for_all_steps_of_an_episode():
-    """Two episodes of six steps, the link draws without the step axis filled in: 18 messages each."""
+    """Two episodes of six steps, the link draws without the step axis filled in:
+    18 messages each.
+    """
     rng = np.random.default_rng(0)
     link = rng.random((2, 1, 3, 2))
     own, helpers = np.full((2, 6, 3), 1 / 3), rng.dirichlet(np.ones(3), (2, 6, 3))
@@ -366,6 +389,10 @@ def test_every_array_of_a_batch_has_the_batch_in_front():
         Draws(rng.random((5, 2, 4, 2)), rng.random((5, 2, 4))),
     )
     per_helper = {"asked", "infers", "delivered", "arrival_s", "on_time", "trust"}
-    inner = {"own": (3,), "fused": (3,), "weights": (5,), "state": (0,)} | dict.fromkeys(per_helper, (4,))
+    inner = {"own": (3,), "fused": (3,), "weights": (5,), "state": (0,)} | dict.fromkeys(
+        per_helper, (4,)
+    )
     for field in fields(decisions):
-        assert getattr(decisions, field.name).shape == (5, 2, *inner.get(field.name, ())), field.name
+        assert getattr(decisions, field.name).shape == (5, 2, *inner.get(field.name, ())), (
+            field.name
+        )

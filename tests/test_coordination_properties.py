@@ -20,12 +20,16 @@ Case = tuple[Intents, Draws]
 
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
-    """Four decisions with up to five helpers, of which some are absent and all NaN; some answers are sure."""
+    """Four decisions with up to five helpers, of which some are absent and all NaN;
+    some answers are sure.
+    """
     helpers, actions = draw(st.integers(0, 5)), draw(st.integers(2, 4))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     shape = (4, helpers)
     valid = rng.random(shape) < draw(st.sampled_from([0.0, 0.5, 1.0]))
-    intents = rng.dirichlet(np.full(actions, draw(st.sampled_from([0.05, 1.0, 50.0]))), (4, 1 + helpers))
+    intents = rng.dirichlet(
+        np.full(actions, draw(st.sampled_from([0.05, 1.0, 50.0]))), (4, 1 + helpers)
+    )
     range_m = rng.uniform(0, 150, shape)
     return Intents(
         own=intents[:, 0],
@@ -134,11 +138,15 @@ def test_a_single_decision_is_a_row_of_the_batch(point, case):
 def test_a_threshold_above_the_uniform_entropy_is_the_single_local_point(point, case):
     never = point.changed(tau_nats=math.log(case[0].own.shape[-1]) + 1e-9)
     # Helpers who might be asked infer from the start.
-    assert_same(coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss", "infers")
+    assert_same(
+        coordinate(never, *case), coordinate(POINTS["single-local"], *case), "loss", "infers"
+    )
 
 
 @given(cases(), st.floats(0, 1.2), st.floats(0, 1.2))
 def test_a_higher_threshold_never_asks_more(case, one, other):
     low, high = sorted((one, other))
-    eager, calm = (coordinate(OperatingPoint.of("x", "v2x", tau_nats=tau), *case) for tau in (low, high))
+    eager, calm = (
+        coordinate(OperatingPoint.of("x", "v2x", tau_nats=tau), *case) for tau in (low, high)
+    )
     assert np.all(calm.messages <= eager.messages)

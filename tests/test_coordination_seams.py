@@ -57,7 +57,8 @@ def step(
 
 
 def test_a_rule_with_memory_is_driven_step_by_step():
-    """Now it is .75, then .5 as nobody is heard, then .25: means with what was before are .75, .625, .4375.
+    """Now it is .75, then .5 as nobody is heard, then .25:
+    means with what was before are .75, .625, .4375.
 
     The ego that hears nobody acts on its own intent, and the rule remembers that it did.
     A second episode in the same arrays hears (.5, .5) throughout and stays where it is.
@@ -84,7 +85,9 @@ def test_an_episode_takes_its_memory_along_wherever_its_row_is():
 
 
 def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
-    """Sure of the first action, it does not ask. The rule keeps half of (.9, .1) and half of (.25, .75)."""
+    """Sure of the first action, it does not ask.
+    The rule keeps half of (.9, .1) and half of (.25, .75).
+    """
     point = OperatingPoint.of("x", "6g", tau_nats=0.5, consensus="smoothing")
     doubt = step(point, (0.0, 1.0), True)
     sure = step(point, (0.0, 1.0), True, doubt.state, own=(0.9, 0.1))
@@ -94,7 +97,10 @@ def test_a_rule_with_memory_also_sees_the_steps_in_which_the_ego_asks_nobody():
 
 
 def test_a_rule_without_memory_leaves_no_state():
-    assert step(OperatingPoint.of("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (1, 0)
+    assert step(OperatingPoint.of("x", "6g", tau_nats=0.5), [(1.0, 0.0)], [True]).state.shape == (
+        1,
+        0,
+    )
 
 
 def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
@@ -107,7 +113,9 @@ def three(range_m=(10.0, 30.0, 50.0), link=0.8) -> tuple[Intents, Draws]:
 
 
 def test_a_channel_may_lose_each_link_by_itself():
-    """1 % a metre: where all draws are .35, the links of 10 and 30 m are up and that of 50 is not."""
+    """1 % a metre: where all draws are .35,
+    the links of 10 and 30 m are up and that of 50 is not.
+    """
     point = OperatingPoint.of("x", "fog", tau_nats=0.5)
     decision = coordinate(point, *three(link=0.35))
     assert decision.delivered.tolist() == [True, True, False]
@@ -135,7 +143,8 @@ def test_an_override_that_a_channel_does_not_have_is_refused(override):
         OperatingPoint.of("x", "fog", **override)
 
 
-# -- every plug-in, those of installed packages included ---------------------------------------------------
+# -- every plug-in, those of installed packages included
+# ---------------------------------------------------
 
 
 def somewhere(shape: tuple[int, ...], rng: np.random.Generator) -> Site:
@@ -158,9 +167,14 @@ def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws
         asked | (rng.random(shape) < 0.5),
         asked & (rng.random(shape) < 0.5),
         400.0,
-        replace(somewhere(shape, rng), units={Unit(0.0, 0.0, 5.0): somewhere((shape[0], 1 + shape[1]), rng)}),
+        replace(
+            somewhere(shape, rng),
+            units={Unit(0.0, 0.0, 5.0): somewhere((shape[0], 1 + shape[1]), rng)},
+        ),
     )
-    trips = Trips(rng.integers(0, 3, shape[0]), rng.integers(0, 9, shape[0]), rng.integers(0, 6, shape[0]), 6)
+    trips = Trips(
+        rng.integers(0, 3, shape[0]), rng.integers(0, 9, shape[0]), rng.integers(0, 6, shape[0]), 6
+    )
     return links, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
 
 
@@ -229,7 +243,8 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         state, alone = fused.state, single.state
 
 
-# -- how packages add them ---------------------------------------------------------------------------------
+# -- how packages add them
+# ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -266,15 +281,18 @@ def test_a_package_adds_a_channel_and_replaces_none():
     [
         (
             "broken",
-            r"plug-in 'broken' \(swarmdrive.channels\): radios:NONE does not load \(.*'NONE'.*\); repair",
+            r"plug-in 'broken' \(swarmdrive.channels\): radios:NONE does not load \(.*'NONE'.*\); "
+            r"repair",
         ),
         (
             "odd",
-            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; repair",
+            r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; "
+            r"repair",
         ),
         (
             "unmade",
-            r"plug-in 'unmade' \(swarmdrive.channels\): radios:Radio is of type type and no Channel; repair",
+            r"plug-in 'unmade' \(swarmdrive.channels\): radios:Radio is of type type and no "
+            r"Channel; repair",
         ),
     ],
 )
@@ -297,8 +315,14 @@ def pooled(p: Floats, weights: Floats) -> Floats:
 @pytest.mark.parametrize(
     ("pool", "says"),
     [
-        (lambda p, w: linear_pool(p, w) * np.nan, "fused policies that are no distributions, such as [nan"),
-        (lambda p, w: linear_pool(p, w) * 2, "fused policies that are no distributions, such as [1.0, 1.0"),
+        (
+            lambda p, w: linear_pool(p, w) * np.nan,
+            "fused policies that are no distributions, such as [nan",
+        ),
+        (
+            lambda p, w: linear_pool(p, w) * 2,
+            "fused policies that are no distributions, such as [1.0, 1.0",
+        ),
         (lambda p, w: [[0.5, 0.5]], "fused policies of type list, not an array"),
         (pooled, "assignment destination is read-only"),
     ],
@@ -356,8 +380,12 @@ class Bent(Fog):
 @pytest.mark.parametrize(
     ("way", "says"),
     [
-        ("integers", "ValueError: up of type int64, not bool"), ("read-only", "ValueError: assignment"),
-        ("delay", "ValueError: a delay that is negative"), ("loss", "ValueError: a loss that is no"),
+        ("integers", 
+            "ValueError: up of "
+            "type int64, not bool"), ("read-only", "ValueError: assignment"),
+        ("delay", 
+            "ValueError: a delay "
+            "that is negative"), ("loss", "ValueError: a loss that is no"),
         ("shape", "ValueError: up of shape (1,), not (3,)"), ("other", "KeyError: 'other'"),
     ],
 )  # fmt: skip

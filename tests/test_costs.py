@@ -1,4 +1,6 @@
-"""What a run's questions cost, by the price in a card, and a limit that stops it before it asks more."""
+"""What a run's questions cost, by the price in a card,
+and a limit that stops it before it asks more.
+"""
 
 import json
 import re
@@ -30,7 +32,8 @@ currency = "EUR"
 source = "paper"
 basis = "none declared"
 """
-EACH = (12 * 1000 + 20 * 2000) / 1e6  # of an answer of 12 tokens read and 20 written, which the server states
+# of an answer of 12 tokens read and 20 written, which the server states
+EACH = (12 * 1000 + 20 * 2000) / 1e6
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +52,18 @@ def there(tmp_path: Path) -> Any:
 
 
 def typed_eval(data: Path, *more: str) -> tuple[str | Path, ...]:
-    fixed = ("--condition", "6g", "--seeds", "0:1", "--ask", "all", "--batch-size", "4", "--out", "run")
+    fixed = (
+        "--condition",
+        "6g",
+        "--seeds",
+        "0:1",
+        "--ask",
+        "all",
+        "--batch-size",
+        "4",
+        "--out",
+        "run",
+    )
     return "eval", "--model", "mine", "--dataset", data, *fixed, *more
 
 
@@ -88,7 +102,8 @@ def test_a_limit_stops_before_more_is_asked_and_the_same_command_goes_on(
     first = len(there.asked)
     assert code == 3
     assert re.search(
-        r"harness: [\d.]+ EUR of --max-cost 4.16 are spent; all answers are kept, and the same", said
+        r"harness: [\d.]+ EUR of --max-cost 4.16 are spent; all answers are kept, and the same",
+        said,
     )
     # Chunks of 64 are asked whole, and those on their way when it is spent still come.
     assert 80 <= first <= 80 + 3 * 64
@@ -115,8 +130,12 @@ def test_a_limit_that_no_tokens_could_reach_stops_the_run(
         typed = typed_eval(small_path, "--no-cache")
         code, _, said = harness(*typed, "--max-cost", "1")
         first = len(server.asked)
-        assert (code, said.count("\n")) == (3, 2), "none of its answers can be read, which is said, too"
-        assert "mine does not say how many tokens its answers take, so --max-cost cannot hold" in said
+        assert (code, said.count("\n")) == (3, 2), (
+            "none of its answers can be read, which is said, too"
+        )
+        assert (
+            "mine does not say how many tokens its answers take, so --max-cost cannot hold" in said
+        )
         assert 0 < first <= 3 * 64
         assert harness(*typed)[0] == 0
         assert len(server.asked) > first
@@ -126,7 +145,10 @@ def test_a_limit_that_no_tokens_could_reach_stops_the_run(
 
 def test_a_dry_run_says_what_it_would_cost(there: Server, two_path: Path, harness: Typed) -> None:
     tokenizer = Path(cards.__file__).parents[2] / "models/swarm-tiny/tokenizer.json"
-    typed = (*typed_eval(two_path, "--limit", "1", "--dry-run", "--tokenizer", str(tokenizer)), "--json")
+    typed = (
+        *typed_eval(two_path, "--limit", "1", "--dry-run", "--tokenizer", str(tokenizer)),
+        "--json",
+    )
     counted = json.loads(harness(*typed)[1])
     n = counted["requests_by_role"]
     tokens = sum(each["n"] * each["mean"] for each in counted["prompt_tokens"].values())
@@ -135,8 +157,8 @@ def test_a_dry_run_says_what_it_would_cost(there: Server, two_path: Path, harnes
     assert cost["answers"] > sum(n.values()) * 2000 / 1e6
     said = harness(*typed[:-3], "--repeats", "2", "--temperature", "1")[1]
     assert (
-        f"cost of mine, EUR: prompts not counted, {2 * cost['answers']:.4g} for answers of the greatest"
-        in said
+        f"cost of mine, EUR: prompts not counted, {2 * cost['answers']:.4g} for answers of the "
+        f"greatest" in said
     )
     assert there.asked == []
 
@@ -150,21 +172,29 @@ def test_a_limit_says_whose_answers_it_does_not_count(
     typed = typed_eval(two_path, "--limit", "1", "--max-cost", "99", "--no-cache", "--quiet")
     says = "harness: --max-cost 99: other has no price and is not counted\n"
     assert harness(*typed, "--helper-model", "other") == (0, "", says)
-    assert harness(*typed, "--helper-model", "proxy", "--out", "rule") == (0, "", ""), "a rule costs nothing"
+    assert harness(*typed, "--helper-model", "proxy", "--out", "rule") == (0, "", ""), (
+        "a rule costs nothing"
+    )
 
 
 @pytest.mark.parametrize(
     ("model", "amount", "words"),
     [
-        ("proxy", "2", "--max-cost 2: proxy has no price; give its card a [price] with input, output and"),
-        ("mine", "0", "--max-cost 0: give an amount above 0, in the currency of the card's [price]"),
+        ("proxy", "2", 
+            "--max-cost 2: proxy has no price; give its "
+            "card a [price] with input, output and"),
+        ("mine", "0", 
+            "--max-cost 0: give an amount above 0, in "
+            "the currency of the card's [price]"),
         ("mine", "nan", "--max-cost nan: give an amount above 0"),
     ],
 )  # fmt: skip
 def test_a_limit_that_limits_nothing_is_refused(
     model: str, amount: str, words: str, there: Server, two_path: Path, harness: Typed
 ) -> None:
-    code, _, said = harness(*typed_eval(two_path, "--limit", "1", "--max-cost", amount), "--model", model)
+    code, _, said = harness(
+        *typed_eval(two_path, "--limit", "1", "--max-cost", amount), "--model", model
+    )
     assert code == 2
     assert words in said
     assert not Path("run").exists()
@@ -200,7 +230,10 @@ def test_a_suite_costs_what_its_runs_cost(there: Server, harness: Typed) -> None
     )  # fmt: skip
     assert code == 0, error
     asked = len(there.asked)
-    assert sum(cost_of(f"suite/{run.name}")["mine"]["asked"] for run in Path("suite").glob("*-v*")) == asked
+    assert (
+        sum(cost_of(f"suite/{run.name}")["mine"]["asked"] for run in Path("suite").glob("*-v*"))
+        == asked
+    )
     assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
 
 

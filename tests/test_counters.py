@@ -1,4 +1,6 @@
-"""Meters of energy, by fake trees of /sys and a fake NVML: no machine of ours has one that can be read."""
+"""Meters of energy, by fake trees of /sys and a fake NVML:
+no machine of ours has one that can be read.
+"""
 
 import sys
 import time
@@ -34,7 +36,9 @@ def test_a_machine_without_meters_has_none(tmp_path: Path):
 def test_rapl_counts_microjoules_and_begins_anew_at_its_end(tmp_path: Path):
     """Of 1000 µJ at most: from 900 to 100 are 200. A part of the package is left out."""
     tree = tmp_path / "class/powercap"
-    package = written(tree / "intel-rapl:0", name="package-0", energy_uj=900, max_energy_range_uj=1000)
+    package = written(
+        tree / "intel-rapl:0", name="package-0", energy_uj=900, max_energy_range_uj=1000
+    )
     written(tree / "intel-rapl:0:0", name="core", energy_uj=5, max_energy_range_uj=1000)
     [meter] = counters(tmp_path)
     assert meter.name == "rapl package-0"
@@ -51,7 +55,14 @@ def test_a_counter_that_nobody_may_read_is_none(tmp_path: Path):
 def test_a_jetsons_rails_state_power_which_is_summed_up(tmp_path: Path):
     """5 V and 2 A are 10 W: over 0.2 s some 2 J."""
     rails = tmp_path / "bus/i2c/drivers/ina3221/1-0040/hwmon/hwmon3"
-    written(rails, in1_label="VDD_IN", in1_input=5000, curr1_input=2000, in2_label="VDD_CPU", in2_input="x")
+    written(
+        rails,
+        in1_label="VDD_IN",
+        in1_input=5000,
+        curr1_input=2000,
+        in2_label="VDD_CPU",
+        in2_input="x",
+    )
     [meter] = counters(tmp_path)
     assert meter.name == "jetson VDD_IN"
     begun = time.perf_counter()
@@ -109,9 +120,13 @@ class Slow:
 
 
 def test_an_answers_joules_are_those_of_asking_with_idling_apart(monkeypatch: pytest.MonkeyPatch):
-    """0.1 s at 20 W are 2 J, of which 0.5 are idling. One answer warms up and counts for nothing."""
+    """0.1 s at 20 W are 2 J, of which 0.5 are idling.
+    One answer warms up and counts for nothing.
+    """
     meter = Meter()
-    monkeypatch.setattr("harness.studies.device_power.time", SimpleNamespace(perf_counter=lambda: meter.now))
+    monkeypatch.setattr(
+        "harness.studies.device_power.time", SimpleNamespace(perf_counter=lambda: meter.now)
+    )
     backend, done = Slow(meter), list[int]()
     requests: Any = [SimpleNamespace(id=name) for name in "abc"]
     [drawn], n = measure(

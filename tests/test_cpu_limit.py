@@ -61,16 +61,32 @@ def test_short():
 def test_long_tests_fail_unless_they_say_so_or_others_share_what_takes_long(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(TESTS)
     here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    command = (sys.executable, "-m", "pytest", "-p", "conftest", "-q", "--cpu-limit", "0.02", "test_it.py")
+    command = (
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "conftest",
+        "-q",
+        "--cpu-limit",
+        "0.02",
+        "test_it.py",
+    )
     done = subprocess.run(
-        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": here}, capture_output=True, text=True
+        command,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": here},
+        capture_output=True,
+        text=True,
     )
     failed = re.findall(r"FAILED test_it.py::(\w+)", done.stdout)
     expected = ["test_long", "test_with_a_long_fixture_of_its_own", "test_long_and_slow"]
     assert failed == expected, done.stdout + done.stderr
     for tier in ("slow", "exhaustive"):
         assert f"allowed 0.02: make it cheaper (CONTRIBUTING.md), or mark it {tier}" in done.stdout
-    assert re.search(r"^CPU s of tests: \d+; the ten dearest files: test_it.py \d+$", done.stdout, re.M)
+    assert re.search(
+        r"^CPU s of tests: \d+; the ten dearest files: test_it.py \d+$", done.stdout, re.M
+    )
 
 
 def test_the_shares_part_all_tests_and_a_function_is_in_one_with_all_its_parameters() -> None:

@@ -33,7 +33,9 @@ def deciding(
     data: Dataset, prompt: str = "v9", points: Sequence[str] = ("single-local",), **how: Any
 ) -> Spec:
     spec = spec_of(data, "swarm-tiny", points=tuple(map(named_point, points)))
-    return with_ego(spec, prompt=versions.load(prompt), **{"answer": "decision", "letters": None, **how})
+    return with_ego(
+        spec, prompt=versions.load(prompt), **{"answer": "decision", "letters": None, **how}
+    )
 
 
 def asked(data: Dataset, **options: Any) -> list[Request]:
@@ -73,7 +75,9 @@ def test_orders_share_the_state_and_list_the_options_as_the_letters(data: Datase
         assert text.startswith(request.question.state + "\n")
         lines = text.removeprefix(request.question.state + "\n").splitlines()
         listed = [line.partition(":")[0] for line in lines[:-1]]
-        letters = ", ".join(f"{letter} {action}" for letter, action in zip("ABC", listed, strict=True))
+        letters = ", ".join(
+            f"{letter} {action}" for letter, action in zip("ABC", listed, strict=True)
+        )
         assert lines[-1] == f"Answer with one letter: {letters}."
 
 
@@ -83,7 +87,10 @@ def test_a_scenario_may_say_what_its_actions_mean(data: Dataset) -> None:
     graph = next(iter(scenes_of(data)[0].graphs.values()))
     question = agent.chats(graph, own.actions, own.prompt_words)["question"]
     assert question.meanings["IDLE"] == "wait for the robot"
-    assert agent.chats(graph, ("HOVER", "IDLE"), own.prompt_words)["question"].meanings["HOVER"] is None
+    assert (
+        agent.chats(graph, ("HOVER", "IDLE"), own.prompt_words)["question"].meanings["HOVER"]
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -104,10 +111,14 @@ def test_what_a_decision_cannot_do_is_refused_in_one_line(
 
 def test_a_decision_is_not_sampled_and_helps_an_ego_that_is(data: Dataset) -> None:
     spec = deciding(data)
-    with pytest.raises(UserError, match=r"--temperature 0.7: a decision is a distribution already; use"):
+    with pytest.raises(
+        UserError, match=r"--temperature 0.7: a decision is a distribution already; use"
+    ):
         spec.changed(temperature=0.7)
     written = replace(spec.ego, answer="json", letters=None)
-    mixed = replace(spec, ego=written, helpers=(spec.ego,)).changed(temperature=0.7, sampling_seed=1)
+    mixed = replace(spec, ego=written, helpers=(spec.ego,)).changed(
+        temperature=0.7, sampling_seed=1
+    )
     ego, *helpers = requests(mixed, scenes_of(data)[:1])
     assert (ego.temperature, ego.sample, ego.question) == (0.7, 1, None)
     assert {(helper.temperature, helper.question is None) for helper in helpers} == {(0.0, False)}
@@ -116,20 +127,33 @@ def test_a_decision_is_not_sampled_and_helps_an_ego_that_is(data: Dataset) -> No
 def test_a_refusal_is_an_answer_that_failed_and_no_fault_of_the_engine(data: Dataset) -> None:
     request = asked(data)[0]
     answer = answer_of(request, Completion(request.id, "", 10, 0, "refusal", None, 1))
-    assert (answer.status, answer.verdict, answer.intent, answer.error) == ("refused", "failed", None, None)
+    assert (answer.status, answer.verdict, answer.intent, answer.error) == (
+        "refused",
+        "failed",
+        None,
+        None,
+    )
     assert answer_of(request, failed(request, "gone")).status == "engine_error"
-    assert parse("{}", role="ego", actions=("IDLE",), finish_reason="refusal").status is Status.REFUSED
+    assert (
+        parse("{}", role="ego", actions=("IDLE",), finish_reason="refusal").status is Status.REFUSED
+    )
 
 
 @pytest.mark.slow
-def test_a_chat_model_decides_by_a_read_out_and_its_run_is_replayed(data: Dataset, tmp_path: Path) -> None:
+def test_a_chat_model_decides_by_a_read_out_and_its_run_is_replayed(
+    data: Dataset, tmp_path: Path
+) -> None:
     pytest.importorskip("llama_cpp")
-    spec = deciding(data, points=("single-local", "6g", "6g:loss=0,tau=0,content=objects"), flip=True)
+    spec = deciding(
+        data, points=("single-local", "6g", "6g:loss=0,tau=0,content=objects"), flip=True
+    )
     run(spec, tmp_path / "a")
     first = folder.read(tmp_path / "a")
     assert {answer.status for answer in first.answers} == {"strict"}
     assert all(answer.label_mass is not None and answer.message is None for answer in first.answers)
-    assert any(answer.heard for answer in first.answers), "the ego is asked once more, about objects"
+    assert any(answer.heard for answer in first.answers), (
+        "the ego is asked once more, about objects"
+    )
     assert first.manifest.answer == "decision"
     replayed = with_ego(spec, card=cards.resolve(f"replay:{tmp_path / 'a'}"))
     run(replayed, tmp_path / "b")
@@ -138,5 +162,7 @@ def test_a_chat_model_decides_by_a_read_out_and_its_run_is_replayed(data: Datase
     assert list(again.decisions.labels("action")) == list(first.decisions.labels("action"))
     with pytest.raises(UserError, match="--answer decision; replay it with the same"):
         run(with_ego(replayed, answer="readout"), tmp_path / "c")
-    texts = {json.loads(a.raw)["action_distribution"].keys() == set(data.actions) for a in first.answers}
+    texts = {
+        json.loads(a.raw)["action_distribution"].keys() == set(data.actions) for a in first.answers
+    }
     assert texts == {True}

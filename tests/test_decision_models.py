@@ -1,4 +1,5 @@
-"""Models that decide and write nothing: two wire shapes, by servers after their documents, and a real one.
+"""Models that decide and write nothing:
+two wire shapes, by servers after their documents, and a real one.
 
 llama.cpp's and OpenAI's own programs are not here. `sparrow-decider` is, and so is its server.
 """
@@ -66,17 +67,28 @@ def answer(wire: str, shares: Any = SHARES, kind: str = "choice", **usage: int) 
     """What the documents of a wire shape show as an answer."""
     if wire == "systemone":
         body: Any = {
-            "action": {"type": kind, "choice": "SLOWER", "probabilities": shares, "confidence": 0.55}
+            "action": {
+                "type": kind,
+                "choice": "SLOWER",
+                "probabilities": shares,
+                "confidence": 0.55,
+            }
         }
     else:
         listed = [{"value": value, "probability": p} for value, p in dict(shares).items()]
         body = [{"type": kind, "name": "action", "choice": "SLOWER", "probabilities": listed}]
         body = [{"type": kind, "name": "action"}] if kind == "refusal" else body
-    return {"model": "default", "answers": body, "usage": {"input_tokens": 90, "output_tokens": 0, **usage}}
+    return {
+        "model": "default",
+        "answers": body,
+        "usage": {"input_tokens": 90, "output_tokens": 0, **usage},
+    }
 
 
 @contextmanager
-def opened(wire: str, play: Callable[[Asked], None], **changes: Any) -> Iterator[tuple[Server, Backend]]:
+def opened(
+    wire: str, play: Callable[[Asked], None], **changes: Any
+) -> Iterator[tuple[Server, Backend]]:
     with serving(play) as there:
         yield there, open_backend(card_at(wire, there.url, **changes), batch_size=4)
 
@@ -128,11 +140,16 @@ def test_a_flipped_question_lists_its_options_in_reverse(wire: str, data: Datase
         for got in there.asked
     ]
     assert listed == [list(question.actions), list(question.actions[::-1])]
-    assert flip.compared(answer_of(question, done), answer_of(flip.asked(question), mirror)).flipped is False
+    assert (
+        flip.compared(answer_of(question, done), answer_of(flip.asked(question), mirror)).flipped
+        is False
+    )
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_a_picture_goes_before_the_state_and_is_shown_by_its_digest(wire: str, asked: list[Request]) -> None:
+def test_a_picture_goes_before_the_state_and_is_shown_by_its_digest(
+    wire: str, asked: list[Request]
+) -> None:
     seen = replace(asked[0], image=Image(np.zeros((2, 4, 3), dtype=np.uint8)))
     with opened(wire, lambda got: got.reply(answer(wire))) as (there, backend):
         assert backend.complete([seen])[0].error is None
@@ -145,7 +162,11 @@ def test_a_picture_goes_before_the_state_and_is_shown_by_its_digest(wire: str, a
     else:
         [message] = body["input"]
         picture, text = message["content"]
-        assert (message["role"], picture["type"], text["type"]) == ("user", "input_image", "input_text")
+        assert (message["role"], picture["type"], text["type"]) == (
+            "user",
+            "input_image",
+            "input_text",
+        )
         url = picture["image_url"]
     assert url.startswith("data:image/png;base64,")
 
@@ -181,9 +202,18 @@ def test_a_question_may_be_refused(wire: str, asked: list[Request]) -> None:
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize(
     "body",
-    [{}, [], {"answers": None}, {"answers": {"action": 1}}, {"answers": [{"type": "choice"}]}, "words"],
+    [
+        {},
+        [],
+        {"answers": None},
+        {"answers": {"action": 1}},
+        {"answers": [{"type": "choice"}]},
+        "words",
+    ],
 )
-def test_whatever_else_comes_is_an_error_in_one_line(wire: str, body: Any, asked: list[Request]) -> None:
+def test_whatever_else_comes_is_an_error_in_one_line(
+    wire: str, body: Any, asked: list[Request]
+) -> None:
     with opened(wire, lambda got: got.reply(body)) as (_, backend):
         [done] = backend.complete(asked[:1])
     assert done.error == "the answer is no decision: it has no probabilities of the question"
@@ -235,11 +265,15 @@ def test_a_model_is_known_by_what_its_server_says_of_it() -> None:
         backend = open_backend(card_at("systemone", there.url))
         assert backend.identity()["states"]["architecture.output_modalities"] == '["decisions"]'
         chat = replace(card_at("systemone", there.url), engine="openai")
-        with pytest.raises(UserError, match="is a decision model, which writes nothing; give a card with"):
+        with pytest.raises(
+            UserError, match="is a decision model, which writes nothing; give a card with"
+        ):
             open_backend(chat)
     with (
         serving(play, listed(["text"])) as there,
-        pytest.raises(UserError, match='writes text and decides nothing; give a card with engine = "openai"'),
+        pytest.raises(
+            UserError, match='writes text and decides nothing; give a card with engine = "openai"'
+        ),
     ):
         open_backend(card_at("systemone", there.url))
 
@@ -252,7 +286,9 @@ def test_a_gguf_file_of_a_decision_model_says_so(tmp_path: Path) -> None:
     pairs = b"".join(text(key) + struct.pack("<I", 8) + text(value) for key, value in facts.items())
     file = tmp_path / "kev.gguf"
     file.write_bytes(struct.pack("<4sIQQ", b"GGUF", 3, 0, len(facts)) + pairs)
-    with pytest.raises(UserError, match=r"is a decision model \(kev\), which no engine opens here; serve it"):
+    with pytest.raises(
+        UserError, match=r"is a decision model \(kev\), which no engine opens here; serve it"
+    ):
         cards.resolve(str(file))
 
 
@@ -260,7 +296,10 @@ def test_a_gguf_file_of_a_decision_model_says_so(tmp_path: Path) -> None:
     ("how", "reason"),
     [
         ({}, "--answer json: systemone-example cannot answer so; use decision"),
-        ({"answer": "decision", "letters": "cyclic"}, "--letters cyclic: systemone-example reads no letters"),
+        (
+            {"answer": "decision", "letters": "cyclic"},
+            "--letters cyclic: systemone-example reads no letters",
+        ),
         ({"answer": "decision", "thinking": True}, "--thinking: systemone-example cannot think"),
     ],
 )
@@ -269,7 +308,8 @@ def test_a_decision_model_does_nothing_else(how: dict[str, Any], reason: str) ->
         Agent(cards.load("systemone-example"), versions.load("v9"), **how)
 
 
-# -- a real one -------------------------------------------------------------------------------------
+# -- a real one
+# -------------------------------------------------------------------------------------
 
 
 def questions_of(name: str) -> tuple[Spec, list[Request]]:
@@ -280,7 +320,9 @@ def questions_of(name: str) -> tuple[Spec, list[Request]]:
 
 
 def test_every_family_is_tried() -> None:
-    assert {load(find(name), limit=1).scenario.name for name in DATASETS} == set(scenarios.witnessed())
+    assert {load(find(name), limit=1).scenario.name for name in DATASETS} == set(
+        scenarios.witnessed()
+    )
 
 
 def listening(port: int) -> bool:
@@ -322,11 +364,14 @@ def test_a_real_model_answers_in_process_as_through_its_own_server(kind: str) ->
 
 
 @pytest.mark.slow
-def test_a_real_model_drives_and_its_run_is_flipped_and_replayed(data: Dataset, tmp_path: Path) -> None:
+def test_a_real_model_drives_and_its_run_is_flipped_and_replayed(
+    data: Dataset, tmp_path: Path
+) -> None:
     pytest.importorskip("sparrow_decider", reason="needs the sparrow extra")
     points = tuple(map(named_point, ("single-local", "6g", "6g:loss=0,tau=0,content=objects")))
     spec = with_ego(
-        spec_of(data, "sparrow-robot", "v9", answer="decision", points=points, seeds=(0,)), flip=True
+        spec_of(data, "sparrow-robot", "v9", answer="decision", points=points, seeds=(0,)),
+        flip=True,
     )
     run(spec, tmp_path / "a")
     first = folder.read(tmp_path / "a")

@@ -1,4 +1,6 @@
-"""The three answer modes, held to naive forwards of a real tiny Qwen3: uncached, unbatched, whole."""
+"""The three answer modes, held to naive forwards of a real tiny Qwen3:
+uncached, unbatched, whole.
+"""
 
 import json
 import math
@@ -51,7 +53,11 @@ def backend(tmp_path_factory: pytest.TempPathFactory) -> LanguageModel:
 
 
 def ask(
-    i: int, answer: AnswerMode = "json", role: Any = "ego", actions: tuple[str, ...] = ACTIONS, **options: Any
+    i: int,
+    answer: AnswerMode = "json",
+    role: Any = "ego",
+    actions: tuple[str, ...] = ACTIONS,
+    **options: Any,
 ) -> Request:
     """Scene i, asked by a viewer of some role; helpers have another system prompt."""
     messages: Any = (
@@ -86,7 +92,8 @@ def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> st
     return texts[int(naive(backend, ids)[tokens].argmax())]
 
 
-# -- json ---------------------------------------------------------------------------------------------
+# -- json
+# ---------------------------------------------------------------------------------------------
 
 
 def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
@@ -100,7 +107,9 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
     lengths = set()
     for request, completion in zip(requests, backend.complete(requests), strict=True):
         ids = torch.tensor([prompt_of(backend, request)])
-        out = engine.model.generate(ids, attention_mask=torch.ones_like(ids), generation_config=config)
+        out = engine.model.generate(
+            ids, attention_mask=torch.ones_like(ids), generation_config=config
+        )
         said = out[0, ids.shape[1] :].tolist()
         stopped = said[-1] in engine.stops
         assert completion.text == backend.chat.decode(said[:-1] if stopped else said)
@@ -128,11 +137,14 @@ def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) ->
     assert len(forwards) < 0.8 * max(c.completion_tokens or 0 for c in alone)
 
 
-# -- times ------------------------------------------------------------------------------------------
+# -- times
+# ------------------------------------------------------------------------------------------
 
 
 class Ticking:
-    """An engine by a clock of its own: half a second to read a prompt, a tenth to go on by some tokens."""
+    """An engine by a clock of its own:
+    half a second to read a prompt, a tenth to go on by some tokens.
+    """
 
     def __init__(self, engine: TransformersEngine) -> None:
         self._engine = engine
@@ -173,12 +185,17 @@ def test_the_first_token_is_there_when_the_model_has_chosen_it(
     timed = LanguageModel(engine, 4)
     [one] = timed.complete([ask(3, answer, max_tokens=4 if answer == "json" else 80)])
     assert one.finish_reason == ("length" if answer == "json" else "stop")
-    assert (one.seconds, one.first_token_s, one.token_s) == pytest.approx((seconds, first_token_s, token_s))
+    assert (one.seconds, one.first_token_s, one.token_s) == pytest.approx(
+        (seconds, first_token_s, token_s)
+    )
     both = timed.complete([ask(i, answer) for i in (3, 4)])
-    assert {(c.batch_size, c.seconds, c.first_token_s, c.token_s) for c in both} == {(2, None, None, None)}
+    assert {(c.batch_size, c.seconds, c.first_token_s, c.token_s) for c in both} == {
+        (2, None, None, None)
+    }
 
 
-# -- constrained --------------------------------------------------------------------------------------
+# -- constrained
+# --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("i", [0, 3, 8])
@@ -197,7 +214,9 @@ def test_each_digit_is_the_likeliest_of_ten(backend: LanguageModel, i: int) -> N
         written += len(backend.chat.encode(opening)) + 2
     said = [d / 100 for d in digits]
     [completion] = backend.complete([request])
-    assert json.loads(completion.text) == {"action_distribution": dict(zip(ACTIONS, said, strict=True))}
+    assert json.loads(completion.text) == {
+        "action_distribution": dict(zip(ACTIONS, said, strict=True))
+    }
     assert completion.completion_tokens == written + len(backend.chat.encode("}}"))
     assert completion.finish_reason == "stop"
 
@@ -223,7 +242,11 @@ def test_a_lane_is_chosen_where_the_lanes_part(backend: LanguageModel) -> None:
             maneuver = "LANE_LEFT" if logits[left[shared]] > logits[right[shared]] else "LANE_RIGHT"
         [completion] = backend.complete([request])
         said = json.loads(completion.text)
-        assert (said["risk"], said["recommended_maneuver"], said["evidence"]) == (risk, maneuver, "")
+        assert (said["risk"], said["recommended_maneuver"], said["evidence"]) == (
+            risk,
+            maneuver,
+            "",
+        )
         lanes.add(maneuver)
     assert len(lanes) > 1
 
@@ -231,11 +254,14 @@ def test_a_lane_is_chosen_where_the_lanes_part(backend: LanguageModel) -> None:
 def test_an_answer_that_does_not_fit_its_bound_is_the_users_to_know(backend: LanguageModel) -> None:
     fits = backend.complete([ask(1, "constrained", max_tokens=25)])[0]
     assert fits.completion_tokens == 25
-    with pytest.raises(UserError, match=r"constrained ego answer takes 25 tokens, and 24 are allowed; raise"):
+    with pytest.raises(
+        UserError, match=r"constrained ego answer takes 25 tokens, and 24 are allowed; raise"
+    ):
         backend.complete([ask(1, "constrained", max_tokens=24)])
 
 
-# -- readout ------------------------------------------------------------------------------------------
+# -- readout
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("i", [0, 3, 8])
@@ -251,7 +277,10 @@ def test_the_letters_probabilities_are_the_answer(backend: LanguageModel, i: int
 
 
 def test_scenes_with_more_and_fewer_actions_are_read_out_together(backend: LanguageModel) -> None:
-    few, many = ask(2, "readout"), ask(2, "readout", actions=("SLOWER", "IDLE", "FASTER", *LANES[::2]))
+    few, many = (
+        ask(2, "readout"),
+        ask(2, "readout", actions=("SLOWER", "IDLE", "FASTER", *LANES[::2])),
+    )
     together = backend.complete([few, many])
     assert [c.batch_size for c in together] == [2, 2]
     same([backend.complete([r])[0] for r in (few, many)], together)
@@ -290,7 +319,9 @@ def test_a_letter_counts_in_all_of_its_spellings() -> None:
     ids = {"\n": [0], "\nA": [0, 1], "\nB": [0, 2], "\nC": [0, 3]}
     spellings = {"A": [1, 11], "B": [2], "C": [13, 3, 23]}
     session = Said({1: 1 / 4, 11: 1 / 4, 2: 1 / 8, 3: 1 / 16, 13: 1 / 32, 23: 1 / 32})
-    chat = SimpleNamespace(name="spelt", encode=ids.__getitem__, spellings=lambda letters: spellings)
+    chat = SimpleNamespace(
+        name="spelt", encode=ids.__getitem__, spellings=lambda letters: spellings
+    )
     engine: Any = SimpleNamespace(chat=chat, begin=lambda prompts, exact: session)
     [answer] = Decoding(engine).answer([ask(0, "readout")], [[[5, 6]]])
     assert json.loads(answer.text)["action_distribution"] == pytest.approx(
@@ -317,11 +348,16 @@ def test_one_spelling_alone_is_read_out_to_the_last_bit_as_ever() -> None:
 @pytest.mark.parametrize(
     ("texts", "decoder"),
     [
-        (["A", "\u0120A", "\u0120\u0120A", "\u010aB", "B", "AB", "a", "A.", "\u0120a"], "ByteLevel"),
+        (
+            ["A", "\u0120A", "\u0120\u0120A", "\u010aB", "B", "AB", "a", "A.", "\u0120a"],
+            "ByteLevel",
+        ),
         (["A", "\u2581A", "\u2581\u2581A", "<0x42>", "B", "AB", "a", "A.", "<0x43>"], "Metaspace"),
     ],
 )
-def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(texts: list[str], decoder: str) -> None:
+def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(
+    texts: list[str], decoder: str
+) -> None:
     from tokenizers import Tokenizer, decoders, models
     from transformers import PreTrainedTokenizerFast
 
@@ -338,14 +374,19 @@ def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(texts: list[str],
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))])
+@pytest.mark.parametrize(
+    "encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))]
+)
 def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
     engine: Any = SimpleNamespace(chat=SimpleNamespace(shown="model 'odd'", encode=encode))
-    with pytest.raises(UserError, match=r"'odd'.* no single token for each of the letters ABC; use --answer"):
+    with pytest.raises(
+        UserError, match=r"'odd'.* no single token for each of the letters ABC; use --answer"
+    ):
         Decoding(engine).room(ask(0, "readout"))
 
 
-# -- all of them --------------------------------------------------------------------------------------
+# -- all of them
+# --------------------------------------------------------------------------------------
 
 
 def same(one: Sequence[Completion], other: Sequence[Completion]) -> None:
@@ -385,7 +426,9 @@ def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[
 @pytest.mark.exhaustive
 @settings(max_examples=60, deadline=None)
 @given(st.lists(REQUESTS, max_size=7))
-def test_much_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
+def test_much_company_never_changes_an_answer(
+    backend: LanguageModel, requests: list[Request]
+) -> None:
     company_changes_nothing(backend, requests)
 
 
@@ -419,5 +462,6 @@ def test_weights_that_are_no_numbers_are_an_error_of_the_engine_and_no_answer(
     for said in broken.complete([ask(1, answer), ask(2, answer)]):
         assert (said.text, said.finish_reason) == ("", "error")
         assert said.error == (
-            "ArithmeticError: the logits are no numbers; the weights are damaged, or too large for this dtype"
+            "ArithmeticError: the logits are no numbers; the weights are damaged, or too large for "
+            "this dtype"
         )

@@ -1,4 +1,6 @@
-"""Device profiles: what a token takes and costs, played by hand; who is in time follows from it alone."""
+"""Device profiles: what a token takes and costs, played by hand;
+who is in time follows from it alone.
+"""
 
 import subprocess
 import sys
@@ -53,7 +55,8 @@ DESK = Device(
 )  # fmt: skip
 
 
-# -- one decision by hand -------------------------------------------------------------------------------
+# -- one decision by hand
+# -------------------------------------------------------------------------------
 
 ALONE = OperatingPoint.of("single-local", None)
 CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0, window_s=0.6)  # serial, 25 ms a slot, 10 Mbit/s
@@ -65,19 +68,31 @@ class Counted(Scripted):
 
     def _say(self, request: Request) -> Completion:
         said = super()._say(request)
-        counts = (300, 10) if "+" in request.id else (100, 10) if request.role == "ego" else (200, 5)
-        return said if said.error else replace(said, prompt_tokens=counts[0], completion_tokens=counts[1])
+        counts = (
+            (300, 10) if "+" in request.id else (100, 10) if request.role == "ego" else (200, 5)
+        )
+        return (
+            said
+            if said.error
+            else replace(said, prompt_tokens=counts[0], completion_tokens=counts[1])
+        )
 
 
 @pytest.fixture
-def counted(small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., folder.Run]:
+def counted(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., folder.Run]:
     """A run of one decision point in which the ego is unsure, with the tokens of `Counted`."""
     one = course(small, 1, {"00001-0": {}}, drives={"00001-0": "SLOWER"})
     lines = {"00001-0/v1": says([0.3, 0.4, 0.3])}
     lines |= {f"00001-0/v{n}": sure("SLOWER", "helper") for n in (2, 3, 4)}
 
-    def made(*points: OperatingPoint, more: dict[str, Any] | None = None, **options: Any) -> folder.Run:
-        monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Counted({**lines, **(more or {})}))
+    def made(
+        *points: OperatingPoint, more: dict[str, Any] | None = None, **options: Any
+    ) -> folder.Run:
+        monkeypatch.setattr(
+            evaluation, "open_backend", lambda *_, **__: Counted({**lines, **(more or {})})
+        )
         options = {"device_profile": DESK, "points": points, "seeds": (0,), **options}
         out = tmp_path / digest([point.name for point in points])[:8]
         run(spec_of(one, "swarm-tiny", **options), out)
@@ -89,13 +104,22 @@ def counted(small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_seconds_and_joules_of_one_decision_by_hand(counted: Callable[..., folder.Run]) -> None:
     told = counted(ALONE, CLEAR, AGAIN, CLOUD)
     d = told.decisions
-    names = ("latency_ms", "messages", "reply_bits", "inference_j", "helpers_j", "radio_mj", "waiting_j")
+    names = (
+        "latency_ms",
+        "messages",
+        "reply_bits",
+        "inference_j",
+        "helpers_j",
+        "radio_mj",
+        "waiting_j",
+    )
     of = {name: dict(zip(d.labels("condition"), d[name].tolist(), strict=True)) for name in names}
     # The ego: 100 / 1000 + 10 / 100 s, and 100 x 0.01 + 10 x 1 J. A helper: 0.2 + 0.05 s, 2 + 5 J.
     assert of["latency_ms"]["single-local"] == pytest.approx(200)
     assert of["inference_j"]["single-local"] == pytest.approx(11)
     assert of["messages"]["clear"] == 3
-    # The helpers have their answers 50 ms after the ego asks; then three slots, one after the other.
+    # The helpers have their answers 50 ms after the ego asks; then three slots, one after the
+    # other.
     bits = of["reply_bits"]["clear"]
     exchange_ms = 250 + 3 * 25 + bits / 10e6 * 1000
     assert of["latency_ms"]["clear"] == pytest.approx(exchange_ms, abs=1e-3)
@@ -118,14 +142,31 @@ def test_helpers_that_infer_before_they_are_asked_cost_energy_unasked(
 ) -> None:
     """All in the radius think from the start; on demand only the one that is asked."""
     one = CLEAR.changed(name="one", max_helpers=1)
-    demand, narrow = one.changed(name="demand", on_demand=True), CLEAR.changed(name="narrow", radius_m=0.5)
+    demand, narrow = (
+        one.changed(name="demand", on_demand=True),
+        CLEAR.changed(name="narrow", radius_m=0.5),
+    )
     sure_ego = CLEAR.changed(name="sure", tau_nats=5.0)
     told = counted(ALONE, CLEAR, one, demand, narrow, sure_ego)
     d = told.decisions
     messages, helpers_j = (dict(zip(d.labels("condition"), d[name].tolist(), strict=True))
                            for name in ("messages", "helpers_j"))  # fmt: skip
-    assert messages == {"single-local": 0, "clear": 3, "one": 1, "demand": 1, "narrow": 0, "sure": 0}
-    assert helpers_j == {"single-local": 0, "clear": 21, "one": 21, "demand": 7, "narrow": 0, "sure": 21}
+    assert messages == {
+        "single-local": 0,
+        "clear": 3,
+        "one": 1,
+        "demand": 1,
+        "narrow": 0,
+        "sure": 0,
+    }
+    assert helpers_j == {
+        "single-local": 0,
+        "clear": 21,
+        "one": 21,
+        "demand": 7,
+        "narrow": 0,
+        "sure": 21,
+    }
 
 
 def test_a_message_takes_a_frame_at_least(counted: Callable[..., folder.Run]) -> None:
@@ -153,17 +194,23 @@ def test_a_runs_summary_has_the_energy_of_a_decision(counted: Callable[..., fold
     assert manifest.latency.speeds == (Speed("swarm-tiny", 1000, 100, 0.01, 1),)
 
 
-def test_without_a_device_profile_nothing_is_said_of_energy(counted: Callable[..., folder.Run]) -> None:
+def test_without_a_device_profile_nothing_is_said_of_energy(
+    counted: Callable[..., folder.Run],
+) -> None:
     told = counted(ALONE, CLEAR, device_profile=None)
     assert told.score("clear", "energy_j") is None
-    assert not {"inference_j", "radio_mj", "busy_ratio"} & set(told.path.joinpath("summary.csv").read_text())
+    assert not {"inference_j", "radio_mj", "busy_ratio"} & set(
+        told.path.joinpath("summary.csv").read_text()
+    )
     assert np.isnan(told.decisions["inference_j"]).all()
 
 
 def test_another_models_speed_is_said_plainly(counted: Callable[..., folder.Run]) -> None:
     """100 / 500 + 10 / 10 s; joules from 50 W over the rates: 100 x 0.1 + 10 x 5."""
     told = counted(ALONE, device_model="big")
-    assert told.manifest.latency.basis.startswith("swarm-tiny's answers at the speed of big on desk (F16")
+    assert told.manifest.latency.basis.startswith(
+        "swarm-tiny's answers at the speed of big on desk (F16"
+    )
     assert told.decisions["latency_ms"].tolist() == [1200]
     assert told.decisions["inference_j"].tolist() == [60]
 
@@ -177,7 +224,9 @@ def test_an_engines_error_is_no_answer_to_be_timed(counted: Callable[..., folder
 def test_tokens_that_nobody_counted_are_refused(small: Dataset, tmp_path: Path,
                                                 monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))
-    with pytest.raises(UserError, match=r"/v1 has no token counts, so no device profile can time it; use"):
+    with pytest.raises(
+        UserError, match=r"/v1 has no token counts, so no device profile can time it; use"
+    ):
         run(spec_of(small, "swarm-tiny", device_profile=DESK, points=(ALONE,)), tmp_path / "run")
 
 
@@ -192,13 +241,18 @@ def test_a_repair_turn_counts_with_its_tokens(counted: Callable[..., folder.Run]
 
 def test_a_radio_sends_with_the_channels_power_where_it_has_one() -> None:
     assert transmit_watts(DESK, named_point("6g")) == pytest.approx(2.0)
-    for radio in ("mode4:power_dbm=20", "mode4:power_dbm=20,loss=0.1", "mode4:power_dbm=20,edge=relay"):
+    for radio in (
+        "mode4:power_dbm=20",
+        "mode4:power_dbm=20,loss=0.1",
+        "mode4:power_dbm=20,edge=relay",
+    ):
         assert transmit_watts(DESK, named_point(radio)) == pytest.approx(0.1 / 0.5)
     silent = msgspec.structs.replace(DESK, amplifier_efficiency=None)
     assert np.isnan(transmit_watts(silent, named_point("6g")))
 
 
-# -- what must always hold ------------------------------------------------------------------------------
+# -- what must always hold
+# ------------------------------------------------------------------------------
 
 RATES = st.floats(1, 1e5)
 COUNTS = st.integers(0, 4000)
@@ -232,7 +286,9 @@ def test_a_faster_device_never_decides_later(
             unsure, np.tile(unsure, (3, 1)), np.ones(3, dtype=bool), np.full(4, 10.0), np.full(3, 20.0),
             np.array([1000.0, 2000.0, 1500.0]), inference_s,
         )  # fmt: skip
-        return float(coordinate(point, intents, Draws(np.full((3, 2), 0.5), np.full(3, 0.5))).latency_s)
+        return float(
+            coordinate(point, intents, Draws(np.full((3, 2), 0.5), np.full(3, 0.5))).latency_s
+        )
 
     slow = np.array(seconds)
     assert latency_s(slow * np.array(shares)) <= latency_s(slow) + 1e-12
@@ -242,7 +298,11 @@ def test_a_faster_device_never_decides_later(
 def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
     """Who is in time follows from tokens, not from how fast this machine is at the moment."""
     spec = spec_of(
-        small, "swarm-tiny", limit=2, device_profile=devices.load("agx-orin"), device_model="qwen3-4b"
+        small,
+        "swarm-tiny",
+        limit=2,
+        device_profile=devices.load("agx-orin"),
+        device_model="qwen3-4b",
     )
     for batch_size in (1, 8):
         run(spec.changed(batch_size=batch_size), tmp_path / str(batch_size))
@@ -270,7 +330,9 @@ class Wordy(Scripted):
 
     def _say(self, request: Request) -> Completion:
         done = super()._say(request)
-        return replace(done, prompt_tokens=100 + len(request.id), completion_tokens=9 + ord(request.id[-1]))
+        return replace(
+            done, prompt_tokens=100 + len(request.id), completion_tokens=9 + ord(request.id[-1])
+        )
 
 
 @pytest.mark.slow
@@ -295,9 +357,24 @@ def test_workers_count_a_models_tokens_as_one_process(
 
 @pytest.mark.exhaustive
 def test_workers_change_no_row(tmp_path: Path) -> None:
-    """Each in a process of its own, as a user types it: a fork has none of an open engine's threads."""
-    here = "from harness import cli; from harness.evaluate import run; run.EPISODES_AT_ONCE = 1; cli.main()"
-    drive = ("drive", "--model", "swarm-tiny", "--episodes", "3", "--seeds", "0", "--condition", "6g")
+    """Each in a process of its own, as a user types it:
+    a fork has none of an open engine's threads.
+    """
+    here = (
+        "from harness import cli; from harness.evaluate import run; run.EPISODES_AT_ONCE = 1; "
+        "cli.main()"
+    )
+    drive = (
+        "drive",
+        "--model",
+        "swarm-tiny",
+        "--episodes",
+        "3",
+        "--seeds",
+        "0",
+        "--condition",
+        "6g",
+    )
     on = ("--device-profile", "agx-orin", "--device-model", "qwen3-0.6b", "--quiet")
     for workers in "12":
         typed = (sys.executable, "-c", here, *drive, *on, "--workers", workers, "--out", workers)
@@ -306,7 +383,8 @@ def test_workers_change_no_row(tmp_path: Path) -> None:
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
 
-# -- files ----------------------------------------------------------------------------------------------
+# -- files
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", devices.names())
@@ -349,9 +427,13 @@ def test_a_decision_takes_what_its_maker_states_whatever_its_tokens(
     assert "d1-3b" not in scaled.model
     assert scaled.memory_gb is not None
     assert scaled.memory_gb.value == pytest.approx(3 * 4.25 / 8, rel=0.01)
-    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))  # which counts no tokens
+    # which counts no tokens
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))
     out = tmp_path / "run"
-    run(spec_of(small, "swarm-tiny", device_profile=nano, device_model="d1-3b", points=(ALONE,)), out)
+    run(
+        spec_of(small, "swarm-tiny", device_profile=nano, device_model="d1-3b", points=(ALONE,)),
+        out,
+    )
     told = folder.read(out)
     assert set(told.decisions["latency_ms"].tolist()) == {50.0}
     assert np.isnan(told.decisions["inference_j"]).all(), "nobody states its joules"
@@ -370,7 +452,9 @@ def test_a_size_is_scaled_from_the_nearest_row_where_the_profile_says_how() -> N
     assert row.model == "5b from qwen3-vl-4b"
     assert row.decode_tokens_per_s.value == pytest.approx(near.decode_tokens_per_s.value * 4.4 / 5)
     assert row.decode_tokens_per_s.status == "modelled"
-    with pytest.raises(UserError, match="unknown model of device profile desk '5b'; known: big, half, swarm"):
+    with pytest.raises(
+        UserError, match="unknown model of device profile desk '5b'; known: big, half, swarm"
+    ):
         devices.find_row(DESK, "5b")
 
 
@@ -410,7 +494,9 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
         (("value = 4000", "value = 0"), "value = 0; allowed: a number above 0"),
         (('status = "measured"', 'status = "felt"'), "unknown status in"),
         (("billions", "bilions"), "did you mean 'billions'?"),
-        (('source = "me" }\ndecode', 'source = "" }\ndecode'), "allowed: where the number comes from"),
+        (('source = "me" }\ndecode', 'source = "" }\ndecode'), 
+            "allowed: where the "
+            "number comes from"),
         (('me = "my desk, today"', "me = 3"), "[sources]: give each source a name and a text"),
         (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: a text"),
         (("batch_size = 1", "batch_size = 0"), "batch_size = 0; allowed: 1 or more"),
@@ -427,15 +513,27 @@ def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, pro
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--device-profile", "agx-ori"), "unknown device profile 'agx-ori'; did you mean 'agx-orin'?"),
-        (("--device-profile", "agx-orin"), "unknown model of device profile agx-orin 'swarm-tiny'; known: d"),
-        (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), "unknown model of device profile"),
-        (("--device-model", "qwen3-4b"), "--device-model qwen3-4b is a device's row; give --device-pro"),
-        (("--device-profile", "h200", "--device-model", "llama-3.1-8b"), "states no prefill_tokens_per_s of"),
+        (("--device-profile", "agx-ori"), 
+            "unknown device profile 'agx-ori'; "
+            "did you mean 'agx-orin'?"),
+        (("--device-profile", "agx-orin"), 
+            "unknown model of device profile "
+            "agx-orin 'swarm-tiny'; known: d"),
+        (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), 
+            "unknown model of "
+            "device profile"),
+        (("--device-model", "qwen3-4b"), 
+            "--device-model qwen3-4b is a "
+            "device's row; give --device-pro"),
+        (("--device-profile", "h200", "--device-model", "llama-3.1-8b"), 
+            "states no "
+            "prefill_tokens_per_s of"),
         (("--device-profile", "agx-orin", "--device-model", "qwen3-4b", "--latency", "paper"),
-         "--device-profile agx-orin says how long answers take, as --latency paper does; give one of"),
+         "--device-profile agx-orin says how long answers take, as --latency paper does; give "
+         "one of"),
         (("--device-profile", "agx-orin", "--device-model", "qwen3-4b", "--model", "proxy"),
-         "--device-profile agx-orin: proxy is no language model and counts no tokens; leave it out"),
+         "--device-profile agx-orin: proxy is no language model and counts no tokens; leave it "
+         "out"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_timed_is_one_line(

@@ -1,4 +1,6 @@
-"""Success corrected by how hard layouts are: by hand, exact where it must be, and in what a run states."""
+"""Success corrected by how hard layouts are:
+by hand, exact where it must be, and in what a run states.
+"""
 
 import json
 import math
@@ -61,7 +63,10 @@ def test_it_is_the_regression_worked_out_by_hand() -> None:
     slope, at_0 = np.polyfit(x, values, 1)
     ahead = known.mean() - x.mean()
     left = np.sum((values - at_0 - slope * x) ** 2) / 48
-    variance = left * (1 / 50 + ahead**2 / np.sum((x - x.mean()) ** 2)) + slope**2 * known.var(ddof=1) / 200
+    variance = (
+        left * (1 / 50 + ahead**2 / np.sum((x - x.mean()) ** 2))
+        + slope**2 * known.var(ddof=1) / 200
+    )
     plain, estimate = rate_interval(values), of(values, known)
     half, plain_half = (
         student.ppf(0.975, freedom) * math.sqrt(of_mean)
@@ -77,7 +82,9 @@ def test_it_is_the_regression_worked_out_by_hand() -> None:
 
 @given(st.integers(0, 99), st.floats(-1, 1))
 def test_what_says_nothing_new_changes_nothing(seed: int, factor: float) -> None:
-    """Neither a constant, nor a sum of what is known, nor the order of layouts that were not asked."""
+    """Neither a constant, nor a sum of what is known,
+    nor the order of layouts that were not asked.
+    """
     values, known = drawn(seed, 40, 90)
     more = np.column_stack([known, np.full(90, 0.3), known[:, 0] * factor - known[:, 1]])
     more[40:] = more[:39:-1]
@@ -127,7 +134,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("more", "proxy", ASKED + 10),
         ("all", "proxy", None),
     ):
-        points = (POINTS["single-local"],) if name == "all" else (POINTS["single-local"], POINTS["6g"])
+        points = (
+            (POINTS["single-local"],) if name == "all" else (POINTS["single-local"], POINTS["6g"])
+        )
         spec = spec_of(load(path, limit), model, limit=limit, points=points, seeds=(0,))
         run(spec, made.setdefault(name, out / name))
     return made
@@ -135,7 +144,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.slow
 def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[str, Path]) -> None:
-    """Alone the proxy is `local-view`, so that this is its success in all layouts, to the last digit."""
+    """Alone the proxy is `local-view`, so that this is its success in all layouts,
+    to the last digit.
+    """
     some, full = read(runs["some"]), read(runs["all"])
     in_all = full.score("single-local", SUCCESS)
     assert some.score("single-local", SUCCESS).value != in_all.value
@@ -145,7 +156,9 @@ def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[s
     assert gain.value == pytest.approx(helped - alone)
     assert (gain.n, gain.interval) == (ASKED, "episodes")
     assert some.score("6g", ADJUSTED[BALANCED]) is not None
-    assert any("success % adjusted for difficulty: single-local" in line for line in adjusted_lines(some))
+    assert any(
+        "success % adjusted for difficulty: single-local" in line for line in adjusted_lines(some)
+    )
     assert full.layouts == ()
     assert not [*adjusted_lines(full)]
     assert not [score for score in full.scores if score.metric in ADJUSTED.values()]
@@ -192,7 +205,9 @@ def test_a_difference_of_references_is_that_of_all_layouts_and_is_said(
         assert f"\n{start}success adjusted for difficulty: B - A {in_all:+.1f} [" in out
         assert "times as many layouts" in " ".join(out.split())
     harness("compare", runs["some"], runs["cruise"], "--html", "page.html")
-    assert f"Success adjusted for difficulty: B - A {in_all:+.1f} [" in Path("page.html").read_text()
+    assert (
+        f"Success adjusted for difficulty: B - A {in_all:+.1f} [" in Path("page.html").read_text()
+    )
     tiles = {figure["what"].partition(",")[0] for figure in figures(read(runs["cruise"]))}
     assert "adjusted for difficulty" in tiles
 
@@ -203,7 +218,9 @@ def test_it_is_shown_by_the_number_of_layouts_whatever_it_says(
 ) -> None:
     some = read(runs["some"])
     [line] = [line for line in adjusted_lines(some) if line.startswith("success %")]
-    assert line.count("times as many layouts") == len(some.conditions), "under 6g it gains hardly anything"
+    assert line.count("times as many layouts") == len(some.conditions), (
+        "under 6g it gains hardly anything"
+    )
     monkeypatch.setattr(words, "SHOWN_FROM", ASKED)
     assert [*adjusted_lines(some)]
     monkeypatch.setattr(words, "SHOWN_FROM", ASKED + 1)
@@ -229,7 +246,9 @@ def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def uncorrected(run: Path) -> None:
-    """Take the figures that are corrected for difficulty out of a run's summary, as an older one has none."""
+    """Take the figures that are corrected for difficulty out of a run's summary,
+    as an older one has none.
+    """
     configure(run, versions={})
     (run / FILE).unlink(missing_ok=True)
     lines = (run / "summary.csv").read_text().splitlines(keepends=True)
@@ -237,7 +256,9 @@ def uncorrected(run: Path) -> None:
 
 
 def corrected_anew(run: Path) -> None:
-    """Compute the corrected figures of a run again, whose layouts are said to be of another difficulty."""
+    """Compute the corrected figures of a run again,
+    whose layouts are said to be of another difficulty.
+    """
     stated = read(run)
     scores = [score for score in stated.scores if "adjusted_" not in score.metric]
     scores += adjusted_scores(stated.grid, stated.episodes, stated.layouts)
@@ -248,7 +269,10 @@ def corrected_anew(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda text: text.replace("0.0,0.0,0.09", "0.0,7.0,0.09", 1), "episode 0: a success that is not"),
+        (
+            lambda text: text.replace("0.0,0.0,0.09", "0.0,7.0,0.09", 1),
+            "episode 0: a success that is not",
+        ),
         (lambda text: text.replace("\n0,left", "\n900,left", 1), "lacks one of the run's"),
         (lambda text: text.replace("\n0,left", "\n0,none", 1), "lacks one of the run's"),
         (lambda text: text.replace("cruise", "crews", 1), "it lacks cruise"),
@@ -284,14 +308,18 @@ def test_runs_that_differ_in_how_hard_a_layout_is_are_compared_as_they_are(
     assert pair(runs["faulty"], copy).pool is None
 
 
-def test_half_of_what_balanced_success_is_may_stay_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_of_what_balanced_success_is_may_stay_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Where few layouts have no danger, only the others are corrected."""
     values, known = drawn(7, 60, 120)
     dangerous = np.arange(120) % 5 > 0
     pool, success = Pool(known, dangerous, np.arange(60)), Success(dangerous[:60])
     estimate = pool.estimate(success, values[None])
     inside, others = dangerous[:60], ~dangerous[:60]
-    half = corrected(rate_interval(values[inside]), values[inside], known[:60][inside], known[dangerous], 0.0)
+    half = corrected(
+        rate_interval(values[inside]), values[inside], known[:60][inside], known[dangerous], 0.0
+    )
     assert estimate.value == pytest.approx((half.value + values[others].mean()) / 2)
     monkeypatch.setattr(covariate, "LEAST", 50)
     assert pool.estimate(success, values[None]) is None

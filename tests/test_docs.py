@@ -39,7 +39,11 @@ def test_every_setting_of_an_operating_point_is_documented_with_its_default(sett
     text = (ROOT / "docs/operating-points.md").read_text()
     [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
     default = POINTS["v2x"].setting(setting)
-    others = {"ego_distance_m": "its distance", "round_trip_s": "the model's", "threshold": "its own"}
+    others = {
+        "ego_distance_m": "its distance",
+        "round_trip_s": "the model's",
+        "threshold": "its own",
+    }
     words = {"None": others.get(setting, "the profile's"), "False": "false", "": "none"}
     shown = words.get(str(default), default)
     cell = line.split("|")[3].strip().strip("`")
@@ -74,7 +78,9 @@ def test_the_overviews_gains_are_those_of_the_claims_page() -> None:
     results = (ROOT / "README.md").read_text().partition("## Results\n")[2]
     block = results.partition("```\n")[2].partition("```")[0]
     gains = [
-        found[2] for line in block.splitlines() if len(found := re.findall(r"-?\d+\.\d \[[^]]+\]", line)) == 3
+        found[2]
+        for line in block.splitlines()
+        if len(found := re.findall(r"-?\d+\.\d \[[^]]+\]", line)) == 3
     ]
     assert len(gains) == 6
     for gain in gains:

@@ -1,8 +1,9 @@
 """Every command and every piece of Python in the documents is run, and prints what its page shows.
 
-A page is a story, from top to bottom in one folder. A command that is neither run nor excused by name fails
-its page, and so does a line that is shown and was not printed. Most pages are followed by `make exhaustive`
-alone: what they type, the tests of those commands prove, and each line of them is held against the program.
+A page is a story, from top to bottom in one folder. A command that is neither run nor excused by
+name fails its page, and so does a line that is shown and was not printed. Most pages are followed
+by `make exhaustive` alone: what they type, the tests of those commands prove, and each line of them
+is held against the program.
 """
 
 import re
@@ -51,19 +52,24 @@ READER_HAS = {
     "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
 }
 
-CHECKED = "harness prompt check mine --tokenizer ../tokenizer.json --dataset occluded-intersection-v2"
+CHECKED = (
+    "harness prompt check mine --tokenizer ../tokenizer.json --dataset occluded-intersection-v2"
+)
 
-# Added to what is typed, where it would take minutes; of an option given twice the last one counts. A whole
-# line has its own, or its command's. Lines that show what they print are not cut; what they read may not be.
+# Added to what is typed, where it would take minutes; of an option given twice the last one counts.
+# A whole line has its own, or its command's. Lines that show what they print are not cut; what they
+# read may not be.
 SHARD = "--episodes 4 --seeds 0 --workers 1"
 CUT = {
-    **{line: "" for line in TYPED if re.search("--limit 20 --out reports/[ab]$", line)},  # then compared
+    # then compared
+    **{line: "" for line in TYPED if re.search("--limit 20 --out reports/[ab]$", line)},
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
     "harness eval --model ./my-checkpoint": "--limit 1",  # by transformers, which is slow on a CPU
     "harness eval --model ./my-checkpoint --prompt v2": "--limit 1",
     "harness eval --model my-model": "--limit 1",
-    **{line: "--limit 1" for line in TYPED if "--dataset suite:" in line},  # of each of six families
+    # of each of six families
+    **{line: "--limit 1" for line in TYPED if "--dataset suite:" in line},
     **{
         line: "--limit 1"
         for line in TYPED
@@ -76,14 +82,21 @@ CUT = {
     "harness study schedule compare": "--schedule entropy",  # of all
     "harness study twins": "--sample 1 --workers 1",  # of 12 episodes
     "harness study attribute": "--sample 2",  # of 40 decision points
-    "harness study trust": "--attacks liar+spoof --rules trust --share 1/3 --seeds 0:1",  # of 15, 10, 2 and 5
+    # of 15, 10, 2 and 5
+    "harness study trust": "--attacks liar+spoof --rules trust --share 1/3 --seeds 0:1",
     "harness study paper": "--episodes 10 --sweep-episodes 10",  # of 1500 and 300 a grid point
-    "harness study closed-loop": "--episodes 1 --seeds 0 --workers 1",  # of 300 layouts with 5 seeds
+    # of 300 layouts with 5 seeds
+    "harness study closed-loop": "--episodes 1 --seeds 0 --workers 1",
     "harness dataset build": "--episodes 2 --workers 1",  # of 40 and of 1000
-    **{line: "--episodes 1 --workers 1" for line in TYPED if line.startswith("harness dataset build --env")},
+    **{
+        line: "--episodes 1 --workers 1"
+        for line in TYPED
+        if line.startswith("harness dataset build --env")
+    },
     "harness dataset scenario drive": "--episodes 2 --workers 1",  # of 100 and of 500
     "harness dataset scenario audit": "--layouts 24 --workers 1",  # of 300
-    "harness dataset scenario audit occluded-intersection": "--layouts 40 --workers 1",  # 24: a tell
+    # 24: a tell
+    "harness dataset scenario audit occluded-intersection": "--layouts 40 --workers 1",
     "harness model distill": "--layouts 2 --samples 16,16,16,16 --workers 1",  # of 240 and 300 000
     CHECKED: "--dataset ../few",  # 4 episodes of 240
     "harness prompt optimize": "--tune ../few --limit 2",  # 4 layouts of 24, and 2 of 240
@@ -102,31 +115,40 @@ CUT_ENDS = {
 NOT_RUN = {
     "harness model device measure --model swarm-tiny": "needs a meter of energy",
     "harness view": "serves until it is interrupted; tests/extensions/view starts it",
-    "harness serve --model swarm-tiny": "as above; tests/extensions/decide/test_serving.py starts it",
-    "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision --prompt v9"
+    "harness serve --model swarm-tiny": "as above; "
+    "tests/extensions/decide/test_serving.py "
+    "starts it",
+    "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision "
+    "--prompt v9"
     " --batch-size 1": "needs that server; tests/extensions/decide/test_serving.py has one",
     **{
         line: "needs that server; tests/test_by_url.py has such ones"
         for line in TYPED
         if re.match(r"harness eval --model '?http://", line)
     },
-    "harness benchmark run v2v-safety-1.1 --model proxy --made-by 'Ada, of Example' --out reports/proxy": (
+    "harness benchmark run v2v-safety-1.1 --model proxy --made-by 'Ada, of Example' --out "
+    "reports/proxy": (
         "takes 20 CPU seconds; tests/extensions/benchmark/test_editions.py runs a small edition"
     ),
     "harness benchmark verify reports/proxy.zip": "as above",
     "harness benchmark board 'reports/*.zip' --out board.html": "as above",
     "harness benchmark pack reports/proxy --made-by 'Ada, of Example' --out ada.zip": "as above",
-    "harness eval --model proxy --limit 40 --tracker mlflow": "needs mlflow; tests of trackers have it",
+    "harness eval --model proxy "
+    "--limit 40 --tracker mlflow": "needs mlflow; tests of trackers have it",
     "harness model pull qwen3-4b": "fetches weights from a hub",
-    "harness model pull smollm2-135m": "fetches weights from a registry; tests/test_packages.py does",
+    "harness model pull smollm2-135m": "fetches weights from a registry; "
+    "tests/test_packages.py does",
     "harness model check smollm2-135m": "needs those weights",
     "harness prompt check v10 --model smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
-    "harness model distill occluded-intersection --base smollm2-135m --lora --rate 5e-4 --dtype bfloat16"
+    "harness model distill occluded-intersection --base smollm2-135m --lora --rate 5e-4 --dtype "
+    "bfloat16"
     " --prompt v9 --samples 0,12800,0,0 --out models/mine": "needs those weights, and an hour",
-    "harness eval --model smollm2-135m --prompt v9 --answer readout --condition single-local --condition 6g"
+    "harness eval --model smollm2-135m --prompt v9 --answer readout --condition single-local "
+    "--condition 6g"
     " --control shuffled-messages --limit 100 --out reports/before": "needs those weights",
-    "harness eval --model models/mine --prompt v9 --answer readout --condition single-local --condition 6g"
+    "harness eval --model models/mine --prompt v9 --answer readout --condition single-local "
+    "--condition 6g"
     " --control shuffled-messages --limit 100 --out reports/after": "as above",
     "harness compare reports/before reports/after": "needs those runs",
     "harness model check qwen3-4b": "needs those weights",
@@ -135,7 +157,8 @@ NOT_RUN = {
     " --batch-size 256": "needs servers; tests/test_servers.py has some",
     "harness eval --model qwen3-4b --engine llama-cpp": "needs weights from a hub",
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
-    "harness run export reports/proxy-v2-occluded-intersection-v3 --inspect logs/run.eval": "needs inspect",
+    "harness run export reports/proxy-v2-occluded-intersection-v3 --inspect "
+    "logs/run.eval": "needs inspect",
 }
 OTHER_PROGRAMS = {
     "inspect": "serves until it is interrupted",
@@ -149,10 +172,12 @@ OTHER_PROGRAMS = {
     "pre-commit": "tests/test_hooks.py reads what it would run",
 }
 
-# Pages that show anything have these whole: they are run once, after what they need, and copied into their
-# folders.
+# Pages that show anything have these whole: they are run once, after what they need, and copied
+# into their folders.
 PROXY, LOCAL_VIEW = "harness eval --model proxy", "harness eval --model local-view"
-EVALUATED, OTHER = (f"reports/{model}-v2-occluded-intersection-v3" for model in ("proxy", "local-view"))
+EVALUATED, OTHER = (
+    f"reports/{model}-v2-occluded-intersection-v3" for model in ("proxy", "local-view")
+)
 ONCE = {
     PROXY: (),
     LOCAL_VIEW: (),
@@ -163,14 +188,19 @@ ONCE = {
 # Pages that `make test` follows, each with how the lines begin that it leaves out.
 FOLLOWED = {
     "docs/answers.md": (),
-    "docs/comparing.md": ("harness eval", "harness compare", "harness run history", "harness plan reports/"),
+    "docs/comparing.md": ("harness eval", "harness compare", "harness run history", 
+        "harness "
+        "plan "
+        "reports/"),
     "docs/radio.md": ("harness eval", "harness radio check"),
 }  # fmt: skip
 
 
 def shell_of(page: Path) -> list[tuple[str, str]]:
     """The lines that a page has a reader type, each with what it shows below."""
-    return [each for language, block in blocks(page) if language == "console" for each in typed(block)]
+    return [
+        each for language, block in blocks(page) if language == "console" for each in typed(block)
+    ]
 
 
 def lines_of(page: Path) -> list[str]:
@@ -178,7 +208,8 @@ def lines_of(page: Path) -> list[str]:
     return [command_of(line) for line, _ in shell_of(page)]
 
 
-# Values that a command reads when it runs; a name of a run, model or prompt may be the reader's own.
+# Values that a command reads when it runs; a name of a run, model or prompt may be the reader's
+# own.
 READ: dict[str, Callable[[str], object]] = {
     "latency": lambda text: text in (*NAMES, "run") or declared(text),
     "seeds": parse_seeds,
@@ -191,7 +222,9 @@ def name(page: Path) -> str:
 
 
 SHOWN = {  # by page; but the code that `echo $?` shows, which the line before it has to end with
-    name(page): {command_of(line) for line, shown in shell_of(page) if shown.strip() and line != "echo $?"}
+    name(page): {
+        command_of(line) for line, shown in shell_of(page) if shown.strip() and line != "echo $?"
+    }
     for page in pages()
 }
 
@@ -217,23 +250,32 @@ def hold_against_options(args: list[str]) -> None:
 def is_whole(words: list[str]) -> bool:
     """Whether the words behind a command in a sentence make it one that can be typed.
 
-    A bare name, one that ends with an option and one with a placeholder, a word in capitals or with an
-    ellipsis, are not.
+    A bare name, one that ends with an option and one with a placeholder,
+    a word in capitals or with an ellipsis, are not.
     """
-    placeholder = any(re.fullmatch(r"[A-Z]+", word) or re.search(r"\.\.\.|…", word) for word in words)
+    placeholder = any(
+        re.fullmatch(r"[A-Z]+", word) or re.search(r"\.\.\.|…", word) for word in words
+    )
     return bool(words) and not words[-1].startswith("--") and not placeholder
 
 
 def expression(shown: list[str]) -> str:
-    """What a page shows, as a regular expression: `…` alone is any lines, and in a line any text."""
+    """What a page shows, as a regular expression:
+    `…` alone is any lines, and in a line any text.
+    """
     return "".join(
-        r"(?:.*\n)*?" if line == "…" else re.escape(line).replace("…", ".*") + r"\n" for line in shown
+        r"(?:.*\n)*?" if line == "…" else re.escape(line).replace("…", ".*") + r"\n"
+        for line in shown
     )
 
 
 def difference(shown: str, printed: str) -> str:
-    """What a page shows against what was printed, if they differ; white space at line ends does not count."""
-    showing, printing = ([line.rstrip() for line in text.rstrip().split("\n")] for text in (shown, printed))
+    """What a page shows against what was printed, if they differ;
+    white space at line ends does not count.
+    """
+    showing, printing = (
+        [line.rstrip() for line in text.rstrip().split("\n")] for text in (shown, printed)
+    )
     if re.fullmatch(expression(showing), "".join(f"{line}\n" for line in printing)):
         return ""
     return "\n".join(unified_diff(showing, printing, "shown", "printed", lineterm=""))
@@ -242,18 +284,24 @@ def difference(shown: str, printed: str) -> str:
 @pytest.fixture
 def reader(harness: Harness, monkeypatch: pytest.MonkeyPatch, svg_alone: None) -> Harness:
     """The command as a reader types it, who sees stdout and stderr in one place."""
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that four episodes are two shards
+    # so that four episodes are two shards
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
     from harness.extensions.media.stills import stills
 
-    monkeypatch.setattr("harness.extensions.media.video.stills", lambda played: [*stills(played)][::20])
-    monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)  # a reader's terminal has a bar instead
+    monkeypatch.setattr(
+        "harness.extensions.media.video.stills", lambda played: [*stills(played)][::20]
+    )
+    # a reader's terminal has a bar instead
+    monkeypatch.setattr("harness.cli.progress.LINE_S", 3600.0)
     monkeypatch.setattr(sys, "stderr", sys.stdout)
     return harness
 
 
 @pytest.fixture
 def copied(reader: Harness, once: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Copied:
-    """Types a command of `ONCE`: what it writes is copied to this folder, and what it prints is returned."""
+    """Types a command of `ONCE`: what it writes is copied to this folder,
+    and what it prints is returned.
+    """
 
     def made(command: str) -> Path:
         def fill(folder: Path) -> None:
@@ -279,7 +327,9 @@ def copied(reader: Harness, once: Callable[..., Path], monkeypatch: pytest.Monke
 class Followed:
     """A page as a reader follows it, who types what it has him type, in one folder."""
 
-    def __init__(self, page: Path, reader: Harness, copied: Copied, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(
+        self, page: Path, reader: Harness, copied: Copied, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         self.page, self.reader, self.copied, self.monkeypatch = page, reader, copied, monkeypatch
         self.wrong: list[str] = []
 
@@ -293,7 +343,9 @@ class Followed:
                 exec(compile(block, self.page.name, "exec"), known)
                 continue
             lines = typed(block)
-            for (line, shown), (then, code_shown) in zip(lines, [*lines[1:], ("", "")], strict=True):
+            for (line, shown), (then, code_shown) in zip(
+                lines, [*lines[1:], ("", "")], strict=True
+            ):
                 # A page that shows `echo $?` says how the line before it ends.
                 says = int(code_shown.split()[0]) if then == "echo $?" else 0
                 if not line.startswith(left_out):
@@ -408,7 +460,9 @@ def test_what_is_shown_is_compared() -> None:
         ("at … s\n", "at 0.1\ns\n", False),
     ],
 )
-def test_dots_stand_for_lines_or_text_and_all_else_is_compared(shown: str, printed: str, same: bool) -> None:
+def test_dots_stand_for_lines_or_text_and_all_else_is_compared(
+    shown: str, printed: str, same: bool
+) -> None:
     assert (difference(shown, printed) == "") == same
 
 
@@ -430,7 +484,9 @@ def test_commands_named_in_a_sentence_are_taken_and_parts_of_them_exist(page: Pa
         for args in each:
             path, words = parsed(args)
             options = {option for parameter in COMMANDS[path].params for option in parameter.opts}
-            assert {word for word in words if word.startswith("--")} <= {*options, "--help"}, mention
+            assert {word for word in words if word.startswith("--")} <= {*options, "--help"}, (
+                mention
+            )
             if is_whole(words):
                 hold_against_options(args)
 
@@ -438,8 +494,13 @@ def test_commands_named_in_a_sentence_are_taken_and_parts_of_them_exist(page: Pa
 @pytest.mark.parametrize(
     ("said", "whole"),
     [
-        ("", False), ("--against", False), ("--sft", False), ("RUN", False), ("NAME --agents all", False),
-        ("SCENARIO...", False), ("--over x --grid 0,…", False), ("--latency 0.05", True), ("site", True),
+        ("", False), ("--against", False), ("--sft", False), ("RUN", False), (
+            "NAME "
+            "--agents "
+            "all", False),
+        ("SCENARIO...", False), (
+            "--over x "
+            "--grid 0,…", False), ("--latency 0.05", True), ("site", True),
     ],
 )  # fmt: skip
 def test_a_name_a_form_and_a_part_are_no_command_to_type(said: str, whole: bool) -> None:
@@ -448,7 +509,13 @@ def test_a_name_a_form_and_a_part_are_no_command_to_type(said: str, whole: bool)
 
 @pytest.mark.parametrize(
     "said",
-    ["drive --latency 0.05", "eval --seeds 5:", "drive --shard 3/2", "eval --limit few", "study sweep"],
+    [
+        "drive --latency 0.05",
+        "eval --seeds 5:",
+        "drive --shard 3/2",
+        "eval --limit few",
+        "study sweep",
+    ],
 )
 def test_what_the_program_refuses_is_no_command(said: str) -> None:
     with pytest.raises((UserError, TyperException)):
@@ -463,7 +530,9 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
 
 def test_console_is_the_one_form_of_a_shell_block() -> None:
     for page in pages():
-        assert not re.search(r"^```(sh|bash|shell|shell-session)", page.read_text(), re.MULTILINE), page
+        assert not re.search(
+            r"^```(sh|bash|shell|shell-session)", page.read_text(), re.MULTILINE
+        ), page
         outside = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
         assert not re.search(r"^ {4,}(\$ )?harness ", outside, re.MULTILINE), page
 

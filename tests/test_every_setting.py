@@ -1,4 +1,6 @@
-"""Each setting, typed with a value that is not its default, is found wherever a run states its settings."""
+"""Each setting, typed with a value that is not its default,
+is found wherever a run states its settings.
+"""
 
 import json
 import shlex
@@ -43,26 +45,34 @@ source = "paper"
 basis = "none"
 """
 RUNS = {
-    "rules": "eval --model proxy-faulty --prompt v4 --helper-model proxy,proxy-faulty --dataset {small} "
-    "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --control shuffled-messages --attack liar:share=1/3 "
-    "--sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first --tag night",
+    "rules": "eval --model proxy-faulty --prompt v4 --helper-model "
+    "proxy,proxy-faulty --dataset {small} "
+    "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --control shuffled-messages --attack "
+    "liar:share=1/3 "
+    "--sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first "
+    "--tag night",
     "selected": "eval --dataset {small} --only 0:3 --danger left --sample 1 --sample-seed 3",
     "narrow": "eval --dataset {two} --condition single-local --until-width 99",
-    "decided": "eval --dataset {two} --condition single-local --seeds 0,1 --until-decided {two_run}",
+    "decided": "eval --dataset {two} --condition single-local "
+    "--seeds 0,1 --until-decided {two_run}",
     "server": "eval --model mine --prompt v4 --dataset {two} --limit 1 --condition 6g --thinking "
     "--helper-prompt v2 --helper-answer constrained --no-helper-thinking --temperature 0.5 "
     "--sampling-seed 3 --server {server}",
     "device": "eval --model mine --dataset {two} --limit 1 --condition 6g --server {server} "
     "--device-profile agx-orin --device-model qwen3-4b",
-    "driven": "drive --scenario {scenario} --condition single-local --episodes 6 --first-seed 7 --sample 1 "
+    "driven": "drive --scenario {scenario} --condition single-local "
+    "--episodes 6 --first-seed 7 --sample "
+    "1 "
     "--sample-seed 3 --seeds 3,7",
     "driven until narrow": "drive --scenario {scenario} --episodes 1 --condition single-local "
     "--until-width 99",
     "driven until decided": "drive --scenario {scenario} --episodes 1 --condition single-local "
     "--until-decided other",
     "engine": "eval --model swarm-tiny --engine transformers --dataset {two} --limit 1 "
-    "--condition single-local --device cpu --dtype bfloat16 --answer readout --letters cyclic --flip",
-    "picture": "eval --model swarm-tiny-vl --prompt v8 --dataset {two} --limit 1 --condition single-local "
+    "--condition single-local --device cpu --dtype bfloat16 --answer readout --letters cyclic "
+    "--flip",
+    "picture": "eval --model swarm-tiny-vl --prompt v8 --dataset "
+    "{two} --limit 1 --condition single-local "
     "--image blank",
 }
 NEEDS = {"engine": "torch", "picture": "llama_cpp"}
@@ -70,7 +80,11 @@ SCENARIO = "occluded-intersection:limits=1,perception=1,witnesses=any,radio_shar
 # A run states its conditions by name, and its engine with its model.
 IN_OTHER_WORDS: dict[str, dict[str, Any]] = {
     "rules": {
-        "condition": ["6g:tau=0.5", "6g:tau=0.5,messages=shuffled", "6g:tau=0.5,attack=liar:share=1/3"],
+        "condition": [
+            "6g:tau=0.5",
+            "6g:tau=0.5,messages=shuffled",
+            "6g:tau=0.5,attack=liar:share=1/3",
+        ],
         "control": [],
         "attack": [],
     },
@@ -99,11 +113,15 @@ def settings_of(run: str) -> Settings:
 
 
 def test_each_setting_is_typed_in_some_run() -> None:
-    tried = {(kind_of(settings_of(run)), each.path) for run in RUNS for each in unusual(settings_of(run))}
+    tried = {
+        (kind_of(settings_of(run)), each.path) for run in RUNS for each in unusual(settings_of(run))
+    }
     for kind, world in WORLDS.items():
         for each in options(world):
             kinds = {kind} if each.path[0] == "world" else WORLDS.keys()
-            assert any((its, each.path) in tried for its in kinds), f"add a run with an unusual {each.flag}"
+            assert any((its, each.path) in tried for its in kinds), (
+                f"add a run with an unusual {each.flag}"
+            )
 
 
 MARKS = {**dict.fromkeys(RUNS, pytest.mark.slow), **dict.fromkeys(NEEDS, pytest.mark.exhaustive)}
@@ -121,7 +139,12 @@ def test_a_run_states_each_setting_and_repeats_it(
     with serving(answer) as there:
         typed = shlex.split(RUNS[run].format(**places, server=there.url))
         beside = ["--server", there.url] if there.url in typed else []
-        silent = ("--quiet", "--no-cache", *(["--workers", "1"] if "drive" in typed else []), "--out")
+        silent = (
+            "--quiet",
+            "--no-cache",
+            *(["--workers", "1"] if "drive" in typed else []),
+            "--out",
+        )
         if "other" in typed:
             assert harness(*typed[:-2], "--model", "cruise", *silent, "other")[0] == 0
         code, _, error = harness(*typed, *silent, "run")
@@ -138,7 +161,9 @@ def test_a_run_states_each_setting_and_repeats_it(
 
 
 @pytest.mark.parametrize("name", PLAIN)
-def test_a_stopped_run_resumes_with_each_setting_as_it_was(name: str, small: Dataset, tmp_path: Path) -> None:
+def test_a_stopped_run_resumes_with_each_setting_as_it_was(
+    name: str, small: Dataset, tmp_path: Path
+) -> None:
     """Of those that open nothing; `test_run_killed.py` changes what is opened."""
     typed = (settings_of(run) for run in RUNS)
     other = next(each.of(of) for of in typed for each in unusual(of) if each.name == name)

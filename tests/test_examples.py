@@ -1,4 +1,6 @@
-"""Examples of a prompt version: earlier turns of the chat, from train seeds and never from what is asked."""
+"""Examples of a prompt version: earlier turns of the chat,
+from train seeds and never from what is asked.
+"""
 
 import json
 import re
@@ -64,14 +66,17 @@ def with_examples(spec: Spec, shown: Examples = SHOWN) -> Spec:
     return with_ego(spec, prompt=replace(spec.ego.prompt, examples=shown))
 
 
-# -- what a model is sent -------------------------------------------------------------------------------
+# -- what a model is sent
+# -------------------------------------------------------------------------------
 
 
 def test_they_are_turns_between_the_systems_message_and_the_question(draft: Any) -> None:
     mine, plain = draft(text_of(SHOWN)), prompts.load("v2")
     asked = graph("ego", [CAR], [])
     [system, question] = plain.render(asked, ACTIONS, (), CROSSING.prompt_words)
-    [_, first], [_, second] = (plain.render(g, ACTIONS, (), CROSSING.prompt_words) for g in (SEES, STANDS))
+    [_, first], [_, second] = (
+        plain.render(g, ACTIONS, (), CROSSING.prompt_words) for g in (SEES, STANDS)
+    )
     assert mine.render(asked, ACTIONS, (), CROSSING.prompt_words) == (
         system,
         first, {"role": "assistant", "content": YIELD},
@@ -94,7 +99,9 @@ def test_a_version_without_them_is_what_it_was(draft: Any) -> None:
 
 def replace_answer(shown: Examples, answer: str) -> Examples:
     first, *rest = shown.ego
-    return Examples(shown.scenario, (Example(first.layout_seed, first.graph, answer), *rest), shown.helper)
+    return Examples(
+        shown.scenario, (Example(first.layout_seed, first.graph, answer), *rest), shown.helper
+    )
 
 
 def test_a_fusion_call_has_them_before_its_question_alone(small: Dataset) -> None:
@@ -106,8 +113,12 @@ def test_a_fusion_call_has_them_before_its_question_alone(small: Dataset) -> Non
     assert ["MESSAGES" in m["content"] for m in chat if m["role"] == "user"] == [False, False, True]
 
 
-def test_in_a_read_out_every_question_asks_for_a_letter_and_every_example_says_one(small: Dataset) -> None:
-    """SLOWER is A, IDLE B and FASTER C: an example says the action that its answer is likeliest to take."""
+def test_in_a_read_out_every_question_asks_for_a_letter_and_every_example_says_one(
+    small: Dataset,
+) -> None:
+    """SLOWER is A, IDLE B and FASTER C:
+    an example says the action that its answer is likeliest to take.
+    """
     spec = with_examples(with_ego(spec_of(small, "swarm-tiny"), answer="readout"))
     ego, helper = list(requests(spec, scenes_of(small)[:1]))[:2]
     question = "Answer with one letter: A SLOWER, B IDLE, C FASTER."
@@ -126,7 +137,8 @@ def test_free_and_constrained_answers_have_the_same_chat(small: Dataset) -> None
     assert free == constrained
 
 
-# -- what is refused ------------------------------------------------------------------------------------
+# -- what is refused
+# ------------------------------------------------------------------------------------
 
 LINE = {"layout_seed": 100_007, "graph": SEES.plain(), "answer": YIELD}
 FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
@@ -136,13 +148,23 @@ FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
     ("shown", "said"),
     [
         ({**FILE, "ego": [LINE, {**LINE, "layout_seed": 7}]},
-         "ego example 2 is of layout seed 7; examples come from train seeds alone, 100000 to 199999"),
-        ({**FILE, "ego": [{**LINE, "layout_seed": 200_000}]}, "examples come from train seeds alone"),
+         "ego example 2 is of layout seed 7; examples come from train seeds alone, 100000 to "
+         "199999"),
+        ({**FILE, "ego": [{**LINE, "layout_seed": 200_000}]}, 
+            "examples come from "
+            "train seeds alone"),
         ({**FILE, "ego": [{**LINE, "layout_seed": -1}]}, "examples come from train seeds alone"),
-        ({**FILE, "ego": [], "helper": [LINE]}, "helper example 1 has the graph of a viewer whose role is"),
-        ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "nodes": 3}}]}, "[ego.0.graph]: nodes = 3"),
+        ({**FILE, "ego": [], "helper": [LINE]}, 
+            "helper example 1 has the graph "
+            "of a viewer whose role is"),
+        ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "nodes": 3}}]}, 
+            "[ego.0.graph]: "
+            "nodes = 3"),
         ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "hint": "go"}}]}, "unknown key"),
-        ({**FILE, "ego": [{**LINE, "reply": GO}]}, "key in prompt mine examples.json [ego.0] 'reply'"),
+        ({**FILE, "ego": [{**LINE, "reply": GO}]}, 
+            "key in prompt mine "
+            "examples.json [ego.0] "
+            "'reply'"),
         ({"ego": [LINE]}, "prompt mine examples.json has no scenario; add it"),
         ([FILE], "prompt mine examples.json is no object; give scenario, ego and helper"),
         ("{", "prompt mine examples.json is no JSON"),
@@ -156,13 +178,16 @@ def test_a_file_that_is_wrong_is_one_line(draft: Any, shown: Any, said: str) -> 
 
 
 def test_an_evaluation_on_a_layout_that_the_examples_show_is_refused(small: Dataset) -> None:
-    """By layout seed: the dataset's second episode is an example; without that episode it may be asked."""
+    """By layout seed: the dataset's second episode is an example;
+    without that episode it may be asked.
+    """
     seed = int(small.forest.seeds[1])
     shown = Examples(scenarios.DEFAULT, (Example(seed, SEES, YIELD),))
     with pytest.raises(UserError) as caught:
         with_examples(spec_of(small), shown)
     assert str(caught.value) == (
-        f"--prompt v2 has an example of layout seed {seed}, which is evaluated; leave that episode out, or "
+        f"--prompt v2 has an example of layout seed {seed}, which is evaluated; leave that episode "
+        "out, or "
         "draw the examples anew: `harness prompt examples --first-seed`"
     )
     others = Selection(only=f"0,2:{len(small.episodes)}").of(small)
@@ -186,13 +211,19 @@ def test_helpers_examples_count_as_the_egos_do(small: Dataset) -> None:
 
 def test_examples_of_another_scenario_are_refused(small: Dataset) -> None:
     shown = Examples("blind-merge", SHOWN.ego)
-    with pytest.raises(UserError, match="has examples of blind-merge, which occluded-intersection is not"):
+    with pytest.raises(
+        UserError, match="has examples of blind-merge, which occluded-intersection is not"
+    ):
         with_examples(spec_of(small), shown)
 
 
 @pytest.mark.parametrize("answer", ["Go!", YIELD.replace("0.90", "0.70"), f"Sure: {YIELD}", ""])
-def test_an_answer_that_the_parser_would_mend_or_refuse_is_no_example(answer: str, small: Dataset) -> None:
-    with pytest.raises(UserError, match="the answer of ego example 1 is not as a model should state it"):
+def test_an_answer_that_the_parser_would_mend_or_refuse_is_no_example(
+    answer: str, small: Dataset
+) -> None:
+    with pytest.raises(
+        UserError, match="the answer of ego example 1 is not as a model should state it"
+    ):
         with_examples(spec_of(small), replace_answer(SHOWN, answer))
 
 
@@ -202,7 +233,8 @@ def test_reasons_may_stand_before_an_answer_where_the_prompt_asks_for_them() -> 
     assert example_actions(asks, "ego", ACTIONS) == ["SLOWER", "FASTER"]
 
 
-# -- with the model that ships --------------------------------------------------------------------------
+# -- with the model that ships
+# --------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -231,7 +263,8 @@ def test_a_replay_gives_the_run_again(small: Dataset, tmp_path: Path) -> None:
         run(plain, tmp_path / "plain")
 
 
-# -- differences ----------------------------------------------------------------------------------------
+# -- differences
+# ----------------------------------------------------------------------------------------
 
 
 def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:
@@ -239,7 +272,9 @@ def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:
     mine = replace(plain, examples=SHOWN)
     [(name, before, after)] = difference.change(plain, mine).settings
     assert (name, before) == ("examples", None)
-    assert after.startswith("2 ego, 1 helper, occluded-intersection, layout seeds 100007, 100009, sha256 ")
+    assert after.startswith(
+        "2 ego, 1 helper, occluded-intersection, layout seeds 100007, 100009, sha256 "
+    )
     ego, *_ = difference.sent(plain, mine, scenes_of(small)[0], CROSSING)
     assert list(ego.parts) == ["system", "examples", "user"]
     assert ego.parts["examples"].added == ego.words[1] - ego.words[0]
@@ -247,7 +282,8 @@ def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:
     assert difference.change(mine, reworded), "the same layouts, and another answer"
 
 
-# -- the command ----------------------------------------------------------------------------------------
+# -- the command
+# ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -258,11 +294,15 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_check_counts_them_and_show_shows_them(project: Path, harness: Harness, small_path: Path) -> None:
+def test_check_counts_them_and_show_shows_them(
+    project: Path, harness: Harness, small_path: Path
+) -> None:
     tokenizer = folder("models") / "swarm-tiny"
 
     def tokens() -> int:
-        said = harness("prompt", "check", "mine", "--dataset", small_path, "--tokenizer", tokenizer, "--json")
+        said = harness(
+            "prompt", "check", "mine", "--dataset", small_path, "--tokenizer", tokenizer, "--json"
+        )
         return int(json.loads(said[1])["tokens"]["ego"]["least"])
 
     before = tokens()
@@ -271,7 +311,9 @@ def test_check_counts_them_and_show_shows_them(project: Path, harness: Harness, 
     assert tokens() > before + 200
 
     scene = scenes_of(load(small_path))[0].id
-    _, out, _ = harness("prompt", "show", "mine", "--scene", scene, "--dataset", small_path, "--viewer", "v1")
+    _, out, _ = harness(
+        "prompt", "show", "mine", "--scene", scene, "--dataset", small_path, "--viewer", "v1"
+    )
     assert [line for line in out.split("\n") if line.startswith("--- ")] == [
         f"--- v1 {role}" for role in ("system", "user", "assistant", "user", "assistant", "user")
     ]

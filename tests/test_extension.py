@@ -45,7 +45,11 @@ EXTENSION = extension.read(json.dumps({"ego": GAPS, "helper": GAPS}), "answer.js
 EIGHTS = {"type": "integer", "minimum": 8, "maximum": 11}
 NUMBERS = {
     "list": {"type": "array", "maxItems": 2, "items": {"type": "boolean"}},
-    "all": {"type": "array", "maxItems": 2, "items": {"type": "array", "maxItems": 2, "items": EIGHTS}},
+    "all": {
+        "type": "array",
+        "maxItems": 2,
+        "items": {"type": "array", "maxItems": 2, "items": EIGHTS},
+    },
 }
 EXTENSION["numbers"] = extension.read(json.dumps({"ego": NUMBERS}), "answer.json")["ego"]
 SHAPES = [
@@ -99,7 +103,8 @@ def values(schema: Any) -> st.SearchStrategy[Any]:
     return st.sampled_from(bounds)
 
 
-# -- filled in ------------------------------------------------------------------------------------------
+# -- filled in
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -122,7 +127,9 @@ def test_whatever_a_model_chooses_fits_and_is_read(shape: Shape, random: Any) ->
     assert valid(shape, done.text), done.text
     parsed = parse(done.text, **shape._asdict(), divides=True)
     if parsed.status is not Status.BAD_SUM:  # all zeros
-        assert parsed.extension == {k: v for k, v in json.loads(done.text).items() if k in shape.further}
+        assert parsed.extension == {
+            k: v for k, v in json.loads(done.text).items() if k in shape.further
+        }
         assert parsed.verdict != "failed"
     assert {*parsed.repairs} <= {"divided", "renormalised"}
 
@@ -133,7 +140,9 @@ def test_the_further_members_come_first_and_a_text_ends_where_it_must() -> None:
     walk = Skeleton(CHARACTERS, shape).walk()
     assert "".join(map(chr, next(walk).forced)) == '{"reason":"'
     left = [walk.send(ord(c)) for c in "abc"]
-    assert [chr(34) in map(chr, ask.among) for ask in left] == [True, True, False], "then no room is left"
+    assert [chr(34) in map(chr, ask.among) for ask in left] == [True, True, False], (
+        "then no room is left"
+    )
     assert "".join(map(chr, left[-1].forced)) == 'c","action_distribution":{"GO":0.'
     assert "\\" not in map(chr, left[0].among)
 
@@ -152,18 +161,25 @@ def test_a_number_is_one_of_a_hundred_to_a_thousand(
     assert all(least <= float(text) <= most for text in found)
 
 
-# -- read -----------------------------------------------------------------------------------------------
+# -- read
+# -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @settings(deadline=None)
-@given(st.fixed_dictionaries({}, optional={k: values(v) for k, v in json.loads(EGO.extension).items()}))
+@given(
+    st.fixed_dictionaries({}, optional={k: values(v) for k, v in json.loads(EGO.extension).items()})
+)
 def test_strict_is_what_the_library_says_of_the_extended_schema(said: Any) -> None:
     text = f"{json.dumps(said)[:-1]}{',' if said else ''}{HALF}}}"
     parsed = parse(text, **EGO._asdict())
     assert parsed.intent == (0.5, 0.5, 0)
     assert (parsed.status is Status.STRICT) == valid(EGO, text)
-    assert (parsed.extension is None) == ("unfit_extension" in parsed.repairs) == (not valid(EGO, text))
+    assert (
+        (parsed.extension is None)
+        == ("unfit_extension" in parsed.repairs)
+        == (not valid(EGO, text))
+    )
 
 
 @pytest.mark.parametrize("said", ['"reason":"\\ud800"', '"reason":"a","reason":"b"', '"clear":NaN'])
@@ -182,7 +198,8 @@ def test_unasked_for_they_are_a_field_too_many() -> None:
     assert (parsed.repairs, parsed.extension) == (("extra_field",), None)
 
 
-# -- servers --------------------------------------------------------------------------------------------
+# -- servers
+# --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -206,19 +223,24 @@ def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape:
     assert broken("generic", asked, json.dumps(json.loads(text), indent=1), ended=True) is None
 
 
-# -- a version ------------------------------------------------------------------------------------------
+# -- a version
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
     shutil.copytree(resources.find("prompts", "v4"), tmp_path / "mine")
-    (tmp_path / "mine/answer.json").write_text(json.dumps({"ego": GAPS, "helper": {"clear": GAPS["clear"]}}))
+    (tmp_path / "mine/answer.json").write_text(
+        json.dumps({"ego": GAPS, "helper": {"clear": GAPS["clear"]}})
+    )
     return tmp_path
 
 
 def test_a_version_says_what_it_adds_and_has_room_for_it(copied: Path) -> None:
     mine, plain = versions.load("mine", copied), versions.load("v4")
-    assert mine.sha256 != versions.digest({k: v for k, v in mine.files.items() if k != "answer.json"})
+    assert mine.sha256 != versions.digest(
+        {k: v for k, v in mine.files.items() if k != "answer.json"}
+    )
     assert plain.extension == {}
     agent = Agent(cards.resolve("proxy"), mine)
     added = longest({"type": "object", "properties": json.loads(mine.extension["ego"])})
@@ -275,7 +297,8 @@ def test_the_pages_example_is_one_and_a_run_of_it_keeps_what_was_added(
     assert (tmp_path / "run/sources/prompts/mine/answer.json").read_text() == example
 
 
-# -- what is refused ------------------------------------------------------------------------------------
+# -- what is refused
+# ------------------------------------------------------------------------------------
 
 TEXT = {"type": "string", "maxLength": 9}
 
@@ -295,22 +318,36 @@ def nested(depth: int) -> Any:
         ({f"a{n}": TEXT for n in range(17)}, "ego has no members or too many"),
         ({"a b": TEXT}, "'a b' is no name"),
         ({"Risk": TEXT}, "ego.Risk is a field of every answer"),
-        ({"a": {"$ref": "http://example.com/s"}}, "ego.a: a schema may not have '$ref'; allowed: type, enum"),
+        ({"a": {"$ref": "http://example.com/s"}}, 
+            "ego.a: a schema may not have "
+            "'$ref'; allowed: type, enum"),
         ({"a": {**TEXT, "$ref": "#/ego/a"}}, "may not have '$ref'; allowed: type, maxLength, enum"),
         ({"a": {**TEXT, "pattern": "(a+)+$"}}, "type string may not have 'pattern'"),
         ({"a": {"oneOf": [TEXT]}}, "a schema may not have 'oneOf'"),
-        ({"a": {"type": ["string", "null"]}}, "give one of string, number, integer, boolean, array, object"),
+        ({"a": {"type": ["string", "null"]}}, 
+            "give one of string, number, "
+            "integer, boolean, array, object"),
         ({"a": 3}, "ego.a is no schema"),
         ({"a": {"type": "string"}}, "ego.a.maxLength is None; give 1 to 400"),
-        ({"a": {"type": "string", "maxLength": 10**9}}, "ego.a.maxLength is 1000000000; give 1 to 400"),
-        ({"a": {"type": "string", "enum": ["x", "x"]}}, "ego.a.enum: give 1 to 100 different texts"),
+        ({"a": {"type": "string", "maxLength": 10**9}}, 
+            "ego.a.maxLength is "
+            "1000000000; give 1 to 400"),
+        ({"a": {"type": "string", "enum": ["x", "x"]}}, 
+            "ego.a.enum: give 1 to "
+            "100 different texts"),
         ({"a": {"type": "string", "enum": ['x"']}}, "ego.a.enum: give 1 to 100 different texts"),
         ({"a": {"type": "number", "minimum": 0}}, "nan is no bound"),
         ({"a": {"type": "number", "minimum": 0, "maximum": 10**400}}, "is no bound; give"),
-        ({"a": {"type": "number", "minimum": 0, "maximum": 1e-9}}, "from 0 to 1e-09; give a minimum below"),
-        ({"a": {"type": "integer", "minimum": 0, "maximum": 5000}}, "of an integer by at most 1000"),
+        ({"a": {"type": "number", "minimum": 0, "maximum": 1e-9}}, 
+            "from 0 to 1e-09; "
+            "give a minimum below"),
+        ({"a": {"type": "integer", "minimum": 0, "maximum": 5000}}, 
+            "of an integer "
+            "by at most 1000"),
         ({"a": {"type": "integer", "minimum": 0, "maximum": 1.5}}, "1.5 is no bound"),
-        ({"a": {"type": "array", "items": TEXT, "maxItems": 21}}, "ego.a.maxItems is 21; give 1 to 20"),
+        ({"a": {"type": "array", "items": TEXT, "maxItems": 21}}, 
+            "ego.a.maxItems is "
+            "21; give 1 to 20"),
         ({"a": {"type": "array", "maxItems": 2}}, "ego.a.items is no schema"),
         ({"a": nested(4)}, "nested 5 deep; give at most 4"),
         ({"a": {"type": "array", "maxItems": 20, "items": {"type": "string", "maxLength": 400}}},
@@ -341,17 +378,23 @@ def test_a_member_named_as_an_action_is_refused_where_that_is_one(
     shutil.copytree(copied / "mine", Path("prompts/mine"))
     assert harness("prompt", "check", "mine", "--dataset", small_path) == (
         2, "",
-        "harness: prompt mine has slower in answer.json, which is an action of occluded-intersection; give "
+        "harness: prompt mine has slower in answer.json, which is an action of "
+        "occluded-intersection; give "
         "another --dataset, or fix the prompt\n",
     )  # fmt: skip
     Path("answer.txt").write_text("{}")
     code, out, error = harness("prompt", "parse", "answer.txt", "--prompt", "mine")
     assert (code, out, error.count("\n")) == (2, "", 1)
-    assert "--prompt mine has slower in answer.json, which is an action of occluded-intersection" in error
+    assert (
+        "--prompt mine has slower in answer.json, which is an action of occluded-intersection"
+        in error
+    )
 
 
 def test_the_largest_that_is_allowed_is_walked_in_time() -> None:
     """Four hundred decisions in a list of lists: nothing recurses by their number."""
     of = {"type": "array", "maxItems": 20, "items": {"type": "integer", "minimum": 0, "maximum": 9}}
     read = extension.read(json.dumps({"ego": {"a": {**of, "items": of}}}), "answer.json")
-    assert Skeleton(CHARACTERS, Shape("ego", ACTIONS, "distribution", read["ego"])).most_tokens > 800
+    assert (
+        Skeleton(CHARACTERS, Shape("ego", ACTIONS, "distribution", read["ego"])).most_tokens > 800
+    )

@@ -64,7 +64,9 @@ def test_each_optional_package_is_in_its_extra_and_in_no_base() -> None:
     for package, extra in OPTIONAL.values():
         assert package not in base
         if package != "pillow":  # matplotlib brings it
-            assert any(re.match(rf"{package}\b", line) for line in project["optional-dependencies"][extra])
+            assert any(
+                re.match(rf"{package}\b", line) for line in project["optional-dependencies"][extra]
+            )
 
 
 @pytest.mark.exhaustive
@@ -141,12 +143,21 @@ def test_a_study_without_matplotlib_has_its_tables_and_page_and_says_what_figure
     tmp_path: Path,
 ) -> None:
     ask = "eval --model proxy --limit 1 --seeds 0 --quiet --out a"
-    lines = (ask, f"{SWEEP} --out swept", f"{SWEEP} --out silent --quiet", f"{SWEEP} --out told --json")
+    lines = (
+        ask,
+        f"{SWEEP} --out swept",
+        f"{SWEEP} --out silent --quiet",
+        f"{SWEEP} --out told --json",
+    )
     said = bare(tmp_path, *lines)
     assert said == f"exit 0\n{NO_FIGURES}exit 0\nexit 0\n{NO_FIGURES}exit 0\n"
     files = {"conditions.csv", "conditions.jsonl", "episodes.csv", "episodes.jsonl"}
     for study in ("swept", "silent", "told"):
-        assert {file.name for file in (tmp_path / study).iterdir()} == {*files, "index.html", "sweep.json"}
+        assert {file.name for file in (tmp_path / study).iterdir()} == {
+            *files,
+            "index.html",
+            "sweep.json",
+        }
     assert "<img" not in (tmp_path / "swept/index.html").read_text()
 
 

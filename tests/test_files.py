@@ -1,4 +1,6 @@
-"""The canonical text of a value, whose bytes digests and keys are made of; and files that are read once."""
+"""The canonical text of a value, whose bytes digests and keys are made of;
+and files that are read once.
+"""
 
 import math
 import os
@@ -46,7 +48,10 @@ def test_a_value_has_one_text(value: Any, text: str) -> None:
 
 
 def test_the_digest_is_that_of_the_text_in_utf_8() -> None:
-    assert digest({"b": "é", "a": 1}) == "09ad9fd2fb648cb2f62141215828ea00a62c299db05d20aa9ade2f527a301cc6"
+    assert (
+        digest({"b": "é", "a": 1})
+        == "09ad9fd2fb648cb2f62141215828ea00a62c299db05d20aa9ade2f527a301cc6"
+    )
     with pytest.raises(ValueError, match="surrogates not allowed"):
         digest("\ud83d")
 
@@ -96,7 +101,9 @@ def test_where_no_file_can_be_made_is_no_missing_file(path: str) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"scene,value\n", bytes(10**6)])
 def test_arrow_holds_a_file_in_memory_of_its_own(content: bytes, tmp_path: Path) -> None:
-    """Its threads need the interpreter to let go of Python's, and abort the process as that ends."""
+    """Its threads need the interpreter to let go of Python's,
+    and abort the process as that ends.
+    """
     (tmp_path / "file").write_bytes(content)
     before = pa.total_allocated_bytes()
     with arrow_file(tmp_path / "file") as file:
@@ -141,7 +148,10 @@ def test_a_full_disk_names_the_file_that_is_written(tmp_path: Path) -> None:
         file.write("x")
     assert full.value.filename == str(tmp_path / "run.json")
     (tmp_path / "answers.jsonl").symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left") as full, appending(tmp_path / "answers.jsonl") as end:
+    with (
+        pytest.raises(OSError, match="No space left") as full,
+        appending(tmp_path / "answers.jsonl") as end,
+    ):
         end.write(b"x")
     assert full.value.filename == str(tmp_path / "answers.jsonl")
     assert {path.name for path in tmp_path.iterdir()} == {"answers.jsonl"}
@@ -149,13 +159,17 @@ def test_a_full_disk_names_the_file_that_is_written(tmp_path: Path) -> None:
 
 def test_a_file_that_grows_too_large_is_named(tmp_path: Path) -> None:
     code = (
-        "import resource, signal, sys\nfrom pathlib import Path\nfrom harness.core.files import write_whole\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))\n"
+        "import resource, signal, sys\nfrom pathlib import Path\nfrom harness.core.files import "
+        "write_whole\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, "
+        "(10, 10))\n"
         "try:\n    write_whole(Path(sys.argv[1]), 'x' * 99)\n"
         "except OSError as error:\n    print(error.filename)\n"
     )
     out = tmp_path / "page.html"
-    said = subprocess.run([sys.executable, "-c", code, out], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", code, out], capture_output=True, text=True, check=True
+    )
     assert (said.stdout, out.exists()) == (f"{out}\n", False)
 
 

@@ -43,7 +43,9 @@ def spec_with(small: Dataset, letters: Letters = "raw", flip: bool = True) -> Sp
     return with_ego(spec, card=card, answer="readout", letters=letters, flip=flip)
 
 
-def answered(spec: Spec, backend: Any, small: Dataset, scenes: int = 4) -> tuple[list[Request], list[Answer]]:
+def answered(
+    spec: Spec, backend: Any, small: Dataset, scenes: int = 4
+) -> tuple[list[Request], list[Answer]]:
     asked = list(requests(spec, all_scenes(small)[:scenes]))
     asker = Asker(spec, lambda: backend, PAPER)
     asker.ask(asked)
@@ -65,12 +67,16 @@ class Taking:
         if self.of_actions:
             return readout.stated(request.actions, [self.of_actions[a] for a in request.actions])
         if request.orders:
-            return average_orders(request.actions, [self.of_letters] * (1 + len(request.orders))).text
+            return average_orders(
+                request.actions, [self.of_letters] * (1 + len(request.orders))
+            ).text
         return readout.stated(request.actions, self.of_letters)
 
 
 @LETTERS
-def test_whoever_takes_the_first_letter_flips_unless_letters_cancel(letters: Letters, small: Dataset) -> None:
+def test_whoever_takes_the_first_letter_flips_unless_letters_cancel(
+    letters: Letters, small: Dataset
+) -> None:
     backend = Taking((0.7, 0.2, 0.1))
     asked, answers = answered(spec_with(small, letters), backend, small)
     assert [answer.flipped for answer in answers] == [letters == "raw"] * len(asked)
@@ -79,7 +85,9 @@ def test_whoever_takes_the_first_letter_flips_unless_letters_cancel(letters: Let
 
 @LETTERS
 def test_whoever_takes_an_action_never_flips(letters: Letters, small: Dataset) -> None:
-    _, answers = answered(spec_with(small, letters), Taking(SLOWER=0.1, IDLE=0.2, FASTER=0.7), small)
+    _, answers = answered(
+        spec_with(small, letters), Taking(SLOWER=0.1, IDLE=0.2, FASTER=0.7), small
+    )
     assert {answer.flipped for answer in answers} == {False}
 
 
@@ -88,19 +96,31 @@ def test_a_reversed_list_without_an_answer_leaves_the_answer_as_it_is(small: Dat
         def complete(self, requests: Sequence[Request]) -> list[Completion]:
             said = super().complete(requests)
             of = zip(requests, said, strict=True)
-            return [c if r.actions == small.actions else replace(c, text="", error="no") for r, c in of]
+            return [
+                c if r.actions == small.actions else replace(c, text="", error="no") for r, c in of
+            ]
 
     for flip in (True, False):
         _, answers = answered(spec_with(small, flip=flip), Refusing((0.7, 0.2, 0.1)), small)
-        assert {(a.cell("flipped"), a.error, a.intent) for a in answers} == {(None, None, (0.7, 0.2, 0.1))}
+        assert {(a.cell("flipped"), a.error, a.intent) for a in answers} == {
+            (None, None, (0.7, 0.2, 0.1))
+        }
 
 
-def by_hand(backend: Any, request: Request, listed: tuple[str, ...], cyclic: bool) -> dict[str, float]:
+def by_hand(
+    backend: Any, request: Request, listed: tuple[str, ...], cyclic: bool
+) -> dict[str, float]:
     """What a model says of the same scene with another list, asked as a question of its own."""
     *before, last = request.messages
     assert readout.question(request.actions) in last["content"]
     messages, *orders = (
-        (*before, {**last, "content": last["content"].replace(readout.question(request.actions), question)})
+        (
+            *before,
+            {
+                **last,
+                "content": last["content"].replace(readout.question(request.actions), question),
+            },
+        )
         for question in map(readout.question, readout.cyclic(listed) if cyclic else [listed])
     )
     asked = request.alike(messages=messages, orders=tuple(orders), flips=(), actions=listed)
@@ -121,7 +141,9 @@ def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, smal
         lists = (small.actions, small.actions[::-1])
         one, other = (by_hand(backend, request, listed, letters == "cyclic") for listed in lists)
         if all(np.diff(sorted(p.values()))[-1] > 1e-4 for p in (one, other)):  # no batch decides it
-            assert answer.flipped == (max(one, key=one.__getitem__) != max(other, key=other.__getitem__))
+            assert answer.flipped == (
+                max(one, key=one.__getitem__) != max(other, key=other.__getitem__)
+            )
             sure.append(answer.flipped)
     assert len(sure) > len(asked) / 2
     assert any(sure)
@@ -138,7 +160,9 @@ def test_a_run_and_its_replay_count_it_and_decide_as_without(
     assert same_decisions(plain.out, done.out)
     assert (plain.out / "episodes.csv").read_bytes() == (done.out / "episodes.csv").read_bytes()
     answers = answers_of(done.out)
-    assert [but_flip(answer) for answer in answers] == [but_flip(answer) for answer in answers_of(plain.out)]
+    assert [but_flip(answer) for answer in answers] == [
+        but_flip(answer) for answer in answers_of(plain.out)
+    ]
     rates = {s.metric: s for s in done.scores if s.metric.startswith("flip_rate")}
     for role in ("ego", "helper"):
         of_role = [answer.flipped for answer in answers if answer.role == role]
@@ -159,7 +183,9 @@ def test_a_run_and_its_replay_count_it_and_decide_as_without(
         finished_with(spec_with(small, other, flip=False).record(), plain.out)
     again = run(with_ego(spec, card=cards.resolve(f"replay:{done.out}")), tmp_path / "again")
     assert (again.out / "answers.jsonl").read_bytes() == (done.out / "answers.jsonl").read_bytes()
-    with pytest.raises(UserError, match="was run without --flip; leave it out, or make the run again"):
+    with pytest.raises(
+        UserError, match="was run without --flip; leave it out, or make the run again"
+    ):
         run(with_ego(spec, card=cards.resolve(f"replay:{plain.out}")), tmp_path / "refused")
 
 
@@ -169,7 +195,9 @@ def but_flip(answer: Answer) -> dict[str, Any]:
 
 
 def test_what_is_no_read_out_of_a_language_model_is_refused(harness: Callable[..., Said]) -> None:
-    with pytest.raises(UserError, match="--flip: proxy is no language model; leave it out, or give"):
+    with pytest.raises(
+        UserError, match="--flip: proxy is no language model; leave it out, or give"
+    ):
         Agent(cards.resolve("proxy"), versions.load("v2"), "readout", flip=True)
     code, _, err = harness("eval", "--model", "proxy", "--flip", "--limit", "1")
     said = "proxy answers in json; leave it out, or give a language model and --answer readout"

@@ -1,4 +1,6 @@
-"""What was made before scenes changed is read as what it was, whatever a scenario's bare name means now."""
+"""What was made before scenes changed is read as what it was,
+whatever a scenario's bare name means now.
+"""
 
 import shutil
 from pathlib import Path
@@ -20,16 +22,22 @@ LATER = "witnesses=each,radio_share=0.25,limits=2,perception=2"
 
 
 def test_an_old_dataset_has_the_scenes_that_it_was_built_of() -> None:
-    old, new = (load(find(name), 1).scenario for name in (former.DATASET, "occluded-intersection-v3"))
+    old, new = (
+        load(find(name), 1).scenario for name in (former.DATASET, "occluded-intersection-v3")
+    )
     assert old.parameters == former.SCENARIO.parameters
     assert new.parameters == scenarios.get(scenarios.DEFAULT).parameters
     assert scenarios.get(scenarios.argument(old)).parameters == old.parameters
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()])
+@pytest.mark.parametrize(
+    "commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()]
+)
 def test_an_old_driven_run_is_replayed_in_its_own_scenes(commit: str) -> None:
-    """Its record lacks the parameters that came later. A scene's name is the digest of what is in it."""
+    """Its record lacks the parameters that came later.
+    A scene's name is the digest of what is in it.
+    """
     run = folder.read(RECORDS / commit / "drive")
     played = replay.played(run, 0, run.conditions[-1], run.manifest.seeds[0])
     assert played.scenario.parameters == former.SCENARIO.parameters
@@ -66,7 +74,9 @@ def test_an_argument_states_the_scenes_even_where_they_are_the_usual_ones() -> N
         ("blind-merge", "blind-merge"),
     ],
 )
-def test_an_old_runs_settings_drive_its_own_scenes(tmp_path: Path, typed: str, scenario: str) -> None:
+def test_an_old_runs_settings_drive_its_own_scenes(
+    tmp_path: Path, typed: str, scenario: str
+) -> None:
     """The first runs with a run.toml named a scenario as it was typed."""
     shutil.copy(RECORDS / "0103f23/drive/run.json", tmp_path)
     file = tmp_path / "run.toml"

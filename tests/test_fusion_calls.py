@@ -77,7 +77,9 @@ def heard(due: dict[OperatingPoint, Due], intents: Intents) -> Ints:
 
 
 def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None:
-    """v2 and v4 are heard, v3's reply is lost: two lines of messages, with intent, risk and evidence."""
+    """v2 and v4 are heard, v3's reply is lost:
+    two lines of messages, with intent, risk and evidence.
+    """
     data = course(small, steps=1).of_episodes([0])
     [scene] = scenes_of(data)
     lines = {
@@ -101,7 +103,9 @@ def test_it_is_asked_with_the_messages_of_those_it_heard(small: Dataset) -> None
 
 def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset) -> None:
     unsure = {f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in scenes_of(small)}
-    intents = asker_of(spec_of(small, LANGUAGE_MODEL, points=(FUSION,)), Scripted(unsure))(scenes_of(small))
+    intents = asker_of(spec_of(small, LANGUAGE_MODEL, points=(FUSION,)), Scripted(unsure))(
+        scenes_of(small)
+    )
     n = len(scenes_of(small))
     all_cross = clear(n)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
@@ -115,7 +119,9 @@ def test_each_set_of_messages_is_asked_once_whatever_delivers_it(small: Dataset)
 def test_a_whole_run_makes_each_fusion_call_once(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Conditions and seeds that hear the same share a call; a step's calls are announced together."""
+    """Conditions and seeds that hear the same share a call;
+    a step's calls are announced together.
+    """
     backend = Scripted({f"{s.id}/v1": says((0.3, 0.4, 0.3)) for s in all_scenes(small)})
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: backend)
     slow = named_point("v2x:consensus=ego-prompt,window_s=0.4")
@@ -126,7 +132,9 @@ def test_a_whole_run_makes_each_fusion_call_once(
     calls = [name for name in backend.asked if "+" in name]
     assert set(Counter(calls).values()) == {1}
     steps = Counter(name.split("-")[1] for name in calls)
-    assert announced[2::3] == [steps[step] for step in sorted(steps)], "after each step's egos and helpers"
+    assert announced[2::3] == [steps[step] for step in sorted(steps)], (
+        "after each step's egos and helpers"
+    )
     assert sum(announced) == sum(answered) == len(backend.asked)
     assert {a.id for a in answers_of(tmp_path / "run") if a.role == "merge"} == set(calls)
 
@@ -147,7 +155,10 @@ def test_with_attackers_in_the_text_the_code_says_who_they_are() -> None:
     heard = np.array([[True, False, True], [True, True, False]])
     attackers = np.array([[True, True, False], [False, False, True]])
     codes = codes_of(heard, np.array([4, 5]), attackers).tolist()
-    assert [heard_in(code, 3, attacked=True) for code in codes] == [(4, [0, 2], [0]), (5, [0, 1], [])]
+    assert [heard_in(code, 3, attacked=True) for code in codes] == [
+        (4, [0, 2], [0]),
+        (5, [0, 1], []),
+    ]
 
 
 def test_a_set_that_was_never_asked_about_is_no_guess() -> None:
@@ -160,14 +171,18 @@ def test_its_answers_keep_their_place_and_a_failed_one_says_so(small: Dataset) -
     scenes = scenes_of(small)[:6]
     one, other = f"{scenes[1].id}/v1+v3", f"{scenes[4].id}/v1+v2+v3+v4"
     slow = Completion(other, "no idea", None, None, "stop", 9.0, 1, slow_s=0.4)
-    asker = asker_of(spec_of(small, LANGUAGE_MODEL), Scripted({one: sure("SLOWER"), other: slow}), DECLARED)
+    asker = asker_of(
+        spec_of(small, LANGUAGE_MODEL), Scripted({one: sure("SLOWER"), other: slow}), DECLARED
+    )
     codes = np.array([1 << 3 | 2, 4 << 3 | 7])
     heard = np.zeros((6, 3), dtype=bool)
     heard[1, 1] = heard[4] = True
     intents, seconds = asker.fusion_call(scenes, codes)(np.arange(6))(heard)
     assert intents[1].tolist() == [1.0, 0.0, 0.0]
     assert np.isnan(intents[[0, 2, 3, 4, 5]]).all()
-    assert seconds[[1, 4]].tolist() == pytest.approx([0.3, 0.7]), "what is declared, not the 9 s it took"
+    assert seconds[[1, 4]].tolist() == pytest.approx([0.3, 0.7]), (
+        "what is declared, not the 9 s it took"
+    )
     assert [asker.answers[name].verdict for name in (one, other)] == ["strict", "failed"]
 
 
@@ -176,7 +191,11 @@ def test_its_answers_keep_their_place_and_a_failed_one_says_so(small: Dataset) -
     [
         ("proxy", {}, "proxy is no language model and cannot fuse messages"),
         ("cruise", {}, "cruise is no language model"),
-        (LANGUAGE_MODEL, {"answer": "readout"}, "a readout gives no messages to fuse; use --answer json"),
+        (
+            LANGUAGE_MODEL,
+            {"answer": "readout"},
+            "a readout gives no messages to fuse; use --answer json",
+        ),
     ],
 )
 def test_who_can_merge_nothing_is_told_so(
@@ -186,7 +205,8 @@ def test_who_can_merge_nothing_is_told_so(
         spec_of(small, model, points=(FUSION,), **options)
 
 
-# -- with the model that ships --------------------------------------------------------------------------
+# -- with the model that ships
+# --------------------------------------------------------------------------
 
 CONDITIONS = (POINTS["single-local"], POINTS["6g"], FUSION)
 
@@ -206,14 +226,17 @@ def done(two: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
 
 def test_it_pays_a_second_inference_where_it_heard_somebody(done: Evaluated) -> None:
     """The paper's 145 ms twice and the exchange between; the same where nobody was asked."""
-    rules, calls = ({(d.scene, d.seed): d for d in decisions(done.out, name)} for name in ("6g", FUSION.name))
+    rules, calls = (
+        {(d.scene, d.seed): d for d in decisions(done.out, name)} for name in ("6g", FUSION.name)
+    )
     assert any(d.triggered for d in calls.values())
     both = rules.keys() & calls.keys()  # where fusion has led both to
     assert len(both) > len(rules) / 2
     for rule, again in ((rules[key], calls[key]) for key in both):
         heard = any(m.on_time for m in again.messages)
         fates, rule_fates = (
-            [(m.sender, m.delivered, m.on_time, m.arrival_ms) for m in d.messages] for d in (again, rule)
+            [(m.sender, m.delivered, m.on_time, m.arrival_ms) for m in d.messages]
+            for d in (again, rule)
         )
         assert fates == rule_fates
         assert not heard or {m.weight for m in again.messages} == {None}
@@ -224,7 +247,9 @@ def test_it_pays_a_second_inference_where_it_heard_somebody(done: Evaluated) -> 
     assert figure(done, "6g", "fusion_ms").value == 0
 
 
-def test_the_policy_is_what_it_answered_and_the_record_has_it(done: Evaluated, two: Dataset) -> None:
+def test_the_policy_is_what_it_answered_and_the_record_has_it(
+    done: Evaluated, two: Dataset
+) -> None:
     answers = {answer.id: answer for answer in answers_of(done.out)}
     again = 0
     for d in decisions(done.out, FUSION.name):
@@ -249,7 +274,9 @@ def test_a_scenes_answers_are_the_egos_the_helpers_and_the_fusion_calls(done: Ev
     assert [role for _, role in order].count("merge") > 5
 
 
-def test_a_replay_scores_the_same_in_other_batches(done: Evaluated, two: Dataset, tmp_path: Path) -> None:
+def test_a_replay_scores_the_same_in_other_batches(
+    done: Evaluated, two: Dataset, tmp_path: Path
+) -> None:
     spec = spec_of(two, f"replay:{done.out}", points=CONDITIONS, latency="paper", batch_size=3)
     replayed = run(spec, tmp_path / "replay")
     assert same_scores(replayed, done)
@@ -306,7 +333,9 @@ def unsure(small: Dataset) -> dict[str, str | Completion]:
 def test_a_resumed_run_has_the_times_that_it_began_with(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They were measured; it resumes on a machine that is too busy and too slow to measure anything."""
+    """They were measured; it resumes on a machine that is too busy and too slow to measure
+    anything.
+    """
 
     class Slower(Scripted):
         def complete(self, requests: Sequence[Request]) -> list[Completion]:
@@ -322,23 +351,32 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
     resumed = run(spec, tmp_path / "run")
     assert json.loads(msgspec.json.encode(resumed.manifest.latency)) == begun
     assert 0 < begun["ego_s"] < begun["fusion_s"]
-    fused = [d for d in decisions(tmp_path / "run", FUSION.name) if any(m.on_time for m in d.messages)]
+    fused = [
+        d for d in decisions(tmp_path / "run", FUSION.name) if any(m.on_time for m in d.messages)
+    ]
     rules = {(d.scene, d.seed): d.latency_ms for d in decisions(tmp_path / "run", "6g")}
     assert fused
     for d in fused:
-        assert d.latency_ms == pytest.approx(rules[d.scene, d.seed] + 1000 * begun["fusion_s"], abs=2e-3)
+        assert d.latency_ms == pytest.approx(
+            rules[d.scene, d.seed] + 1000 * begun["fusion_s"], abs=2e-3
+        )
 
 
-# -- in a sweep -----------------------------------------------------------------------------------------
+# -- in a sweep
+# -----------------------------------------------------------------------------------------
 
 
-def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp_path: Path) -> None:
+def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(
+    done: Evaluated, tmp_path: Path
+) -> None:
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     watched = Watched()
     source = ReplayedRun(folder, progress=watched)
     [[same]] = source.walked([Setting("6g", FUSION, 4)], source.seeds)
     assert watched.asked == [], "the run's own seeds delivered nothing else"
-    assert same.ends["success_rate"].mean() == pytest.approx(figure(done, FUSION.name, "success_rate").value)
+    assert same.ends["success_rate"].mean() == pytest.approx(
+        figure(done, FUSION.name, "success_rate").value
+    )
     [[fewer]] = source.walked([Setting("6g", FUSION, 2)], source.seeds)
     assert sum(watched.asked) > 0
     again = Watched()
@@ -350,7 +388,9 @@ def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(done: Evaluated, tmp
 
 
 @pytest.mark.exhaustive
-def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evaluated, tmp_path: Path) -> None:
+def test_what_another_process_has_asked_meanwhile_is_not_asked_again(
+    done: Evaluated, tmp_path: Path
+) -> None:
     """Both looked at the run before either asked."""
     folder = Path(shutil.copytree(done.out, tmp_path / "run"))
     one, other = ReplayedRun(folder), ReplayedRun(folder)
@@ -366,7 +406,9 @@ def test_what_another_process_has_asked_meanwhile_is_not_asked_again(done: Evalu
 
 
 @pytest.mark.slow
-def test_points_that_are_walked_together_make_the_calls_of_each(done: Evaluated, tmp_path: Path) -> None:
+def test_points_that_are_walked_together_make_the_calls_of_each(
+    done: Evaluated, tmp_path: Path
+) -> None:
     """Each set of messages is asked about once, and answers are what each point has alone."""
     texts = ("loss=0", "loss=0.3", "loss=0.3,defence=quoted+schema", "attack=injection:share=1/3")
     points = [named_point(f"{FUSION.name},{text}") for text in texts]

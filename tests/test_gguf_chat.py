@@ -27,7 +27,9 @@ MESSAGES = (
 def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:
     from transformers import AutoTokenizer
 
-    return AutoTokenizer.from_pretrained(tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny"))
+    return AutoTokenizer.from_pretrained(
+        tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny")
+    )
 
 
 TEMPLATES = {
@@ -40,20 +42,27 @@ TEMPLATES = {
     {% endfor %}
     {{- eos_token }}
 """,
-    "loop controls": "{% for m in messages %}{% if loop.index == 2 %}{% break %}{% endif %}x{% endfor %}",
+    "loop controls": "{% for m in messages %}{% if loop.index == 2 "
+    "%}{% break %}{% endif %}x{% endfor %}",
     "JSON as it is": "{{ messages | tojson }}{{ messages[0] | tojson(indent=2) }}",
-    "what it said": "{% for m in messages %}{% generation %}{{ m.content }}{% endgeneration %};{% endfor %}",
+    "what it said": "{% for m in messages %}{% generation %}{{ "
+    "m.content }}{% endgeneration %};{% endfor %}",
     "the day": "{{ strftime_now('%Y') }}",
-    "nothing given": "{% if tools is none and documents is none %}none{% endif %}{{ bos_token }}{{ x }}",
+    "nothing given": "{% if tools is none and documents is none "
+    "%}none{% endif %}{{ bos_token }}{{ x }}",
     "namespaces and slices": "{% set ns = namespace(n=0) %}{% for m in messages[::-1] %}"
     "{% set ns.n = ns.n + 1 %}{{ ns.n }}{{ m.content[:4] }}{% endfor %}",
-    "Python's own methods": "{{ messages[0].content.split('.')[0].upper() }}{{ 'x'.startswith('u') }}",
+    "Python's own methods": "{{ "
+    "messages[0].content.split('.')[0].upper() "
+    "}}{{ 'x'.startswith('u') }}",
 }
 
 
 @pytest.mark.parametrize("template", TEMPLATES.values(), ids=TEMPLATES)
 @pytest.mark.parametrize("thinking", [True, False])
-def test_a_template_renders_as_in_transformers(tokenizer: Any, template: str, thinking: bool) -> None:
+def test_a_template_renders_as_in_transformers(
+    tokenizer: Any, template: str, thinking: bool
+) -> None:
     theirs = tokenizer.apply_chat_template(
         list(MESSAGES), chat_template=template, tokenize=False, add_generation_prompt=True,
         enable_thinking=thinking,
@@ -71,7 +80,9 @@ def test_a_checkpoint_and_a_gguf_file_have_one_prompt(tokenizer: Any) -> None:
 
 def test_a_template_that_refuses_the_messages_says_so() -> None:
     chat = Chat("gruff", Words("{{ raise_exception('System role not supported') }}"))
-    with pytest.raises(UserError, match=r"'gruff': .*refuses the messages \(System role not supported\)"):
+    with pytest.raises(
+        UserError, match=r"'gruff': .*refuses the messages \(System role not supported\)"
+    ):
         chat.render(MESSAGES, thinking=False)
 
 

@@ -74,7 +74,9 @@ def test_every_weight_is_there_under_llama_cpps_name_to_the_bit(tiny: Path, tmp_
         "blk.1.ffn_norm": "model.layers.1.post_attention_layernorm",
         "blk.1.ffn_down": "model.layers.1.mlp.down_proj",
     }.items():
-        np.testing.assert_array_equal(ours[f"{name}.weight"], theirs[f"{theirs_name}.weight"].numpy())
+        np.testing.assert_array_equal(
+            ours[f"{name}.weight"], theirs[f"{theirs_name}.weight"].numpy()
+        )
 
 
 def test_f16_is_the_nearest_half_and_vectors_stay_whole(tiny: Path, tmp_path: Path) -> None:
@@ -173,16 +175,28 @@ def strip_spaces(folder: Path) -> None:
         (remove("model.safetensors"), "has no model.safetensors"),
         (remove("tokenizer.json"), "has no tokenizer.json"),
         (remove("chat_template.jinja"), "has no chat template; put a chat_template.jinja"),
-        (set_config(architectures=["LlamaForCausalLM"]), "LlamaForCausalLM.*; only Qwen3ForCausalLM"),
+        (
+            set_config(architectures=["LlamaForCausalLM"]),
+            "LlamaForCausalLM.*; only Qwen3ForCausalLM",
+        ),
         (set_config(attention_bias=True), "attention_bias = True; only False"),
-        (set_config(rope_parameters={"rope_type": "yarn", "rope_theta": 1e4}), "scales its rope .yarn."),
+        (
+            set_config(rope_parameters={"rope_type": "yarn", "rope_theta": 1e4}),
+            "scales its rope .yarn.",
+        ),
         (set_config(vocab_size=300), "its tokenizer has 375 tokens and the model only 300"),
-        (set_tokenizer(pre_tokenizer={"type": "ByteLevel"}), "splits text otherwise than Qwen2's; llama.cpp"),
+        (
+            set_tokenizer(pre_tokenizer={"type": "ByteLevel"}),
+            "splits text otherwise than Qwen2's; llama.cpp",
+        ),
         (set_tokenizer(pre_tokenizer=None), "splits text otherwise"),
         (set_tokenizer(normalizer={"type": "Lowercase"}), "normalises text otherwise"),
         (set_tokenizer(model={"type": "Unigram"}), "is no plain BPE"),
         (strip_spaces, "takes spaces or whole words with </think>"),
-        (lambda folder: (folder / "config.json").write_text("{"), "cannot be exported: JSONDecodeError"),
+        (
+            lambda folder: (folder / "config.json").write_text("{"),
+            "cannot be exported: JSONDecodeError",
+        ),
         (lambda folder: (folder / "config.json").write_text("[]"), "cannot be exported: TypeError"),
         (set_config(rms_norm_eps=None), "cannot be exported"),
         (truncate, "cannot be exported: ValueError: mmap length"),

@@ -1,4 +1,6 @@
-"""A saved Qwen3-VL as two GGUF files, its text part and its projector: what is in them, what is refused."""
+"""A saved Qwen3-VL as two GGUF files, its text part and its projector:
+what is in them, what is refused.
+"""
 
 import json
 import shutil
@@ -35,13 +37,16 @@ def test_every_weight_is_in_one_of_the_two_to_the_bit(tiny: Path, tmp_path: Path
     export(tiny, out, "F32")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mmproj-tiny.gguf", "tiny.gguf"]
     theirs, text, seen = weights_of(tiny), tensors(out), tensors(projector_of(out))
-    assert len(text) + len(seen) == len(theirs) + 1  # a patch's weights are two, for a video's two frames
+    # a patch's weights are two, for a video's two frames
+    assert len(text) + len(seen) == len(theirs) + 1
     for name, theirs_name in {
         "token_embd": "language_model.embed_tokens",
         "output_norm": "language_model.norm",
         "blk.1.attn_q": "language_model.layers.1.self_attn.q_proj",
     }.items():
-        np.testing.assert_array_equal(text[f"{name}.weight"], theirs[f"model.{theirs_name}.weight"].numpy())
+        np.testing.assert_array_equal(
+            text[f"{name}.weight"], theirs[f"model.{theirs_name}.weight"].numpy()
+        )
     for name, theirs_name in {
         "v.blk.1.ln1.bias": "blocks.1.norm1.bias",
         "v.blk.0.attn_qkv.weight": "blocks.0.attn.qkv.weight",
@@ -81,7 +86,10 @@ def test_the_two_say_what_llama_cpp_must_know(tiny: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("table", "key", "value", "said"),
     [
-        ("vision_config", "spatial_merge_size", 4, r"\[vision_config\]: spatial_merge_size = 4; only 2"),
+        ("vision_config", "spatial_merge_size", 4, 
+            r"\[vision_config\]: "
+            r"spatial_merge_size = 4; "
+            r"only 2"),
         ("vision_config", "hidden_act", "gelu", "hidden_act = gelu; only gelu_pytorch_tanh"),
         ("text_config", "rope_parameters", {"rope_theta": 1e4, "mrope_section": [4, 2, 2]},
          r"mrope_section = \[4, 2, 2\]; only \[3, 3, 2\]"),
@@ -106,6 +114,8 @@ def test_what_is_missing_is_named_and_no_half_is_left(tiny: Path, tmp_path: Path
     with pytest.raises(UserError, match=r"lacks model\.visual\.merger\.linear_fc2\.bias"):
         export(copy, tmp_path / "out" / "out.gguf")
     remove("preprocessor_config.json")(copy)
-    with pytest.raises(UserError, match=r"has no preprocessor_config\.json; save its image processor"):
+    with pytest.raises(
+        UserError, match=r"has no preprocessor_config\.json; save its image processor"
+    ):
         export(copy, tmp_path / "out" / "out.gguf")
     assert not list((tmp_path / "out").iterdir())

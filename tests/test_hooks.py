@@ -25,7 +25,9 @@ def test_a_hook_is_a_program_of_the_dev_extra_or_of_every_machine(hook: dict[str
         assert re.search(hook["entry"], "-----BEGIN RSA PRIVATE " + "KEY-----")
         return
     program = Path(shlex.split(hook["entry"])[0])
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     packages = {re.split(r"[><=\[]", line)[0] for line in extras["dev"]}
     package = {"lint-imports": "import-linter"}.get(program.name, program.name)
     assert str(program) == "bash" or program.parent == Path(".venv/bin")
@@ -33,6 +35,10 @@ def test_a_hook_is_a_program_of_the_dev_extra_or_of_every_machine(hook: dict[str
 
 
 def test_what_is_checked_before_a_push_or_commit_is_what_make_checks() -> None:
-    run = {Path(shlex.split(hook["entry"])[0]).name for hook in HOOKS if hook["language"] == "system"}
-    [recipe] = re.findall(r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    run = {
+        Path(shlex.split(hook["entry"])[0]).name for hook in HOOKS if hook["language"] == "system"
+    }
+    [recipe] = re.findall(
+        r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE
+    )
     assert run - {"bash"} == set(re.findall(r"\$\(BIN\)/(\S+)", recipe))

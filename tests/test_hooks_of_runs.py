@@ -59,7 +59,8 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def installed(**hooks: Any) -> None:
         found = {
-            name: SimpleNamespace(load=lambda hook=hook: hook, value="x:y") for name, hook in hooks.items()
+            name: SimpleNamespace(load=lambda hook=hook: hook, value="x:y")
+            for name, hook in hooks.items()
         }
         entries = plugins.entries
         monkeypatch.setattr(
@@ -98,7 +99,17 @@ def test_a_hook_is_told_of_a_drive_from_the_environment(
     note = Note()
     install(mine=note)
     monkeypatch.setenv("SWARMDRIVE_TRACKERS", " mine,")
-    drive = ("--condition", "single-local", "--episodes", "2", "--seeds", "0:1", "--workers", "1", "--quiet")
+    drive = (
+        "--condition",
+        "single-local",
+        "--episodes",
+        "2",
+        "--seeds",
+        "0:1",
+        "--workers",
+        "1",
+        "--quiet",
+    )
     assert harness("drive", *drive, "--out", "driven")[0] == 0
     assert [told[:2] for told in note.told if told[0] == "answered"][-1] == ("answered", 2)
     assert [told[0] for told in note.told][:: len(note.told) - 1] == ["begin", "end"]
@@ -110,7 +121,9 @@ def test_a_hook_that_fails_costs_a_run_one_line(
 ) -> None:
     bad, good = Note(fails_at), Note()
     install(bad=bad, good=good)
-    code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--tracker", "good", "--quiet"))
+    code, _, said = harness(
+        *typed_eval(two_path, "--tracker", "bad", "--tracker", "good", "--quiet")
+    )
     assert code == 0
     assert said.count("tracker bad") == 1
     assert f"harness: tracker bad: {fails_at} went wrong; the run goes on without it\n" in said
@@ -146,7 +159,11 @@ class Bad(Note):
 )
 @pytest.mark.parametrize("at", ["begin", "end"])
 def test_a_hook_that_ends_the_program_costs_a_run_one_line(
-    at: str, does: Callable[[], object], two_path: Path, harness: Typed, install: Callable[..., None]
+    at: str,
+    does: Callable[[], object],
+    two_path: Path,
+    harness: Typed,
+    install: Callable[..., None],
 ) -> None:
     install(bad=Bad(at, does))
     code, _, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet"))
@@ -225,7 +242,10 @@ def test_the_process_does_not_wait_again_for_a_server_that_did_not_answer(
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}, check=False,
         )  # fmt: skip
     assert (ended.returncode, json.loads(ended.stdout)["run"]) == (0, "run")
-    assert "tracker away: its begin takes longer than 0.4 s; the run goes on without it" in ended.stderr
+    assert (
+        "tracker away: its begin takes longer than 0.4 s; the run goes on without it"
+        in ended.stderr
+    )
 
 
 def test_a_hook_that_takes_long_is_waited_for_aloud(
@@ -250,7 +270,9 @@ def test_a_hook_that_leaves_the_folder_does_not_take_the_run_along(
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_hook_is_called_in_one_thread(two_path: Path, harness: Typed, install: Callable[..., None]) -> None:
+def test_a_hook_is_called_in_one_thread(
+    two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
     """MLflow keeps its run by thread."""
     threads = list[int]()
     note = Note()

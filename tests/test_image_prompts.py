@@ -41,7 +41,8 @@ def asked(of: Spec, scene: Scene, blind: bool = False) -> dict[str, Request]:
     return {r.id.partition("/")[2]: r for r in requests(of, [scene], blind)}
 
 
-# -- pictures of a question ----------------------------------------------------------------------------------
+# -- pictures of a question
+# ----------------------------------------------------------------------------------
 
 
 def test_every_viewer_is_shown_what_its_own_cameras_see(crossing: Dataset):
@@ -57,19 +58,26 @@ def test_every_viewer_is_shown_what_its_own_cameras_see(crossing: Dataset):
 def test_a_model_is_shown_pictures_of_its_own_size(crossing: Dataset):
     scene = crossing.scenes(crossing.forest.ids[:1])[0]
     small = spec(crossing, vision=Vision(448, 224, patch_px=14, merge=2))
-    assert {r.image.pixels.shape for r in asked(small, scene).values() if r.image} == {(224, 448, 3)}
+    assert {r.image.pixels.shape for r in asked(small, scene).values() if r.image} == {
+        (224, 448, 3)
+    }
 
 
 def test_a_blank_picture_says_nothing_and_a_blind_helper_gets_one(crossing: Dataset):
     scene = crossing.scenes(crossing.forest.ids[:1])[0]
-    blank = [*asked(spec(crossing, "blank"), scene).values(), *asked(spec(crossing), scene, True).values()]
+    blank = [
+        *asked(spec(crossing, "blank"), scene).values(),
+        *asked(spec(crossing), scene, True).values(),
+    ]
     assert len(blank) == 4 + 3
     for request in blank:
         assert request.image is not None
         assert np.all(request.image.pixels == GREY)
 
 
-def test_another_scene_is_of_another_episode_at_the_same_step_and_always_the_same(crossing: Dataset):
+def test_another_scene_is_of_another_episode_at_the_same_step_and_always_the_same(
+    crossing: Dataset,
+):
     of, forest = spec(crossing, "another"), crossing.forest
     for scene in crossing.scenes(forest.ids[:40:7]):
         other = another(of, scene)
@@ -79,7 +87,9 @@ def test_another_scene_is_of_another_episode_at_the_same_step_and_always_the_sam
         viewer = scene.viewers[1]
         request = asked(of, scene)[viewer]
         assert request.image is not None
-        assert request.image.sha256 == frame(crossing.scenario, other.state, other.viewers[1]).sha256
+        assert (
+            request.image.sha256 == frame(crossing.scenario, other.state, other.viewers[1]).sha256
+        )
 
 
 def test_without_its_picture_a_prompt_is_its_text(crossing: Dataset):
@@ -87,14 +97,18 @@ def test_without_its_picture_a_prompt_is_its_text(crossing: Dataset):
     with_it, without = asked(spec(crossing), scene), asked(spec(crossing, "none"), scene)
     for viewer, request in without.items():
         assert request.image is None
-        assert [m["content"] for m in request.messages] == [m["content"] for m in with_it[viewer].messages]
+        assert [m["content"] for m in request.messages] == [
+            m["content"] for m in with_it[viewer].messages
+        ]
         assert not any("image" in m for m in request.messages)
 
 
 def test_image_alone_says_nothing_of_anybody_around(crossing: Dataset):
     for scene in crossing.scenes(crossing.forest.ids[:20]):
         for viewer, graph in scene.graphs.items():
-            _, user = prompts.load("v8").render(graph, crossing.actions, words=crossing.scenario.prompt_words)
+            _, user = prompts.load("v8").render(
+                graph, crossing.actions, words=crossing.scenario.prompt_words
+            )
             named = {node.id for node in graph.nodes} - {graph.ego.id, viewer}
             assert not named & set(user["content"].replace(":", " ").replace(",", " ").split())
 
@@ -114,7 +128,8 @@ def test_a_prompt_that_shows_no_objects_is_not_asked_again_with_more_of_them(
     assert replace(spec(crossing, image, "v7"), points=(point,)).points == (point,)
 
 
-# -- what is refused -----------------------------------------------------------------------------------------
+# -- what is refused
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -142,10 +157,14 @@ def test_a_model_of_texts_takes_the_text_of_an_image_prompt():
 
 def test_pictures_of_other_scenes_are_a_datasets(crossing: Dataset):
     one = crossing.of_episodes({0})
-    with pytest.raises(UserError, match=r"no other episode of .* at step 0; give a greater --limit"):
+    with pytest.raises(
+        UserError, match=r"no other episode of .* at step 0; give a greater --limit"
+    ):
         another(spec(one, "another"), one.scenes(one.forest.ids[:1])[0])
     ego = Agent(SEES, prompts.load("v7"), image="another")
-    with pytest.raises(UserError, match="--image another: pictures of other scenes are a dataset's"):
+    with pytest.raises(
+        UserError, match="--image another: pictures of other scenes are a dataset's"
+    ):
         replace(spec(crossing), ego=ego, source=LiveSource(200000, 2))
 
 
@@ -160,7 +179,8 @@ def test_a_prompt_with_examples_shows_no_picture(tmp_path: Path):
         prompts.load("vx", tmp_path)
 
 
-# -- tokens of a picture -------------------------------------------------------------------------------------
+# -- tokens of a picture
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

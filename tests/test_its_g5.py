@@ -1,4 +1,6 @@
-"""802.11p: airtimes and waits by hand, closed forms beside a simulation of the slots, published curves."""
+"""802.11p: airtimes and waits by hand, closed forms beside a simulation of the slots,
+published curves.
+"""
 
 import math
 from dataclasses import replace
@@ -26,7 +28,8 @@ def site(distance_m, sight=CLEAR, corner_m=np.nan) -> Site:
     return Site(there, np.full(n, sight), np.full(n, 1.6), np.full((n, 2), corner_m))
 
 
-# -- by hand -----------------------------------------------------------------------------------------------
+# -- by hand
+# -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("size_bytes", "airtime_us"), [(190, 304), (300, 448), (350, 512)])
@@ -54,9 +57,11 @@ def test_on_an_idle_medium_one_waits_an_aifs_and_half_the_window_and_nothing_col
 
 
 def test_a_link_by_hand_with_nobody_else():
-    """150 m: 40 log10 d + 7.56 + 2.7 log10 5.89 = 96.68 dB, -73.68 dBm, 21.32 dB over noise, 23.54 a bit.
+    """150 m: 40 log10 d + 7.56 + 2.7 log10 5.89 = 96.68 dB, -73.68 dBm, 21.32 dB over noise,
+    23.54 a bit.
 
-    On the line from 20 dB (0.4 %) to 25 dB (0.3 %). Five standard deviations of 3 dB lower it is not sensed.
+    On the line from 20 dB (0.4 %) to 25 dB (0.3 %).
+    Five standard deviations of 3 dB lower it is not sensed.
     """
     loss = QUIET.loss(site([150, 150]), np.array([0.0, -5.0]), 800.0)
     assert loss[0] == pytest.approx(0.004 - 0.001 * 3.54 / 5, abs=1e-5)
@@ -64,7 +69,8 @@ def test_a_link_by_hand_with_nobody_else():
 
 
 @pytest.mark.parametrize(
-    ("curve", "half_db"), [("11p-mcs2-350B-highway-los", 1.08), ("11p-mcs4-350B-crossing-nlos", 10.39)]
+    ("curve", "half_db"),
+    [("11p-mcs2-350B-highway-los", 1.08), ("11p-mcs4-350B-crossing-nlos", 10.39)],
 )
 def test_other_block_error_curves_hold_at_the_rate_that_they_were_made_for_and_shifted_at_others(
     curve, half_db
@@ -79,7 +85,8 @@ def test_other_block_error_curves_hold_at_the_rate_that_they_were_made_for_and_s
     )
 
 
-# -- limits and directions ---------------------------------------------------------------------------------
+# -- limits and directions
+# ---------------------------------------------------------------------------------
 
 
 def test_reception_is_the_mean_of_what_links_have_over_their_shadowing():
@@ -106,7 +113,8 @@ def test_farther_denser_and_oftener_is_never_better():
 
 def test_what_stands_between_costs_reception():
     clear, vehicle, building = (
-        CROWD.reception(np.array([80.0, 160.0]), np.full(2, sight)) for sight in (CLEAR, VEHICLE, BUILDING)
+        CROWD.reception(np.array([80.0, 160.0]), np.full(2, sight))
+        for sight in (CLEAR, VEHICLE, BUILDING)
     )
     assert np.all(clear > vehicle)
     assert np.all(vehicle > building)
@@ -115,7 +123,8 @@ def test_what_stands_between_costs_reception():
     assert CROWD.loss(site(28.3, BUILDING, 20.0), np.zeros(1), 800.0) < 0.5
 
 
-# -- the closed forms beside a simulation of the slots -----------------------------------------------------
+# -- the closed forms beside a simulation of the slots
+# -----------------------------------------------------
 
 
 def simulated(
@@ -137,7 +146,11 @@ def simulated(
         while arrived < n and at[arrived] < until:
             vehicle = who[arrived]
             if count[vehicle] < 0:
-                count[vehicle], since[vehicle], idle[vehicle] = rng.integers(0, window + 1), at[arrived], 0
+                count[vehicle], since[vehicle], idle[vehicle] = (
+                    rng.integers(0, window + 1),
+                    at[arrived],
+                    0,
+                )
             arrived += 1
         return arrived
 
@@ -173,7 +186,9 @@ def test_collisions_and_waits_are_those_of_simulated_slots(vehicles):
     share, its_busy = back_off.same_slot(per_slot, 25, 8, 15)
     assert its_busy == pytest.approx(busy, rel=0.06)
     assert share == pytest.approx(met, rel=0.2, abs=0.002)
-    assert back_off.mean_access_s(busy, 25 * SLOT_S, 8 * SLOT_S, 15) == pytest.approx(wait_s, rel=0.15)
+    assert back_off.mean_access_s(busy, 25 * SLOT_S, 8 * SLOT_S, 15) == pytest.approx(
+        wait_s, rel=0.15
+    )
 
 
 @pytest.mark.parametrize("busy", [0.05, 0.3, 0.6])
@@ -184,7 +199,8 @@ def test_the_waits_drawn_have_the_mean_of_the_closed_form(busy):
     )
 
 
-# -- the seam ----------------------------------------------------------------------------------------------
+# -- the seam
+# ----------------------------------------------------------------------------------------------
 
 
 def links_and_draws(n: int) -> tuple[Links, Draws]:
@@ -194,7 +210,14 @@ def links_and_draws(n: int) -> tuple[Links, Draws]:
     asked = rng.random((n, 3)) < 0.8
     ready_s = np.where(asked, 0.145 + rng.uniform(0, 0.05, (n, 3)), np.nan)
     links = Links(
-        asked, ready_s, rng.uniform(5, 90, (n, 3)), np.full((n, 3), 2400.0), asked, asked, 800.0, where
+        asked,
+        ready_s,
+        rng.uniform(5, 90, (n, 3)),
+        np.full((n, 3), 2400.0),
+        asked,
+        asked,
+        800.0,
+        where,
     )
     trips = Trips(np.zeros(n, int), np.arange(n), np.zeros(n, int), 6)
     return links, Draws(rng.random((n, 3, 2)), rng.random((n, 3)), trips)
@@ -217,7 +240,9 @@ def test_a_batch_is_one_at_a_time_and_who_was_not_asked_changes_nobody():
 
 
 def test_replies_wait_for_each_other_and_those_that_begin_together_are_both_lost():
-    """All ready at 150 ms on an idle medium; back-offs of 0, 0 and 10 slots, then of 0, 1 and 10."""
+    """All ready at 150 ms on an idle medium;
+    back-offs of 0, 0 and 10 slots, then of 0, 1 and 10.
+    """
     where = Site(
         np.array([[0.0, 0], [20, 0], [0, 20], [20, 20]]),
         np.zeros(3, int),
@@ -225,11 +250,15 @@ def test_replies_wait_for_each_other_and_those_that_begin_together_are_both_lost
         np.full((3, 2), np.nan),
     )
     asked, same = np.ones(3, bool), np.full(3, 0.15)
-    links = Links(asked, same, np.array([20.0, 20.0, 28.0]), np.full(3, 1280.0), asked, asked, 800.0, where)
+    links = Links(
+        asked, same, np.array([20.0, 20.0, 28.0]), np.full(3, 1280.0), asked, asked, 800.0, where
+    )
 
     def played(slots):
         draws = Draws(
-            np.ones((3, 2)), (np.array(slots) + 0.5) / 16, Trips(np.array(0), np.array(0), np.array(0), 1)
+            np.ones((3, 2)),
+            (np.array(slots) + 0.5) / 16,
+            Trips(np.array(0), np.array(0), np.array(0), 1),
         )
         object.__setattr__(draws, "packet", np.full((3, 2), 0.5))
         return QUIET.deliver(links, draws)
@@ -267,4 +296,6 @@ def test_settings_that_are_no_radio_are_refused(setting, says):
 def test_a_world_without_places_is_refused():
     one = np.ones(1)
     with pytest.raises(UserError, match="a physical radio needs vehicles that are somewhere"):
-        ItsG5().deliver(Links(one > 0, one, one, one, one > 0, one > 0), Draws(np.ones((1, 2)), one))
+        ItsG5().deliver(
+            Links(one > 0, one, one, one, one > 0, one > 0), Draws(np.ones((1, 2)), one)
+        )

@@ -42,7 +42,8 @@ LANGUAGE_MODEL = "swarm-tiny"
 ROWS = ("decisions.parquet", "episodes.csv", "summary.csv")
 
 
-# -- which one counts -----------------------------------------------------------------------------------
+# -- which one counts
+# -----------------------------------------------------------------------------------
 
 
 def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
@@ -82,34 +83,50 @@ def test_what_is_left_out_takes_as_long_as_the_ego(text: str, seconds: tuple[flo
 @pytest.mark.parametrize(
     "text",
     ["", "mine", "0.1", "ego", "ego=", "ego=x", "ego=nan", "ego=-1", "ego=inf", f"ego={LONGEST_S + 1}",
-     "helper=0.1", "ego=0.1,ego=0.2", "ego=0.1,", "ego=0.1,car=0.2", "ego=0.1 helper=0.2", "ego=0.1\x1b[2J"],
+     "helper=0.1", "ego=0.1,ego=0.2", "ego=0.1,", "ego=0.1,car=0.2", 
+         "ego=0.1 "
+         "helper=0.2", "ego=0.1\x1b[2J"],
 )  # fmt: skip
 def test_anything_else_is_one_line(text: str, harness: Callable[..., Any]) -> None:
     code, out, err = harness("eval", "--limit", "1", "--latency", text)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("harness: --latency '")
     assert "give card, measured, paper, or by role the seconds of one answer, 0 to 3600" in err
-    assert "such as ego=0.171,helper=0.164,fusion=0.2 (ego is needed; a role left out has its time)" in err
+    assert (
+        "such as ego=0.171,helper=0.164,fusion=0.2 (ego is needed; a role left out has its time)"
+        in err
+    )
     assert "\x1b" not in err
 
 
 @pytest.mark.slow
-def test_a_replay_keeps_its_runs_times_unless_others_are_declared(small: Dataset, tmp_path: Path) -> None:
+def test_a_replay_keeps_its_runs_times_unless_others_are_declared(
+    small: Dataset, tmp_path: Path
+) -> None:
     first = run(spec_of(small, latency="ego=0.02,helper=0.01"), tmp_path / "run")
     replay = f"replay:{tmp_path / 'run'}"
-    assert run(spec_of(small, replay), tmp_path / "again").manifest.latency == first.manifest.latency
+    assert (
+        run(spec_of(small, replay), tmp_path / "again").manifest.latency == first.manifest.latency
+    )
     other = run(spec_of(small, replay, latency="ego=0.3"), tmp_path / "other").manifest.latency
     assert (other.ego_s, other.helper_s) == (0.3, 0.3)
 
 
-# -- measured, by name ----------------------------------------------------------------------------------
+# -- measured, by name
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("load", "said"),
     [
-        (IDLE + 0.01, "the machine is busy (0.26 processes a core in the last minute; at most 0.25); wait"),
-        (None, "this system does not say how busy it is; declare times with --latency paper or ego="),
+        (
+            IDLE + 0.01,
+            "the machine is busy (0.26 processes a core in the last minute; at most 0.25); wait",
+        ),
+        (
+            None,
+            "this system does not say how busy it is; declare times with --latency paper or ego=",
+        ),
     ],
 )
 def test_a_busy_machine_measures_nothing(
@@ -117,16 +134,22 @@ def test_a_busy_machine_measures_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(timing, "load_a_core", lambda: load)
-    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: pytest.fail("the model was opened"))
+    monkeypatch.setattr(
+        evaluation, "open_backend", lambda *_, **__: pytest.fail("the model was opened")
+    )
     for command in (["eval"], ["drive"], ["study", "closed-loop"]):
-        code, out, err = harness(*command, "--model", LANGUAGE_MODEL, "--latency", "measured", "--quiet")
+        code, out, err = harness(
+            *command, "--model", LANGUAGE_MODEL, "--latency", "measured", "--quiet"
+        )
         assert (code, out) == (2, "")
         assert err.startswith(f"harness: --latency measured: {said}")
         assert err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_system_without_a_load_average_is_none_that_is_idle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_without_a_load_average_is_none_that_is_idle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (3.0, 0.0, 0.0))
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     assert timing.load_a_core() == 0.75
@@ -139,14 +162,18 @@ def test_a_system_without_a_load_average_is_none_that_is_idle(monkeypatch: pytes
 
 
 class Clock(Scripted):
-    """An ego takes 0.2 s, a helper 0.1 s and a fusion call 0.4 s, but for the completions written down."""
+    """An ego takes 0.2 s, a helper 0.1 s and a fusion call 0.4 s,
+    but for the completions written down.
+    """
 
     def _say(self, request: Request) -> Completion:
         assert request.timed, "a server streams what is asked to be timed, and nothing else"
         done = super()._say(request)
         if request.id in self.lines:
             return done
-        return replace(done, seconds=0.4 if "+" in request.id else 0.2 if request.role == "ego" else 0.1)
+        return replace(
+            done, seconds=0.4 if "+" in request.id else 0.2 if request.role == "ego" else 0.1
+        )
 
 
 def test_a_measurement_is_the_median_of_good_answers_asked_alone(small: Dataset) -> None:
@@ -177,11 +204,14 @@ def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
         f"{s.id}/v1": Completion(f"{s.id}/v1", "", None, None, "error", 0.1, 1, "no")
         for s in scenes_of(small)
     }
-    with pytest.raises(Unanswered, match=r"^no \(5 times\): no answer to 5 of 5 questions to the ego"):
+    with pytest.raises(
+        Unanswered, match=r"^no \(5 times\): no answer to 5 of 5 questions to the ego"
+    ):
         measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(scenes_of(small)))
 
 
-# -- and what answers took decides nothing ----------------------------------------------------------------
+# -- and what answers took decides nothing
+# ----------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -212,7 +242,9 @@ def test_no_seconds_retries_or_batches_move_a_row(
         assert same_rows(tmp_path / name, tmp_path / "a")
     assert [m.latency for m in found] == [PAPER] * 3
     assert [m.retries for m in found] == [0, 2 * len(answers_of(tmp_path / "b")), 0]
-    assert found[0].answer_times == found[1].answer_times == {}, "no time, or none of a first attempt"
+    assert found[0].answer_times == found[1].answer_times == {}, (
+        "no time, or none of a first attempt"
+    )
     egos = sum(answer.role == "ego" for answer in answers_of(tmp_path / "c"))
     assert found[2].answer_times["ego"] == Times(egos, 0.5, 0.5, 0.5)
 
@@ -221,7 +253,9 @@ def test_times_by_hand(small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small), tmp_path / "run")
     one = answers_of(tmp_path / "run")[0]
     took = [msgspec.structs.replace(one, seconds=s / 100) for s in range(101)]
-    assert times(took) == {"ego": Times(101, 0.5, 0.05, 0.95)}, "of one episode: no interval over episodes"
+    assert times(took) == {"ego": Times(101, 0.5, 0.05, 0.95)}, (
+        "of one episode: no interval over episodes"
+    )
 
 
 def test_times_to_the_first_token_and_of_each_after_it(small: Dataset, tmp_path: Path) -> None:
@@ -269,11 +303,15 @@ def test_a_replay_keeps_its_runs_times_to_first_token(
     ]
 
 
-def test_answers_of_before_there_were_times_to_first_token_have_none(small: Dataset, tmp_path: Path) -> None:
+def test_answers_of_before_there_were_times_to_first_token_have_none(
+    small: Dataset, tmp_path: Path
+) -> None:
     run(spec_of(small), tmp_path / "run")
     file = tmp_path / "run/answers.jsonl"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
-    old = [{k: v for k, v in line.items() if k not in ("first_token_s", "token_s")} for line in lines]
+    old = [
+        {k: v for k, v in line.items() if k not in ("first_token_s", "token_s")} for line in lines
+    ]
     assert len(old[0]) == len(lines[0]) - 2
     file.write_text("".join(json.dumps(line) + "\n" for line in old))
     assert {(a.first_token_s, a.token_s) for a in answers_of(tmp_path / "run")} == {(None, None)}
@@ -316,7 +354,9 @@ def test_a_measured_run_repeated_from_its_manifest_on_a_busy_machine_has_the_sam
     command: Sequence[str], engine: str, harness: Callable[..., Any], small_path: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Measured while idle; then twice under load: as it was asked, and each answer alone and timed."""
+    """Measured while idle; then twice under load:
+    as it was asked, and each answer alone and timed.
+    """
     monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
     is_measured((*command, "--engine", engine), "0:2", harness, small_path, tmp_path)
     with busy_machine():
@@ -362,10 +402,21 @@ def test_a_measured_run_repeated_from_its_manifest_by_a_slower_model_has_the_sam
 
 
 def is_measured(
-    command: Sequence[str], seeds: str, harness: Callable[..., Any], small_path: Path, tmp_path: Path
+    command: Sequence[str],
+    seeds: str,
+    harness: Callable[..., Any],
+    small_path: Path,
+    tmp_path: Path,
 ) -> None:
     data = ("--dataset", small_path) if command[0] == "eval" else ("--first-seed", "100")
-    points = ("--condition", "single-local", "--condition", "6g", "--condition", "6g:consensus=ego-prompt")
+    points = (
+        "--condition",
+        "single-local",
+        "--condition",
+        "6g",
+        "--condition",
+        "6g:consensus=ego-prompt",
+    )
     code, _, err = harness(
         *command, *data, *points, "--model", LANGUAGE_MODEL, "--seeds", seeds, "--latency", "measured",
         "--no-cache", "--out", tmp_path / "run",
@@ -390,5 +441,6 @@ def has_the_same_rows(harness: Callable[..., Any], tmp_path: Path) -> None:
     times_of = json.loads((tmp_path / "alone/run.json").read_text())["answer_times"]
     said = answers_of(tmp_path / "alone")
     assert {role: t["n"] for role, t in times_of.items()} == Counter(a.role for a in said)
-    assert {"ego", "helper"} <= set(times_of)  # replies that a busy machine made late are not merged
+    # replies that a busy machine made late are not merged
+    assert {"ego", "helper"} <= set(times_of)
     assert all(0 < t["p5_s"] <= t["median_s"] <= t["p95_s"] for t in times_of.values())

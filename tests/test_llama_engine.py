@@ -1,4 +1,6 @@
-"""The llama.cpp engine, played on a real tiny Qwen3 with random weights, exported to a GGUF file."""
+"""The llama.cpp engine, played on a real tiny Qwen3 with random weights,
+exported to a GGUF file.
+"""
 
 import json
 import shutil
@@ -80,7 +82,9 @@ def open_gguf(file: Path, batch_size: int = 8, **options: str) -> LlamaBackend:
 
 
 def opened_here(file: Path, batch_size: int = 8) -> LanguageModel:
-    """The same in this process, which takes no second to start; the child's errors are those of here."""
+    """The same in this process, which takes no second to start;
+    the child's errors are those of here.
+    """
     return open_here(card_of(file), file, None, batch_size)
 
 
@@ -89,11 +93,15 @@ def engine_of(file: Path, places: int = 8) -> LlamaEngine:
 
 
 def naive(theirs: Any, sequences: list[list[int]]) -> Floats:
-    """Log-probabilities of the next token, by a forward of transformers from scratch for each sequence."""
+    """Log-probabilities of the next token,
+    by a forward of transformers from scratch for each sequence.
+    """
     import torch
 
     with torch.no_grad():
-        logits = [theirs.engine.model(torch.tensor([ids])).logits[0, -1].double() for ids in sequences]
+        logits = [
+            theirs.engine.model(torch.tensor([ids])).logits[0, -1].double() for ids in sequences
+        ]
     found: Floats = torch.log_softmax(torch.stack(logits), -1).numpy()
     return found
 
@@ -106,7 +114,8 @@ PROMPTS = [[1, 7, 8, *range(20, 20 + n), 9] for n in (4, 11, 1, 30, 17)]
 TOKENS = st.lists(st.integers(0, VOCABULARY - 1), max_size=5)
 
 
-# -- what goes in -------------------------------------------------------------------------------------
+# -- what goes in
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
@@ -140,10 +149,13 @@ def test_special_tokens_are_read_whole_and_thoughts_stay_in_the_text(engine: Lla
     assert engine.chat.decode(ids) == "a<think>b</think>"
 
 
-# -- logits -------------------------------------------------------------------------------------------
+# -- logits
+# -------------------------------------------------------------------------------------------
 
 
-def test_f32_says_what_transformers_says_to_the_fifth_digit(engine: LlamaEngine, theirs: Any) -> None:
+def test_f32_says_what_transformers_says_to_the_fifth_digit(
+    engine: LlamaEngine, theirs: Any
+) -> None:
     session = engine.begin(PROMPTS)
     np.testing.assert_allclose(next_of(session), naive(theirs, PROMPTS), atol=1e-4)
     session.close()
@@ -184,7 +196,9 @@ def test_whatever_way_sequences_go_it_is_as_if_each_were_read_from_scratch(
                 session.advance(chunks)
                 sequences = [old + new for old, new in zip(sequences, chunks, strict=True)]
             else:
-                places = data.draw(st.permutations(range(len(sequences))))[: data.draw(st.integers(1, 5))]
+                places = data.draw(st.permutations(range(len(sequences))))[
+                    : data.draw(st.integers(1, 5))
+                ]
                 session.keep(places)
                 sequences = [sequences[place] for place in places]
             np.testing.assert_allclose(next_of(session), naive(theirs, sequences), atol=1e-3)
@@ -211,7 +225,8 @@ def test_a_beginning_kept_from_before_changes_nothing_and_is_not_computed_again(
         ([[*helper, 5, 6]], 102),
         ([[*system[:90], 5], [*system[:90], 6]], 2),
         ([[*helper, 5, 7], [*helper, 8]], 3),
-        ([[*helper, 5, 6]], 102),  # asked again alone, it is read again: else its time would be no answer's
+        # asked again alone, it is read again: else its time would be no answer's
+        ([[*helper, 5, 6]], 102),
         ([[*system, 5], [*helper, 9], [*system, 6], [*helper, 7, 8]], 5),  # a batch with both
     ]:
         computed.clear()
@@ -247,7 +262,8 @@ def test_tokens_that_are_none_fail_and_the_next_prompts_do_not(tiny: Path, their
         engine.begin(PROMPTS[:4])
 
 
-# -- answers ------------------------------------------------------------------------------------------
+# -- answers
+# ------------------------------------------------------------------------------------------
 
 
 def in_mode(request: Request, answer: Any) -> Request:
@@ -311,7 +327,8 @@ def test_its_chat_can_be_asked_from_here(backend: LlamaBackend, theirs: Any) -> 
     assert backend.chat.bos == 0
 
 
-# -- what a user can get wrong ------------------------------------------------------------------------
+# -- what a user can get wrong
+# ------------------------------------------------------------------------
 
 
 def rename(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
@@ -322,12 +339,21 @@ def rename(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda data: data[:-1000], "does not load: .*corrupted or incomplete.*download the file again"),
+        (
+            lambda data: data[:-1000],
+            "does not load: .*corrupted or incomplete.*download the file again",
+        ),
         (lambda data: data[:100], "does not load"),
         (lambda data: b"", "does not load: .*magic"),
         (lambda data: b"PK" + data, "does not load: .*invalid magic characters"),
-        (rename(b"token_embd.weight", b"token_embX.weight"), "does not load: .*token_embd.weight' not found"),
-        (rename(b"tokenizer.chat_template", b"tokenizer.chat_templatX"), "no chat template; give .*instruct"),
+        (
+            rename(b"token_embd.weight", b"token_embX.weight"),
+            "does not load: .*token_embd.weight' not found",
+        ),
+        (
+            rename(b"tokenizer.chat_template", b"tokenizer.chat_templatX"),
+            "no chat template; give .*instruct",
+        ),
         (rename(b"{%- endfor %}", b"{%- endfro %}"), r"its chat template is no Jinja \(.*endfro"),
         (rename(b"qwen3", b"qwen0"), "does not load: .*unknown model architecture: 'qwen0'"),
     ],
@@ -371,7 +397,9 @@ def test_what_cannot_be_is_said_in_the_child_as_well(tiny: Path) -> None:
         open_gguf(tiny / "F32.gguf", batch_size=10_000)
 
 
-def test_without_the_package_it_says_how_to_get_it(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_it_says_how_to_get_it(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(registry, "find_spec", lambda name: None)
     card = card_of(tiny / "F32.gguf")
     assert missing(card) == "llama-cpp-python"
@@ -379,7 +407,8 @@ def test_without_the_package_it_says_how_to_get_it(tiny: Path, monkeypatch: pyte
         open_backend(card)
 
 
-# -- where it lies, and what it is --------------------------------------------------------------------
+# -- where it lies, and what it is
+# --------------------------------------------------------------------
 
 
 def test_a_file_is_found_by_its_path_beside_the_cards_or_in_a_folder(

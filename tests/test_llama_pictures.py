@@ -1,4 +1,6 @@
-"""Pictures through llama.cpp: a real tiny Qwen3-VL with random weights, held to the engine transformers."""
+"""Pictures through llama.cpp: a real tiny Qwen3-VL with random weights,
+held to the engine transformers.
+"""
 
 import json
 import sys
@@ -40,8 +42,8 @@ from harness.core.image import Image
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
-# llama.cpp rounds pixels, their patches' weights and GELU to half precision, in files of any precision; the
-# weights here are so large that two pictures differ by a hundred times as much.
+# llama.cpp rounds pixels, their patches' weights and GELU to half precision, in files of any
+# precision; the weights here are so large that two pictures differ by a hundred times as much.
 ROUNDED, APART = 0.02, 1.0
 VISION = Vision(320, 224, patch_px=16, merge=2, least_px=65536, most_px=1 << 24)
 TOKENS = 70
@@ -59,7 +61,9 @@ def tiny(request: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def theirs(tiny: Path) -> Any:
     """What transformers makes of the same checkpoint."""
-    card = Card("tiny", "transformers", "d", Latency("paper", None, "b"), weights=str(tiny), vision=VISION)
+    card = Card(
+        "tiny", "transformers", "d", Latency("paper", None, "b"), weights=str(tiny), vision=VISION
+    )
     return open_backend(card, device="cpu", dtype="float32")
 
 
@@ -69,7 +73,12 @@ def engine(tiny: Path) -> LlamaEngine:
 
 
 def card_of(folder: Path, **fields: Any) -> Card:
-    given = {"weights": str(folder), "file": "F32.gguf", "projector": "mmproj-F32.gguf", "vision": VISION}
+    given = {
+        "weights": str(folder),
+        "file": "F32.gguf",
+        "projector": "mmproj-F32.gguf",
+        "vision": VISION,
+    }
     return Card("tiny", "llama-cpp", "d", Latency("paper", None, "b"), **{**given, **fields})
 
 
@@ -81,7 +90,9 @@ def engine_of(folder: Path, places: int = 4) -> LlamaEngine:
 
 
 def tokens(engine: Any, prompt: Prompt) -> list[int]:
-    return [t for part in prompt for t in (engine.look(part) if isinstance(part, Image) else [part])]
+    return [
+        t for part in prompt for t in (engine.look(part) if isinstance(part, Image) else [part])
+    ]
 
 
 def begin(engine: Any, *prompts: Prompt) -> Any:
@@ -105,7 +116,8 @@ def prompt(image: Image, *rest: int) -> Prompt:
     return [*SYSTEM, START, image, END, *rest]
 
 
-# -- what the two engines say -------------------------------------------------------------------------
+# -- what the two engines say
+# -------------------------------------------------------------------------
 
 
 def test_after_a_picture_it_says_what_transformers_says(engine: LlamaEngine, theirs: Any) -> None:
@@ -148,7 +160,9 @@ def played(tiny: Path) -> LlamaEngine:
 
 TEXT = st.lists(st.integers(10, 300), min_size=1, max_size=3)
 SHOWN = st.sampled_from([A, B, C]).map(lambda image: [START, image, END])
-PROMPT = st.lists(TEXT | SHOWN, min_size=1, max_size=4).map(lambda parts: [t for part in parts for t in part])
+PROMPT = st.lists(TEXT | SHOWN, min_size=1, max_size=4).map(
+    lambda parts: [t for part in parts for t in part]
+)
 
 
 @settings(max_examples=12)
@@ -164,14 +178,17 @@ def test_texts_and_pictures_in_any_order_in_any_company(
         np.testing.assert_allclose(session.log_probs(), expected, atol=ROUNDED)
 
 
-# -- answers ------------------------------------------------------------------------------------------
+# -- answers
+# ------------------------------------------------------------------------------------------
 
 
 def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> Request:
     shown = {"image": "camera"} if image else {}
     return Request(
         id=f"s{n}/v1", role="ego", actions=("SLOWER", "IDLE", "FASTER"), max_tokens=64, answer=answer,
-        messages=({"role": "system", "content": "You drive."}, {"role": "user", "content": text, **shown}),
+        messages=({"role": "system", "content": 
+            "You "
+            "drive."}, {"role": "user", "content": text, **shown}),
         image=image,
     )  # fmt: skip
 
@@ -180,10 +197,19 @@ def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> R
 def test_a_backend_answers_what_its_picture_shows(
     tiny: Path, theirs: Any, answer: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    asked = [question(0, A, answer), question(1, B, answer, "Another, longer"), question(2, None, answer)]
+    asked = [
+        question(0, A, answer),
+        question(1, B, answer, "Another, longer"),
+        question(2, None, answer),
+    ]
     card = card_of(tiny)
-    in_a_child = answer == "readout"  # one of the three, since a process takes longer to start than to answer
-    backend = open_backend(card, batch_size=3) if in_a_child else open_here(card, find_gguf(card), None, 3)
+    # one of the three, since a process takes longer to start than to answer
+    in_a_child = answer == "readout"
+    backend = (
+        open_backend(card, batch_size=3)
+        if in_a_child
+        else open_here(card, find_gguf(card), None, 3)
+    )
     together = backend.complete(asked)
     assert [c.error for c in together] == [None] * 3
     assert [c.prompt_tokens for c in together] == [c.prompt_tokens for c in theirs.complete(asked)]
@@ -192,7 +218,9 @@ def test_a_backend_answers_what_its_picture_shows(
             p, q = (json.loads(c.text)["action_distribution"] for c in (ours, hers))
             assert p == pytest.approx(q, abs=ROUNDED)
     else:
-        assert [backend.complete([request])[0].text for request in asked] == [c.text for c in together]
+        assert [backend.complete([request])[0].text for request in asked] == [
+            c.text for c in together
+        ]
     shown = [question(0, image, answer) for image in (A, B, C, A)]
     first, *others, same = (c.text for c in backend.complete(shown))
     assert first == same
@@ -219,7 +247,8 @@ def test_who_reads_pictures_with_which_projector_is_part_of_a_backends_identity(
     assert "projector" not in open_backend(card_of(tiny, projector=None, vision=None)).identity()
 
 
-# -- what is computed once ----------------------------------------------------------------------------
+# -- what is computed once
+# ----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -271,14 +300,20 @@ def test_a_picture_is_encoded_once_unless_its_prompt_alone_is_asked_again(
     engine: LlamaEngine, encoded: list[str]
 ) -> None:
     same = Image(A.pixels.copy())
-    for asked in ([prompt(A, 80), prompt(same, 81)], [prompt(A, 82), prompt(B, 80)], [prompt(A, 83, 84)]):
+    for asked in (
+        [prompt(A, 80), prompt(same, 81)],
+        [prompt(A, 82), prompt(B, 80)],
+        [prompt(A, 83, 84)],
+    ):
         begin(engine, *asked).close()
     assert encoded == [A.sha256, B.sha256]
     begin(engine, prompt(A, 83)).close()
     assert encoded == [A.sha256, B.sha256, A.sha256]
 
 
-def test_memory_grows_with_pictures_in_it_and_nothing_is_lost(engine: LlamaEngine, theirs: Any) -> None:
+def test_memory_grows_with_pictures_in_it_and_nothing_is_lost(
+    engine: LlamaEngine, theirs: Any
+) -> None:
     prompts = [prompt(image, 80) for image in (A, B, C)]
     session = begin(engine, *prompts)
     room = engine.context._room
@@ -311,7 +346,8 @@ def test_its_tokens_are_negative_the_same_for_the_same_pixels_and_others_for_oth
     assert set(seen).isdisjoint(engine.look(B))
 
 
-# -- what a user can get wrong ------------------------------------------------------------------------
+# -- what a user can get wrong
+# ------------------------------------------------------------------------
 
 
 def opened(card: Card) -> UserError:
@@ -334,7 +370,8 @@ def test_a_file_that_is_no_projector_is_named(tiny: Path) -> None:
 
 
 def test_a_projector_of_another_model_is_refused(tiny: Path, tmp_path: Path) -> None:
-    other = tiny_vl.build(tmp_path / "other", deepstack=[0, 1])  # as wide, but it gets features three times
+    # as wide, but it gets features three times
+    other = tiny_vl.build(tmp_path / "other", deepstack=[0, 1])
     export(other, other / "F32.gguf", "F32")
     (other / "mmproj-F32.gguf").write_bytes((tiny / "mmproj-F32.gguf").read_bytes())
     assert "mismatch between text model (n_embd = 96)" in str(opened(card_of(other)))

@@ -1,4 +1,6 @@
-"""Runs that stop when they have seen enough: intervals hold at every look, and the record says when."""
+"""Runs that stop when they have seen enough:
+intervals hold at every look, and the record says when.
+"""
 
 import json
 from collections.abc import Callable
@@ -81,7 +83,9 @@ def test_of_two_parts_no_pair_of_means_outside_is_left(first: int, second: int) 
 
 
 def test_an_interval_of_differences_at_every_look_is_half_as_wide_again_as_at_one() -> None:
-    """At 100 episodes it is sqrt((1 + 1/9) (ln 10 - 2 ln .05)) = 3.035 standard errors, elsewhere more."""
+    """At 100 episodes it is sqrt((1 + 1/9) (ln 10 - 2 ln .05)) = 3.035 standard errors,
+    elsewhere more.
+    """
     rng = np.random.default_rng(2)
     for n, errors in ((100, 3.035), (25, 3.219), (1000, 3.259)):
         differences = rng.choice([1.0, 0.0, -1.0], n, p=(0.3, 0.6, 0.1))
@@ -102,13 +106,17 @@ def test_the_truth_is_held_at_every_look_of_nearly_all_runs() -> None:
     assert held >= 55  # 57 at a coverage of 95 %; it is simulated by benchmarks/looks.py
 
 
-def test_looks_are_a_quarter_more_each_and_end_with_all_layouts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_looks_are_a_quarter_more_each_and_end_with_all_layouts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.undo()
     assert looks.looks(60) == [20, 25, 32, 40, 50, 60]
     assert looks.looks(7) == [7]
 
 
-def test_a_run_stops_when_its_interval_is_narrow_and_says_so(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_stops_when_its_interval_is_narrow_and_says_so(
+    small: Dataset, tmp_path: Path
+) -> None:
     spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
     done = run(spec, tmp_path / "run")
     assert done.manifest.world.looks is not None
@@ -123,7 +131,9 @@ def test_a_run_stops_when_its_interval_is_narrow_and_says_so(small: Dataset, tmp
     assert read(tmp_path / "run").score("single-local", "success_rate") == row
     assert f"stopped after {at[-1]} of 4 layouts" in " ".join(looked_at(read(done.out)))
     whole = run(
-        spec_of(Dataset.of_episodes(small, frozenset(small.episodes[: at[-1]])), "constant", **ALONE),
+        spec_of(
+            Dataset.of_episodes(small, frozenset(small.episodes[: at[-1]])), "constant", **ALONE
+        ),
         tmp_path / "whole",
     )
     for name in ("episodes.csv", "answers.jsonl"):
@@ -234,7 +244,10 @@ def test_what_another_run_lacks_is_one_line(
             ("eval", "--until-width", "4", "--dataset", "suite:v2v-safety-2"),
             "suite v2v-safety-2: runs that stop",
         ),
-        (("drive", "--until-width", "4", "--sample", "3"), "--sample 3: a run that stops takes layouts"),
+        (
+            ("drive", "--until-width", "4", "--sample", "3"),
+            "--sample 3: a run that stops takes layouts",
+        ),
     ],
 )
 def test_bad_input_is_one_line(words: tuple[str, ...], says: str, harness: Typed) -> None:
@@ -253,5 +266,8 @@ def test_typed_it_is_in_the_command_and_the_table(harness: Typed, small_path: Pa
     assert code == 0
     assert ("It stopped after" if n < 4 else "It took all 4 layouts") in out
     assert f"n = {n} episodes" in out
-    assert "intervals of success and of its gain hold at every look" in Path("run/report.html").read_text()
+    assert (
+        "intervals of success and of its gain hold at every look"
+        in Path("run/report.html").read_text()
+    )
     assert "until_width = 99.0" in Path("run/run.toml").read_text()

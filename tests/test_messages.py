@@ -1,4 +1,6 @@
-"""Sizes of messages: bit for bit those of an encoder, and by the values that each member may have."""
+"""Sizes of messages: bit for bit those of an encoder,
+and by the values that each member may have.
+"""
 
 import json
 import math
@@ -42,7 +44,10 @@ def test_a_message_has_the_bits_that_an_encoder_writes(name: str):
     cases = [dict(case) for case in ENCODED["messages"] if case["message"] == name]
     assert len(cases) > 2
     for case in cases:
-        bits, content = case.pop("bits"), Counts(**{key: case[key] for key in case if key != "message"})
+        bits, content = (
+            case.pop("bits"),
+            Counts(**{key: case[key] for key in case if key != "message"}),
+        )
         assert sum(share.bits for share in shares(name, content)[:-1]) == bits, case
         assert message_bits(name, content) == 8 * math.ceil(bits / 8)
 
@@ -81,18 +86,28 @@ def test_a_row_has_the_bits_of_its_values_or_a_type_and_a_source(row: Member):
 
 def test_every_type_stands_in_a_message_or_a_layer():
     used = {row.values.split()[-1] for row in ROWS if row.bits is None}
-    layers = {"envelope", *(f"{encoding}-{layer}" for encoding in NAMES for layer in ("network", "link"))}
+    layers = {
+        "envelope",
+        *(f"{encoding}-{layer}" for encoding in NAMES for layer in ("network", "link")),
+    }
     assert set(table()) == used | set(MESSAGES) | layers
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-@given(st.tuples(counts, st.booleans(), st.integers(0, 23), counts, counts, st.integers(1, 200)), st.data())
+@given(
+    st.tuples(counts, st.booleans(), st.integers(0, 23), counts, counts, st.integers(1, 200)),
+    st.data(),
+)
 @settings(max_examples=40)
-def test_more_content_never_takes_less_and_arrays_are_as_one_at_a_time(name: str, parts: Any, data: Any):
+def test_more_content_never_takes_less_and_arrays_are_as_one_at_a_time(
+    name: str, parts: Any, data: Any
+):
     place = data.draw(st.sampled_from([0, 2, 3, 4, 5]))
     more = [part + (at == place and (part < 23 or at != 2)) for at, part in enumerate(parts)]
     both = message_bits(name, Counts(*map(np.array, zip(parts, more, strict=True))))
-    assert np.broadcast_to(both, 2).tolist() == [message_bits(name, Counts(*c)) for c in (parts, more)]
+    assert np.broadcast_to(both, 2).tolist() == [
+        message_bits(name, Counts(*c)) for c in (parts, more)
+    ]
     assert np.all(np.diff(both) >= 0)
     assert np.all(both % 8 == 0)
 
@@ -132,7 +147,9 @@ def test_the_certificate_goes_along_when_it_is_due():
 @pytest.mark.parametrize("name", MESSAGES)
 def test_headers_are_those_of_network_and_transport_and_no_radios(name: str):
     taken = wraps(name, 800.0)
-    headers = sum(share.bits for share in taken if share.path[0] != "envelope" and share.path[-1] != "length")
+    headers = sum(
+        share.bits for share in taken if share.path[0] != "envelope" and share.path[-1] != "length"
+    )
     etsi = name in NAMES["etsi"].values()
     assert headers / 8 == (44 if etsi else 3 if name == "BSM" else 4)
     radio, packet = ItsG5(), packet_bits(name, 800.0)
@@ -140,7 +157,9 @@ def test_headers_are_those_of_network_and_transport_and_no_radios(name: str):
     assert radio.message_s(packet) == radio.airtime_s(packet / 8 + radio.header_bytes)
 
 
-def test_the_command_shows_bytes_members_and_time_on_air(harness: Callable[..., tuple[int, str, str]]):
+def test_the_command_shows_bytes_members_and_time_on_air(
+    harness: Callable[..., tuple[int, str, str]],
+):
     code, out, _ = harness("radio", "messages", "--objects", "2", "--channel", "its-g5")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
@@ -156,7 +175,9 @@ def test_the_command_shows_bytes_members_and_time_on_air(harness: Callable[..., 
     assert re.search(r"^envelope\.signature\.r +256$", out, re.MULTILINE)
 
 
-def test_the_page_on_radios_shows_what_the_command_prints(harness: Callable[..., tuple[int, str, str]]):
+def test_the_page_on_radios_shows_what_the_command_prints(
+    harness: Callable[..., tuple[int, str, str]],
+):
     page = (Path(__file__).parent.parent / "docs/radio.md").read_text()
     assert harness("radio", "messages", "--channel", "its-g5")[1] in page
 

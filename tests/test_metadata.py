@@ -1,4 +1,6 @@
-"""What is said of the project outside its code: version, licence and authors are the same everywhere."""
+"""What is said of the project outside its code:
+version, licence and authors are the same everywhere.
+"""
 
 import importlib.util
 import re
@@ -29,7 +31,13 @@ def test_the_citation_is_of_this_version() -> None:
 def test_code_dataset_and_weights_have_one_licence() -> None:
     licence = PROJECT["license"]
     assert "Apache License" in (ROOT / "LICENSE").read_text()
-    for model in ("swarm-tiny", "swarm-tiny-six", "swarm-tiny-six-v2", "swarm-tiny-vl", "swarm-smol"):
+    for model in (
+        "swarm-tiny",
+        "swarm-tiny-six",
+        "swarm-tiny-six-v2",
+        "swarm-tiny-vl",
+        "swarm-smol",
+    ):
         assert cards.load(model).licence == licence
         assert f"Licence: {licence}" in (ROOT / "models" / model / "README.md").read_text()
     for manifest in (ROOT / "datasets").glob("*/manifest.json"):
@@ -62,8 +70,12 @@ def test_the_lock_has_all_that_an_install_needs_with_digests(install: str) -> No
     blocks = re.findall(
         r"^([\w.-]+)==(\S+) \\\n((?: +--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", text, re.MULTILINE
     )
-    assert {name for name, *_ in blocks} == requirements.needed(requirements.INSTALLS[install]) - {"torch"}
-    assert {name: release for name, release, _ in blocks} == {name: version(name) for name, *_ in blocks}
+    assert {name for name, *_ in blocks} == requirements.needed(requirements.INSTALLS[install]) - {
+        "torch"
+    }
+    assert {name: release for name, release, _ in blocks} == {
+        name: version(name) for name, *_ in blocks
+    }
 
 
 def test_no_other_charting_library_runs_in_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,6 +84,7 @@ def test_no_other_charting_library_runs_in_a_page(monkeypatch: pytest.MonkeyPatc
     library.vega.cache_clear()
     monkeypatch.setattr(library, "BUNDLE_SHA256", "0" * 64)
     with pytest.raises(
-        UserError, match=r"^the charting library of .* has sha256 b6f62605c995[0-9a-f]{52}, not 0{64}"
+        UserError,
+        match=r"^the charting library of .* has sha256 b6f62605c995[0-9a-f]{52}, not 0{64}",
     ):
         library.vega()

@@ -1,4 +1,6 @@
-"""Every metric is whole: what a table, a page, a comparison and a gate ask of it is in its entry."""
+"""Every metric is whole: what a table, a page,
+a comparison and a gate ask of it is in its entry.
+"""
 
 import csv
 from pathlib import Path
@@ -96,7 +98,9 @@ def test_every_row_of_a_summary_has_an_entry(file: Path) -> None:
 
 @pytest.mark.parametrize("closed_loop", [False, True])
 @pytest.mark.usefixtures("installed")
-def test_every_metric_of_decisions_and_episodes_keeps_its_range(tmp_path: Path, closed_loop: bool) -> None:
+def test_every_metric_of_decisions_and_episodes_keeps_its_range(
+    tmp_path: Path, closed_loop: bool
+) -> None:
     """And values of some decisions are those of all, since workers see parts."""
     run = run_of(tmp_path / "run", closed_loop)
     part = Decisions(run.decisions.table.slice(3, 7), run.actions, run.decisions.helpers)
@@ -120,7 +124,10 @@ def test_a_package_adds_a_metric_and_replaces_none(tmp_path: Path) -> None:
     """It is in the summary, it is compared, and a gate takes it."""
     assert METRICS["success_rate"].primary
     scores = [score for score in run_of(tmp_path / "run").scores if score.metric == "sure_rate"]
-    assert {(score.condition, score.value) for score in scores} == {("single-local", 0.5), ("6g", 0.5)}
+    assert {(score.condition, score.value) for score in scores} == {
+        ("single-local", 0.5),
+        ("6g", 0.5),
+    }
     made_up(tmp_path / "other", decision=lambda row: row.update(entropy_nats=0.0))
     comparison = compare(pair(tmp_path / "run", tmp_path / "other"))
     assert "sure_rate %" in terminal(comparison, [], 3, whole=True)
@@ -130,7 +137,9 @@ def test_a_package_adds_a_metric_and_replaces_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_another_metric_changes_no_corrected_p(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_metric_changes_no_corrected_p(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its own is exploratory, and stands uncorrected."""
 
     def lose(row: Row) -> None:
@@ -156,10 +165,16 @@ def test_another_metric_changes_no_corrected_p(tmp_path: Path, monkeypatch: pyte
     [
         ("gone = by_hand:GONE", "'gone' .*does not load"),
         ("odd = by_hand:PACKAGE", "'odd' .*does not load"),
-        ("mine = by_hand:OTHER", "'mine' .* is the metric 'other' with 1 functions; give it the name of"),
+        (
+            "mine = by_hand:OTHER",
+            "'mine' .* is the metric 'other' with 1 functions; give it the name of",
+        ),
         ("first = by_hand:FIRST", "'first' .* with 1 functions, a primary one; .* is not primary"),
         ("unitless = by_hand:UNITLESS", "'unitless' .* has unit None; allowed: Unit; repair"),
-        ("sideways = by_hand:SIDEWAYS", "has better 'sideways'; allowed: higher, lower, neither; repair"),
+        (
+            "sideways = by_hand:SIDEWAYS",
+            "has better 'sideways'; allowed: higher, lower, neither; repair",
+        ),
         ("moon = by_hand:MOON", "has world 'moon'; allowed: None, frozen, closed-loop; repair"),
         ("nothing = by_hand:NOTHING", "'nothing' .* with 0 functions; give it .* one function"),
     ],
@@ -185,7 +200,11 @@ def test_a_metric_that_does_not_work_is_one_line(
     ],
 )
 def test_a_metric_that_fails_costs_its_own_figure(
-    name: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    name: str,
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     say_once.cache_clear()
     before = run_of(tmp_path / "before")
@@ -210,7 +229,9 @@ def test_a_metric_that_does_not_load_is_known_before_the_first_question(
     asked = list[object]()
     spec = spec_of(load(small_path), seeds=(0,))
     with pytest.raises(UserError, match=r"'gone' .* does not load"):
-        evaluate(spec, tmp_path / "run", asked.append, opens=lambda *card, **options: asked.append(card))
+        evaluate(
+            spec, tmp_path / "run", asked.append, opens=lambda *card, **options: asked.append(card)
+        )
     assert (asked, (tmp_path / "run").exists()) == ([], False)
 
 

@@ -25,7 +25,9 @@ from harness.core.statistics import (
 NAN = math.nan
 
 
-@pytest.mark.parametrize(("n", "t"), [(2, 12.706), (3, 4.303), (5, 2.776), (10, 2.262), (31, 2.042)])
+@pytest.mark.parametrize(
+    ("n", "t"), [(2, 12.706), (3, 4.303), (5, 2.776), (10, 2.262), (31, 2.042)]
+)
 def test_the_interval_over_seeds_uses_the_t_of_the_printed_tables(n, t):
     values = np.arange(float(n))
     estimate = seed_interval(values)
@@ -38,7 +40,9 @@ def test_the_interval_over_seeds_uses_the_t_of_the_printed_tables(n, t):
 def test_five_seeds_by_hand():
     """Mean 0.94, standard deviation 0.0158 over root 5 is 0.00707, times 2.776 is 0.0196."""
     estimate = seed_interval(np.array([0.92, 0.93, 0.94, 0.95, 0.96]))
-    assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.94, 0.9204, 0.9596), abs=5e-5)
+    assert (estimate.value, estimate.low, estimate.high) == pytest.approx(
+        (0.94, 0.9204, 0.9596), abs=5e-5
+    )
     assert (estimate.n, estimate.n_excluded) == (5, 0)
 
 
@@ -59,7 +63,10 @@ def test_nothing_to_average_is_unknown_and_not_zero(interval, values):
 
 @pytest.mark.parametrize("interval", [seed_interval, episode_interval, rate_interval])
 def test_unknown_values_are_excluded_and_counted(interval):
-    with_gaps, without = interval(np.array([1.0, NAN, 0.0, 1.0, NAN])), interval(np.array([1.0, 0.0, 1.0]))
+    with_gaps, without = (
+        interval(np.array([1.0, NAN, 0.0, 1.0, NAN])),
+        interval(np.array([1.0, 0.0, 1.0])),
+    )
     assert with_gaps == Estimate(without.value, without.low, without.high, 3, 2)
 
 
@@ -72,7 +79,12 @@ def test_steps_of_one_episode_are_one_trial():
 
 @pytest.mark.parametrize(
     ("successes", "n", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
 )
 def test_wilson_intervals_of_newcombe_1998(successes, n, low, high):
     """Newcombe, Statistics in Medicine 17:857-872, table I, method 3."""
@@ -94,18 +106,27 @@ def test_a_rate_lies_in_its_interval_and_the_interval_in_zero_to_one(successes, 
 
 
 def test_seeds_and_decisions_of_an_episode_are_worth_what_their_spread_says():
-    """Means of episodes 1, 1, .5, .5, mean .75: the squares sum to 1/4, and over 4 · 3 the variance is 1/48.
+    """Means of episodes 1, 1, .5, .5, mean .75:
+    the squares sum to 1/4, and over 4 · 3 the variance is 1/48.
 
-    .75 · .25 over that is 9. All fourth powers are alike, so all 3 degrees of freedom count: t = 3.182, and 9
-    times (1.960 / 3.182)² is 3.414, less than the 4 episodes. With .8 and .7 the variance is 1/1200.
+    .75 · .25 over that is 9. All fourth powers are alike, so all 3 degrees of freedom count: t =
+    3.182, and 9 times (1.960 / 3.182)² is 3.414, less than the 4 episodes. With .8 and .7 the
+    variance is 1/1200.
     """
-    apart, near = rate_interval(np.array([1.0, 1.0, 0.5, 0.5])), rate_interval(np.array([0.8, 0.8, 0.7, 0.7]))
+    apart, near = (
+        rate_interval(np.array([1.0, 1.0, 0.5, 0.5])),
+        rate_interval(np.array([0.8, 0.8, 0.7, 0.7])),
+    )
     assert (apart.value, apart.low, apart.high) == pytest.approx((0.75, *wilson(0.75, 4)))
-    assert (near.low, near.high) == pytest.approx(wilson(0.75, 225 * (1.959964 / 3.182446) ** 2), rel=1e-6)
+    assert (near.low, near.high) == pytest.approx(
+        wilson(0.75, 225 * (1.959964 / 3.182446) ** 2), rel=1e-6
+    )
 
 
 def test_where_few_episodes_differ_the_spread_is_hardly_known():
-    """One of ten at .5, nine at 1: mean .95, squares .225, fourth powers .0411, 2 · .225² / .0360 = 2.81."""
+    """One of ten at .5, nine at 1: mean .95, squares .225, fourth powers .0411,
+    2 · .225² / .0360 = 2.81.
+    """
     rate = rate_interval(np.array([0.5] + [1.0] * 9))
     t = stats.t.ppf(0.975, 2 * 0.225**2 / (0.45**4 + 9 * 0.05**4 - 0.225**2 / 10))
     assert 0.95 * 0.05 / (0.225 / 90) * (1.959964 / t) ** 2 < 10, "so an episode counts as one"
@@ -125,10 +146,12 @@ def test_a_pair_counts_only_where_both_are_known():
 
 
 def test_a_paired_difference_of_newcombe_1998():
-    """Statistics in Medicine 17:2635-2650, method 10: of 50 pairs 36 both, 12 the first, 2 the second alone.
+    """Statistics in Medicine 17:2635-2650, method 10:
+    of 50 pairs 36 both, 12 the first, 2 the second alone.
 
     By hand, p = .96 and q = .76 (Wilson's ends .8654, .9890 and .6259, .8570): the covariance is
-    .72 - .96 · .76 = -.0096, from which nothing is taken, so the correlation is -.0096 / (.1960 · .4271).
+    .72 - .96 · .76 = -.0096, from which nothing is taken, so the correlation is -.0096 / (.1960 ·
+    .4271).
     """
     difference = rate_difference(
         np.repeat([1.0, 1.0, 0.0], [36, 12, 2]), np.repeat([1.0, 0.0, 1.0], [36, 12, 2])
@@ -158,16 +181,19 @@ def test_where_all_pairs_succeed_the_interval_is_the_score_interval_of_tango(n: 
 
 @pytest.mark.parametrize("gain", [0.02, 0.05, 0.088])
 def test_pairs_that_all_agree_need_their_interval(gain: float):
-    """Of 50 pairs each gains with this probability: by all outcomes, 94 % and more of intervals hold it.
+    """Of 50 pairs each gains with this probability:
+    by all outcomes, 94 % and more of intervals hold it.
 
-    At .05 no pair of the sample gains in .95^50, 8 % of samples, so that an interval that then stops below
-    5 points holds too little. At .088 coverage is least.
+    At .05 no pair of the sample gains in .95^50, 8 % of samples, so that an interval that then
+    stops below 5 points holds too little. At .088 coverage is least.
     """
     n, both = 50, 0.5
     covered = 0.0
     for gained in range(16):
         for same in range(10, 41):
-            chance = stats.binom.pmf(gained, n, gain) * stats.binom.pmf(same, n - gained, both / (1 - gain))
+            chance = stats.binom.pmf(gained, n, gain) * stats.binom.pmf(
+                same, n - gained, both / (1 - gain)
+            )
             if chance > 1e-7:
                 first = np.repeat([1.0, 1.0, 0.0], [same, gained, n - same - gained])
                 second = np.repeat([1.0, 0.0], [same, n - same])
@@ -186,7 +212,8 @@ def test_a_difference_of_rates_turns_its_sign_with_its_sides(pairs):
 
 
 def test_over_seeds_these_episodes_stay_what_they_are():
-    """Two of four episodes hang on the seed: the squares in them, 1/2 and 1/2, over 4 (2 - 1) are 1/4.
+    """Two of four episodes hang on the seed:
+    the squares in them, 1/2 and 1/2, over 4 (2 - 1) are 1/4.
 
     Of 8 values that is 2, and with two more that go another way 4: t(4) = 2.776 times 2 over 8.
     """
@@ -228,7 +255,9 @@ def test_values_of_an_episode_go_together_in_students_t_too():
 
 
 def test_brier_scores_by_hand():
-    safe = np.array([[True, False, False], [True, True, False], [True, True, False], [True, False, False]])
+    safe = np.array(
+        [[True, False, False], [True, True, False], [True, True, False], [True, False, False]]
+    )
     p = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     assert brier(p, safe_target(safe)) == pytest.approx([0.0, 0.0, 0.5, 2.0])
 
@@ -285,7 +314,9 @@ def test_unknown_decisions_are_left_out_and_none_gives_no_share():
 
 
 def test_the_mean_of_two_families_by_hand():
-    """.5 [.3, .6] and .9 [.8, .96]: the ends are half of √(.2² + .1²) below and of √(.1² + .06²) above .7."""
+    """.5 [.3, .6] and .9 [.8, .96]: the ends are half of √(.2² + .1²) below and of √(.1² + .06²)
+    above .7.
+    """
     mean = mean_of([Estimate(0.5, 0.3, 0.6, 20, 0), Estimate(0.9, 0.8, 0.96, 50, 1)])
     assert (mean.value, mean.low, mean.high) == pytest.approx((0.7, 0.588197, 0.758310), abs=1e-6)
     assert (mean.n, mean.n_excluded) == (70, 1)

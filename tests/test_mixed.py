@@ -53,13 +53,17 @@ def test_each_half_answers_as_it_does_in_a_run_of_its_own(mix: Path, pure: dict[
         here, there = by_id(mix, role), by_id(pure[model], role)
         both = here.keys() & there.keys()
         assert len(both) > 20
-        assert [here[name].raw for name in sorted(both)] == [there[name].raw for name in sorted(both)]
+        assert [here[name].raw for name in sorted(both)] == [
+            there[name].raw for name in sorted(both)
+        ]
     verdicts = {answer.verdict for answer in by_id(mix, "helper").values()}
     assert verdicts == {"strict", "recovered", "failed"}
     assert {answer.verdict for answer in by_id(mix, "ego").values()} == {"strict"}
 
 
-def test_helpers_like_the_ego_make_no_mix(small: Dataset, pure: dict[str, Path], tmp_path: Path) -> None:
+def test_helpers_like_the_ego_make_no_mix(
+    small: Dataset, pure: dict[str, Path], tmp_path: Path
+) -> None:
     same = mixed(small, helper(), helper())
     assert same.helpers == ()
     assert same_decisions(run(same, tmp_path / "same").out, pure["proxy"])
@@ -69,7 +73,10 @@ def test_a_run_says_who_answered(mix: Path) -> None:
     made = read(mix)
     assert made.manifest.variant.helpers == "proxy-faulty · v2 · json"
     assert str(made.manifest.variant) == f"{RULE} + proxy-faulty · v2 · json"
-    assert "--helper-model proxy-faulty --helper-prompt v2 --helper-answer json" in made.manifest.command
+    assert (
+        "--helper-model proxy-faulty --helper-prompt v2 --helper-answer json"
+        in made.manifest.command
+    )
     agents = {(a.role, made.agent(a)["model"]["name"]) for a in made.answers}
     assert agents == {("ego", "proxy"), ("helper", "proxy-faulty")}
     assert made.manifest.identity["helpers"][0]["engine"] == "proxy"
@@ -114,7 +121,12 @@ def test_every_agent_takes_its_own_time(small: Dataset, tmp_path: Path) -> None:
         return replace(agent, card=replace(agent.card, latency=latency))
 
     made = run(mixed(small, at(0.3), at(0.2)), tmp_path / "run").manifest.latency
-    assert (made.ego_s, made.helper_s, made.helpers_s, made.fusion_s) == (0.145, 0.3, (0.3, 0.2), 0.145)
+    assert (made.ego_s, made.helper_s, made.helpers_s, made.fusion_s) == (
+        0.145,
+        0.3,
+        (0.3, 0.2),
+        0.145,
+    )
     decisions = read(tmp_path / "run").decisions
     arrival = {
         m.sender: m.arrival_ms
@@ -134,7 +146,8 @@ def test_times_of_several_helper_models_are_declared_in_turn(small: Dataset) -> 
 
 @pytest.mark.slow
 def test_a_mix_drives_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)  # so that both workers have some
+    # so that both workers have some
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
 
     def driven(workers: int) -> Path:
         from harness.core.work import tidy
@@ -156,7 +169,12 @@ def test_a_mix_drives_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("ego", "helpers", "options", "said"),
     [
-        ("proxy", ("full-view",), {}, "--helper-model: full-view is a driver, which decides for an ego"),
+        (
+            "proxy",
+            ("full-view",),
+            {},
+            "--helper-model: full-view is a driver, which decides for an ego",
+        ),
         (
             "local-view",
             ("proxy",),
@@ -182,14 +200,22 @@ def test_a_mix_that_means_nothing_is_refused(
 @pytest.mark.parametrize(
     ("command", "typed", "said"),
     [
-        ("eval", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
-        ("drive", "--helper-answer readout", "--helper-answer readout: proxy is no language model; use json"),
+        ("eval", "--helper-answer readout", 
+            "--helper-answer readout: proxy is "
+            "no language model; use json"),
+        ("drive", "--helper-answer readout", 
+            "--helper-answer readout: proxy is "
+            "no language model; use json"),
         ("study grid", "--helper-answer readout",
          "--helper-answer readout: proxy is no language model; use json"),
-        ("study grid", "--helper-model proxy,proxy", "--helper-model proxy,proxy: give different names"),
+        ("study grid", "--helper-model proxy,proxy", 
+            "--helper-model proxy,proxy: "
+            "give different names"),
         ("study grid", "--helper-model proxy --helper-model proxy",
          "--helper-model proxy,proxy: give different names"),
-        ("eval", "--helper-model full-view --helper-model proxy", "--helper-model: full-view is a driver"),
+        ("eval", 
+            "--helper-model full-view "
+            "--helper-model proxy", "--helper-model: full-view is a driver"),
         ("eval", "--helper-thinking", "--helper-thinking: proxy cannot think; leave it out"),
         ("eval", "--model swarm-tiny --answer readout --helper-model proxy",
          "helpers: --answer readout: proxy is no language model; use json"),
@@ -208,7 +234,9 @@ def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:
     from harness.coordination.operating_point import named_point
 
     asks = (named_point("6g:consensus=ego-prompt"),)
-    with pytest.raises(UserError, match="prompt v2 fuses messages with a distribution, those of paper"):
+    with pytest.raises(
+        UserError, match="prompt v2 fuses messages with a distribution, those of paper"
+    ):
         mixed(small, helper("swarm-tiny", "paper"), model="swarm-tiny", points=asks)
     with pytest.raises(UserError, match="a readout gives no messages to fuse"):
         mixed(small, helper("swarm-tiny", answer="readout"), model="swarm-tiny", points=asks)

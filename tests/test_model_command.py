@@ -51,7 +51,9 @@ def test_the_list_has_every_card_in_eighty_columns(
     code, out, _ = harness(monkeypatch, capsys, "model", "list")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
-    listed = {line.split()[0]: line for line in out.splitlines() if not line.startswith((" ", "name"))}
+    listed = {
+        line.split()[0]: line for line in out.splitlines() if not line.startswith((" ", "name"))
+    }
     assert sorted(listed) == cards.names()
     assert "card 145 ms" in listed["proxy"]
     assert listed["proxy"].endswith(" yes")
@@ -80,7 +82,10 @@ def test_a_model_free_engine_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, _ = harness(monkeypatch, capsys, "model", "check", "proxy")
-    assert (code, out) == (0, "proxy: engine proxy is model-free: no weights, no tokens, nothing to load\n")
+    assert (code, out) == (
+        0,
+        "proxy: engine proxy is model-free: no weights, no tokens, nothing to load\n",
+    )
     code, out, _ = harness(monkeypatch, capsys, "model", "check", "brake", "--json")
     assert json.loads(out) == {"name": "brake", "engine": "driver", "model_free": True}
 
@@ -97,7 +102,8 @@ def test_a_misspelt_model_is_one_line_and_exit_code_two(
 def test_without_the_extra_the_list_says_what_is_missing_and_a_check_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)  # as python sees a package that is not installed
+    # as python sees a package that is not installed
+    monkeypatch.setitem(sys.modules, "torch", None)
     code, out, _ = harness(monkeypatch, capsys, "model", "list")
     assert code == 0
     assert "no: torch" in out
@@ -158,7 +164,9 @@ def test_weights_are_held_to_the_digest_of_their_card_whenever_they_are_loaded(
     file = tiny / ("tiny-f32.gguf" if engine == "llama-cpp" else "model.safetensors")
     card = replace(cards.resolve(str(tiny), engine), sha256=sha256_file(file))
     assert open_backend(card, device="cpu").identity()["engine"] == engine
-    with pytest.raises(UserError, match=rf"{file.name} is not what its card says: sha256 {card.sha256}"):
+    with pytest.raises(
+        UserError, match=rf"{file.name} is not what its card says: sha256 {card.sha256}"
+    ):
         open_backend(replace(card, sha256="0" * 64), device="cpu")
 
 
@@ -202,19 +210,26 @@ def test_a_check_as_json_has_every_token_and_asks_for_a_thought_in_json_only(
     ("arguments", "said"),
     [
         (("check", "qwen3-4b", "--engine", "openai"), "unknown engine of model qwen3-4b 'openai'"),
-        (("check", "openai-example", "--device", "cpu"), "--device cpu: openai-example has no weights"),
+        (
+            ("check", "openai-example", "--device", "cpu"),
+            "--device cpu: openai-example has no weights",
+        ),
         (("pull", "proxy"), "'proxy' runs on proxy: it has no weights to pull"),
     ],
 )
 def test_what_a_model_has_not_is_one_line(
-    arguments: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: tuple[str, ...],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     code, out, err = harness(monkeypatch, capsys, "model", *arguments)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err
 
 
-# -- models that see -----------------------------------------------------------------------------------------
+# -- models that see
+# -----------------------------------------------------------------------------------------
 
 SERVED = """\
 engine = "openai"
@@ -256,7 +271,11 @@ def looks(asked: Asked) -> None:
 def ignores(asked: Asked) -> None:
     """One whose program leaves the picture out."""
     letters = asked.body.get("logprobs")
-    asked.reply(read_out(("A", -0.5), ("B", -1.5), ("C", -2.0)) if letters else completion(ANSWER % (70, 10)))
+    asked.reply(
+        read_out(("A", -0.5), ("B", -1.5), ("C", -2.0))
+        if letters
+        else completion(ANSWER % (70, 10))
+    )
 
 
 def ignores_uncounted(asked: Asked) -> None:
@@ -273,7 +292,11 @@ def answers_all_alike(asked: Asked) -> None:
 def counts(asked: Asked) -> None:
     """One that reads texts, and says how many characters a prompt has."""
     letters = "logprobs" in asked.body
-    said = read_out(("A", -0.5), ("B", -1.5), ("C", -2.0)) if letters else completion(ANSWER % (70, 10))
+    said = (
+        read_out(("A", -0.5), ("B", -1.5), ("C", -2.0))
+        if letters
+        else completion(ANSWER % (70, 10))
+    )
     size = sum(len(message["content"]) for message in asked.body["messages"])
     asked.reply({**said, "usage": {"prompt_tokens": size, "completion_tokens": 1}})
 
@@ -290,9 +313,13 @@ def refuses(asked: Asked) -> None:
     [
         (looks, None),
         (answers_all_alike, None),
-        (ignores, "ignores pictures: the same answers to a frame and to a blank one, and as many prompt "
+        (ignores, 
+            "ignores pictures: the same answers to a frame and "
+            "to a blank one, and as many prompt "
          "tokens as without any; start it with its projector, or leave [vision] out of its card"),
-        (ignores_uncounted, "ignores pictures: the same answers to a frame and to a blank one; start it"),
+        (ignores_uncounted, 
+            "ignores pictures: the same answers to a "
+            "frame and to a blank one; start it"),
         (refuses, "answers no prompt with a picture: "),
     ],
 )  # fmt: skip
@@ -335,9 +362,13 @@ def test_a_model_of_texts_is_asked_no_picture(
     assert (code, err) == (0, "")
     assert "picture" not in out
     # Letter A is the likeliest whatever it stands for.
-    assert "letters      100 % of a read-out follows the letter; the likeliest action does in 12 of 12" in out
+    assert (
+        "letters      100 % of a read-out follows the letter; the likeliest action does in 12 of 12"
+        in out
+    )
     assert "it does not read the scene" in out
-    # Three orders of the actions, two of yes and no; and the pairs of scenes with letters read once.
+    # Three orders of the actions, two of yes and no; and the pairs of scenes with letters read
+    # once.
     examined = 3 * (12 + 2 * 8) + 2 * (2 * 8) + 2 * 8
     assert len(there.asked) == 2 * 3 + examined
 
@@ -351,7 +382,9 @@ def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
 
     folder = tiny_vl.build(tmp_path / "vl")
     capsys.readouterr()
-    code, out, err = harness(monkeypatch, capsys, "model", "check", str(folder), "--device", "cpu", "--json")
+    code, out, err = harness(
+        monkeypatch, capsys, "model", "check", str(folder), "--device", "cpu", "--json"
+    )
     assert (code, err) == (0, "")
     seen = json.loads(out)["looks"]
     own, blank = seen["answers"]["readout"], seen["blank"]["readout"]

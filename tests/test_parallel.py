@@ -1,4 +1,6 @@
-"""Work spread over processes: each item's result once, and what becomes of the rest when a worker dies."""
+"""Work spread over processes: each item's result once,
+and what becomes of the rest when a worker dies.
+"""
 
 import os
 import time
@@ -53,8 +55,12 @@ def shared(arrived: Path, total: int, number: int) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("total", [9, 10, 11, 2])
-def test_workers_at_work_divide_what_may_be_used_and_the_last_one_has_all(total: int, tmp_path: Path) -> None:
-    first, last = zip(*spread(partial(shared, tmp_path, total), range(3), 3, lambda done: None), strict=True)
+def test_workers_at_work_divide_what_may_be_used_and_the_last_one_has_all(
+    total: int, tmp_path: Path
+) -> None:
+    first, last = zip(
+        *spread(partial(shared, tmp_path, total), range(3), 3, lambda done: None), strict=True
+    )
     assert sum(first) == max(total, 3)
     assert max(first) - min(first) <= 1
     assert last[2] == total
@@ -71,7 +77,13 @@ def deadly(graves: Path, poison: int, deaths: int, number: int) -> int:
 
 @pytest.mark.parametrize("deaths", [1, TRIES - 1])
 def test_who_dies_is_tried_again(deaths: int, tmp_path: Path) -> None:
-    assert spread(partial(deadly, tmp_path, 1, deaths), range(5), 2, lambda done: None) == [0, 1, 2, 3, 4]
+    assert spread(partial(deadly, tmp_path, 1, deaths), range(5), 2, lambda done: None) == [
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]
 
 
 def test_what_kills_its_worker_three_times_is_named_and_the_rest_is_done(tmp_path: Path) -> None:
@@ -111,7 +123,9 @@ def fail_at(tried: Path, wrong: int, number: int) -> int:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_an_error_of_the_works_own_is_raised_and_never_tried_again(workers: int, tmp_path: Path) -> None:
+def test_an_error_of_the_works_own_is_raised_and_never_tried_again(
+    workers: int, tmp_path: Path
+) -> None:
     with pytest.raises(UserError, match="item 1 is wrong"):
         spread(partial(fail_at, tmp_path, 1), range(9), workers, lambda done: None)
     assert len(list(tmp_path.glob("1-*"))) == 1
@@ -120,7 +134,8 @@ def test_an_error_of_the_works_own_is_raised_and_never_tried_again(workers: int,
 def test_without_ray_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda module: None)
     with pytest.raises(
-        UserError, match=r"^--workers ray needs ray, .*; run `pip install 'swarmdrive-harness\[ray\]'`$"
+        UserError,
+        match=r"^--workers ray needs ray, .*; run `pip install 'swarmdrive-harness\[ray\]'`$",
     ):
         spread(squared, [1], Ray(), lambda done: None)
 
@@ -146,7 +161,9 @@ def test_who_works_is_read_from_a_number_or_an_address(text: str, who: object) -
              "ray://head:10001/x\x1b[31m", "http://head:1"],
 )  # fmt: skip
 def test_who_cannot_work_is_one_line(text: str) -> None:
-    with pytest.raises(UserError, match=r"^--workers .*: give 1 to 256 processes, or ray for") as raised:
+    with pytest.raises(
+        UserError, match=r"^--workers .*: give 1 to 256 processes, or ray for"
+    ) as raised:
         workers_of(text)
     assert str(raised.value).isprintable()
     assert len(str(raised.value)) < 400

@@ -1,4 +1,6 @@
-"""Every completion of the corpus gets the status in its name, and just the repairs that are written down."""
+"""Every completion of the corpus gets the status in its name,
+and just the repairs that are written down.
+"""
 
 import pytest
 from corpus import ACTIONS, CASES, Case
@@ -22,7 +24,9 @@ def test_a_completion_gives_what_its_name_says(case: Case) -> None:
     else:
         assert parsed.faults == ()
         assert sum(parsed.intent) == pytest.approx(1, abs=1e-12)
-        assert set(parsed.message or ()) == (set(MESSAGE) if case.asked["role"] == "helper" else set())
+        assert set(parsed.message or ()) == (
+            set(MESSAGE) if case.asked["role"] == "helper" else set()
+        )
     if "intent" in expected:
         assert parsed.intent == pytest.approx(expected["intent"], abs=1e-9)
     if "mass" in expected:
@@ -62,7 +66,9 @@ def test_the_corpus_shows_every_status_and_every_repair() -> None:
          "beside the answer stands a part of another one, which names no action"),
         ("n_conflicting_answers_two_one_level_deeper",
          "if_not repeats what stands beside it in another object"),
-        ("n_conflicting_answers_in_schema_and_beside", "2 answers stand in the text and they differ"),
+        ("n_conflicting_answers_in_schema_and_beside", 
+            "2 answers stand in the "
+            "text and they differ"),
         ("n_missing_action_distribution_as_cut_text",
          "what stands for the distribution is a text, and none of JSON"),
     ],
@@ -95,10 +101,14 @@ def test_a_megabyte_of_noise_is_given_up_before_it_takes_minutes(
     "opening", ["<think>", "<thinking>\n", "[think] ", "<|channel|>analysis ", "```\n<reasoning>"]
 )
 @pytest.mark.parametrize("thinking", [True, False])
-def test_a_thought_after_an_answer_is_not_called_one_before_it(opening: str, thinking: bool) -> None:
+def test_a_thought_after_an_answer_is_not_called_one_before_it(
+    opening: str, thinking: bool
+) -> None:
     answer = '{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
     parsed = parse(f"{answer}\n{opening}hm", role="ego", actions=ACTIONS, thinking=thinking)
     assert parsed.status is Status.TRUNCATED_REASONING
     assert parsed.detail.endswith("it may overturn what stands before it")
-    begun = parse(f"{opening.removeprefix('```')}hm", role="ego", actions=ACTIONS, thinking=thinking)
+    begun = parse(
+        f"{opening.removeprefix('```')}hm", role="ego", actions=ACTIONS, thinking=thinking
+    )
     assert begun.detail == "the thought was not closed, so no answer was begun"

@@ -10,8 +10,9 @@ from judging import ego, hundredths, judged_strict, unhurried
 from harness.parsing.parse import Status
 from harness.prompts.answer_schema import Shape
 
-# The sum is the checksum. One edited character changes a distribution in hundredths by 0.01 or more, or by a
-# third decimal, which is at most 0.009. So a changed intent is never exact, but for that decimal's 0.001.
+# The sum is the checksum. One edited character changes a distribution in hundredths by 0.01 or
+# more, or by a third decimal, which is at most 0.009. So a changed intent is never exact, but for
+# that decimal's 0.001.
 
 
 def mutants(text: str, at: int, character: str) -> list[str]:
@@ -55,7 +56,9 @@ def test_an_answer_cut_anywhere_by_the_token_limit_gives_no_intent(
 
 
 @unhurried
-@given(hundredths(), st.text(alphabet="ab {}\"'\n.", max_size=20), st.text(max_size=20), st.booleans())
+@given(
+    hundredths(), st.text(alphabet="ab {}\"'\n.", max_size=20), st.text(max_size=20), st.booleans()
+)
 def test_a_draft_in_an_open_thought_is_never_an_answer(
     distribution: dict[str, float], before: str, after: str, thinking: bool
 ) -> None:
@@ -70,7 +73,9 @@ def test_a_draft_in_an_open_thought_is_never_an_answer(
 def test_two_answers_are_one_only_if_they_are_the_same(
     first: dict[str, float], second: dict[str, float]
 ) -> None:
-    parsed = ego(f"Initially {json.dumps(first)} but finally {json.dumps({'action_distribution': second})}")
+    parsed = ego(
+        f"Initially {json.dumps(first)} but finally {json.dumps({'action_distribution': second})}"
+    )
     if first == second:
         assert "repeated_answer" in parsed.repairs
     else:

@@ -31,7 +31,16 @@ PIECES = st.sampled_from(
             "\n",
             " ",
         ),
-        *('"SLOWER"', '"IDLE"', '"FASTER"', "SLOWER", "slower", '"evidence": "car"', '"risk": "high"', "｛"),
+        *(
+            '"SLOWER"',
+            '"IDLE"',
+            '"FASTER"',
+            "SLOWER",
+            "slower",
+            '"evidence": "car"',
+            '"risk": "high"',
+            "｛",
+        ),
         *(
             '"recommended_maneuver": "IDLE"',
             '"confidence": 0.8',
@@ -82,7 +91,9 @@ PIECES = st.sampled_from(
     ]
 )
 ANY_TEXT = st.one_of(
-    st.text(), st.text(st.characters(exclude_categories=())), st.lists(PIECES, max_size=25).map("".join)
+    st.text(),
+    st.text(st.characters(exclude_categories=())),
+    st.lists(PIECES, max_size=25).map("".join),
 )
 
 

@@ -41,7 +41,9 @@ ANSWERS = st.fixed_dictionaries(
             st.integers(),
         ),
         "risk": st.sampled_from(["low", "medium", "high", "High", "none", None, 1, []]),
-        "recommended_maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
+        "recommended_maneuver": st.one_of(
+            st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS
+        ),
         "maneuver": st.one_of(st.sampled_from([*ACTIONS, "idle", "STOP", None]), OBJECTS),
         "confidence": NUMBERS,
         "note": NUMBERS,
@@ -49,12 +51,16 @@ ANSWERS = st.fixed_dictionaries(
 )
 
 
-SHAPES = st.sampled_from([Shape(role, ACTIONS, form) for role in FORMS for form in (None, *FORMS[role])])
+SHAPES = st.sampled_from(
+    [Shape(role, ACTIONS, form) for role in FORMS for form in (None, *FORMS[role])]
+)
 
 
 @unhurried
 @given(ANSWERS, SHAPES)
-def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value: Any, shape: Shape) -> None:
+def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(
+    value: Any, shape: Shape
+) -> None:
     text = json.dumps(value)
     strict = parse(text, **shape._asdict()).status is Status.STRICT
     assert strict == judged_strict(text, shape)
@@ -75,9 +81,13 @@ def test_strict_is_what_the_published_schema_and_the_sum_say_of_any_object(value
     ),
     SHAPES,
 )
-def test_strict_is_what_the_published_schema_says_of_near_valid_messages(value: Any, shape: Shape) -> None:
+def test_strict_is_what_the_published_schema_says_of_near_valid_messages(
+    value: Any, shape: Shape
+) -> None:
     if shape.role == "ego":
-        value = {key.removeprefix("recommended_"): v for key, v in value.items() if key not in REPORT}
+        value = {
+            key.removeprefix("recommended_"): v for key, v in value.items() if key not in REPORT
+        }
     text = json.dumps(value)
     strict = parse(text, **shape._asdict()).status is Status.STRICT
     assert strict == judged_strict(text, shape)
@@ -103,17 +113,25 @@ PROSE = st.text(st.characters(exclude_characters="{｛<＜[&\\`~", codec="utf-8"
 
 @unhurried
 @given(PROSE.map(lambda prose: f"So: {prose}\n"), ANSWERS, ROLES)
-def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(reasons: str, value: Any, role: str) -> None:
+def test_reasons_that_were_asked_for_change_nothing_of_a_verdict(
+    reasons: str, value: Any, role: str
+) -> None:
     """Whatever they say and whatever stands behind them; unasked they are a repair more."""
     text = json.dumps(value)
     bare = parse(text, role=role, actions=ACTIONS)
     asked = parse(reasons + text, role=role, actions=ACTIONS, reasons_first=True)
     unasked = parse(reasons + text, role=role, actions=ACTIONS)
     if bare.verdict != "failed":
-        assert (asked.status, asked.repairs, asked.intent) == (bare.status, bare.repairs, bare.intent)
+        assert (asked.status, asked.repairs, asked.intent) == (
+            bare.status,
+            bare.repairs,
+            bare.intent,
+        )
         assert unasked.status is Status.RECOVERED
         assert {*unasked.repairs} - {*bare.repairs} >= {Repair.PROSE_AROUND}
-    assert (asked.verdict == "failed") == (unasked.verdict == "failed") == (bare.verdict == "failed")
+    assert (
+        (asked.verdict == "failed") == (unasked.verdict == "failed") == (bare.verdict == "failed")
+    )
 
 
 @unhurried
@@ -123,7 +141,9 @@ def test_strict_is_what_the_published_schema_says_of_a_text_with_a_slip(
 ) -> None:
     text = json.dumps(value, ensure_ascii=data.draw(st.booleans()))
     at = data.draw(st.integers(0, len(text)))
-    added = data.draw(st.sampled_from(["", " ", ",", '"risk":"low",', "\\u003a", ":", "0", "1e0", "\n"]))
+    added = data.draw(
+        st.sampled_from(["", " ", ",", '"risk":"low",', "\\u003a", ":", "0", "1e0", "\n"])
+    )
     check_readings_agree(text[:at] + added + text[at:], shape)
 
 
@@ -136,7 +156,18 @@ def test_the_strict_reading_of_the_corpus_is_the_librarys(case: Any) -> None:
 
 @pytest.mark.parametrize(
     "evidence",
-    ["", "v6: left", "a\\u003ab", "max 12 words", "\t", "\x7f", "\x00", "\ud83d", "é" * 200, "é" * 201],
+    [
+        "",
+        "v6: left",
+        "a\\u003ab",
+        "max 12 words",
+        "\t",
+        "\x7f",
+        "\x00",
+        "\ud83d",
+        "é" * 200,
+        "é" * 201,
+    ],
 )
 @pytest.mark.parametrize("again", ["", '"evidence":"b",', '"evidence":"b:c",', '"risk":"low",'])
 def test_the_strict_reading_is_not_deceived_by_a_key_given_twice(evidence: str, again: str) -> None:
@@ -148,7 +179,9 @@ def test_the_strict_reading_is_not_deceived_by_a_key_given_twice(evidence: str, 
 
 
 def check_readings_agree(text: str, shape: Shape) -> None:
-    """The typed reading takes what the schema of jsonschema does, and reads it as the search does."""
+    """The typed reading takes what the schema of jsonschema does,
+    and reads it as the search does.
+    """
     strict = fitting(text, shape)
     assert (strict is not None) == judged_strict(text, shape)
     if strict:
@@ -168,7 +201,9 @@ def test_a_valid_distribution_is_strict_and_comes_back_unchanged(
 
 @pytest.mark.parametrize("key", [r"\ud800", r"note\udc00", r"IDLE\ud800"])
 @pytest.mark.parametrize("role", FORMS)
-def test_a_key_that_no_text_can_hold_is_no_strict_answer_and_no_fault_of_ours(role: str, key: str) -> None:
+def test_a_key_that_no_text_can_hold_is_no_strict_answer_and_no_fault_of_ours(
+    role: str, key: str
+) -> None:
     """JSON may escape a lone surrogate, and a name with one cannot be written as UTF-8."""
     shares = '{"SLOWER":0.2,"IDLE":0.5,"FASTER":0.3}'
     for text in (f'{{"{key}":1,"action_distribution":{shares}}}', f'{{"{key}":{shares}}}'):

@@ -1,4 +1,6 @@
-"""What a prompt shows in place of values is found in its template, and is no evidence when it comes back."""
+"""What a prompt shows in place of values is found in its template,
+and is no evidence when it comes back.
+"""
 
 import json
 from dataclasses import replace
@@ -20,9 +22,13 @@ ACTIONS = ("SLOWER", "IDLE", "FASTER")
          ("max 12 words", "low|medium|high", "0 to 1")),
         ('{"evidence": "what you see, and where", "risk": how grave}',
          ("what you see, and where", "how grave")),
-        ('{"action_distribution":{ {%- for a in actions %}"{{ a }}":p{{ "," }}{% endfor -%} }}', ("p",)),
+        (
+            '{"action_distribution":{ {%- for a in actions %}"{{ a }}":p{{ "," }}{% '
+            'endfor -%} }}', ("p",)),
         ('{"maneuver": "{{ actions | join("|") }}", "confidence": {# hm: "x": y #}number}', ()),
-        ('Answer in JSON with two keys: "evidence" names what you see; "risk" is one of low, high.', ()),
+        (
+            'Answer in JSON with two keys: "evidence" names what you see; "risk" is one of '
+            'low, high.', ()),
         ("{{ graph.ego.id }}: {{ words.task }}", ()),
         ("", ()),
     ],
@@ -55,7 +61,11 @@ def test_no_shipped_prompts_own_placeholder_is_evidence(version: str) -> None:
 
 def test_nor_is_that_of_a_users_prompt() -> None:
     prompt = versions.load("v6")
-    helper = prompt.texts["helper"].replace("max 12 words", "what hides whom").replace("low|", "none|low|")
+    helper = (
+        prompt.texts["helper"]
+        .replace("max 12 words", "what hides whom")
+        .replace("low|", "none|low|")
+    )
     own = replace(prompt, texts={**prompt.texts, "helper": helper})
     for shown in ("What  hides whom.", "None|low", "Low or none"):
         assert said(shown, own).repairs == ("evidence_echo",)

@@ -22,14 +22,26 @@ RECORDS = {
     "run.json", "run.toml", "sweep.json", "schedule.json", "suite.json", "twins.json", "fidelity.json",
     "cells.jsonl", *FILES,
 }  # fmt: skip
-EVAL = ("--seeds", "0", "--limit", "1", "--quiet", "--condition", "single-local", "--condition", "6g")
+EVAL = (
+    "--seeds",
+    "0",
+    "--limit",
+    "1",
+    "--quiet",
+    "--condition",
+    "single-local",
+    "--condition",
+    "6g",
+)
 
 
 @pytest.fixture
 def typed(
     harness: Typed, small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., str]:
-    """The command, typed in a project below a folder of that name, which every option spells out."""
+    """The command, typed in a project below a folder of that name,
+    which every option spells out.
+    """
     here = tmp_path / CANARY / "project"
     (here / "datasets").mkdir(parents=True)
     (here / "swarmdrive.toml").touch()
@@ -46,7 +58,9 @@ def typed(
 
 
 def found(folder: Path) -> Iterator[Path]:
-    """The files in which the name can be read, but for what a run and a study record of themselves."""
+    """The files in which the name can be read,
+    but for what a run and a study record of themselves.
+    """
     for file in sorted(path for path in folder.rglob("*") if path.is_file()):
         text = file.read_bytes().decode("utf-8", "ignore")
         if file.suffix == ".html" and 'id="index"' in text:
@@ -58,13 +72,21 @@ def found(folder: Path) -> Iterator[Path]:
 
 
 def spoil(run: Path) -> None:
-    """Have an engine name a file of the machine in an error, and the card a server with a password."""
+    """Have an engine name a file of the machine in an error,
+    and the card a server with a password.
+    """
     first, *rest = (run / "answers.jsonl").read_text().splitlines()
     said = f"cannot read {run.resolve()}/weights.bin"
-    answer = json.loads(first) | {"error": said, "detail": f"the engine: {said}", "status": "bad_json"}
+    answer = json.loads(first) | {
+        "error": said,
+        "detail": f"the engine: {said}",
+        "status": "bad_json",
+    }
     (run / "answers.jsonl").write_text("\n".join([json.dumps(answer), *rest]) + "\n")
     manifest = json.loads((run / "run.json").read_text())
-    manifest["model"]["server"] = {"base_url": [f"http://ada:{SECRET}@localhost:80/v1?key={SECRET}"]}
+    manifest["model"]["server"] = {
+        "base_url": [f"http://ada:{SECRET}@localhost:80/v1?key={SECRET}"]
+    }
     (run / "run.json").write_text(json.dumps(manifest))
 
 
@@ -75,7 +97,9 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     typed("eval", "--model", "proxy", *EVAL, "--dataset", data, "--out", here / "reports/one")
     replay = f"replay:{here}/reports/one"
     typed("eval", "--model", replay, *EVAL, "--dataset", data, "--out", here / "reports/two")
-    typed("eval", "--model", "proxy", *EVAL, "--dataset", "suite:two", "--out", here / "reports/suite")
+    typed(
+        "eval", "--model", "proxy", *EVAL, "--dataset", "suite:two", "--out", here / "reports/suite"
+    )
     typed(*DRIVE, "--model", "proxy", "--episodes", "1", "--first-seed", "100", "--seeds", "0", "--quiet",
           "--condition", "6g", "--condition", "single-local", "--out", here / "reports/driven")  # fmt: skip
     one, two = here / "reports/one", here / "reports/two"
@@ -99,7 +123,9 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     assert [str(path) for path in found(here.parent.parent)] == []
     pages = here / "pair.html", here.parent / "elsewhere/apart.html", one / "x"
     places = [beside(page)(read(one)) for page in pages]
-    assert places == ["reports/one/report.html", None, "report.html"], "pages of one project are linked"
+    assert places == ["reports/one/report.html", None, "report.html"], (
+        "pages of one project are linked"
+    )
 
 
 @pytest.mark.exhaustive
@@ -107,10 +133,22 @@ def test_no_page_of_studies_names_a_folder(typed: Callable[..., str]) -> None:
     here = Path.cwd()
     run = here / "reports/one"
     typed("eval", "--model", "proxy", *EVAL, "--dataset", here / "datasets/mine", "--out", run)
-    typed("study", "sweep", run, "--over", "tau", "--grid", "0.7", "--quiet", "--out", here / "swept")
+    typed(
+        "study", "sweep", run, "--over", "tau", "--grid", "0.7", "--quiet", "--out", here / "swept"
+    )
     typed("study", "trust", run, "--attacks", "liar", "--rules", "median", "--share", "1/3", "--quiet",
           "--out", here / "trust")  # fmt: skip
-    typed("study", "schedule", "compare", run, "--schedule", "margin", "--quiet", "--out", here / "schedules")
+    typed(
+        "study",
+        "schedule",
+        "compare",
+        run,
+        "--schedule",
+        "margin",
+        "--quiet",
+        "--out",
+        here / "schedules",
+    )
     typed("study", "attribute", run, "--sample", "2", "--quiet")
     typed("report", run)
     typed("study", "twins", "--model", "proxy", "--dataset", here / "datasets/mine", "--limit", "1",

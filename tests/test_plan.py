@@ -19,7 +19,9 @@ Harness = Callable[..., tuple[int, str, str]]
 Z975, Z80 = 1.959964, 0.841621
 
 
-def lost(*episodes: int, condition: str = "single-local", dangerous: int = 0) -> Callable[[Row], None]:
+def lost(
+    *episodes: int, condition: str = "single-local", dangerous: int = 0
+) -> Callable[[Row], None]:
     """These episodes fail under one condition; the first so many have a danger."""
 
     def change(row: Row) -> None:
@@ -74,11 +76,15 @@ def test_pilots_that_agree_do_not_promise_that_few_layouts_are_enough() -> None:
 
 def test_the_variance_of_resampled_values_is_that_of_the_values_drawn() -> None:
     values, counts = np.array([0.0, 0.5, 1.0]), np.array([[1, 1, 1], [2, 0, 2]])
-    assert variance(values, counts) == pytest.approx([np.var(values, ddof=1), np.var([0, 0, 1, 1], ddof=1)])
+    assert variance(values, counts) == pytest.approx(
+        [np.var(values, ddof=1), np.var([0, 0, 1, 1], ddof=1)]
+    )
     assert variance(values[:1], np.ones(1, dtype=int)) == np.inf
 
 
-def test_a_run_plans_the_gain_of_its_conditions_and_what_that_takes(tmp_path: Path, harness: Harness) -> None:
+def test_a_run_plans_the_gain_of_its_conditions_and_what_that_takes(
+    tmp_path: Path, harness: Harness
+) -> None:
     def timed(row: Row) -> None:
         row |= {"prompt_tokens": 90, "completion_tokens": 10, "seconds": 0.5}
 
@@ -90,7 +96,11 @@ def test_a_run_plans_the_gain_of_its_conditions_and_what_that_takes(tmp_path: Pa
     differences = np.array([1, 1, 0, 0, 0, 1] + [0] * 6)
     spread = Spread(np.ones(1), np.array([differences.var(ddof=1)]))
     layouts = row["layouts"]
-    assert (row["condition"], layouts["value"], layouts["n"]) == ("6g", spread.episodes(0.1, 0.8), 12)
+    assert (row["condition"], layouts["value"], layouts["n"]) == (
+        "6g",
+        spread.episodes(0.1, 0.8),
+        12,
+    )
     assert layouts["low"] < layouts["value"] < layouts["high"]
     assert row["finds"] == pytest.approx(float(spread.difference(12, 0.8)))
     requests = 8 * layouts["value"]  # of two steps, four viewers each
@@ -102,7 +112,9 @@ def test_a_run_plans_the_gain_of_its_conditions_and_what_that_takes(tmp_path: Pa
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_two_runs_plan_their_difference_in_both_kinds_of_layouts(tmp_path: Path, harness: Harness) -> None:
+def test_two_runs_plan_their_difference_in_both_kinds_of_layouts(
+    tmp_path: Path, harness: Harness
+) -> None:
     pilots = [
         made_up(tmp_path / name, episode=lost(*episodes, condition="6g", dangerous=4), episodes=10)
         for name, episodes in (("a", (0, 1, 8)), ("b", (9,)))
@@ -111,7 +123,10 @@ def test_two_runs_plan_their_difference_in_both_kinds_of_layouts(tmp_path: Path,
     plan = json.loads(out)
     assert (code, plan["difference"]) == (0, "balanced success, B - A")
     rows = {row["condition"]: row for row in plan["conditions"]}
-    dangerous, harmless = np.array([1, 1, 0, 0]).var(ddof=1), np.array([0, 0, 0, 0, 1, -1]).var(ddof=1)
+    dangerous, harmless = (
+        np.array([1, 1, 0, 0]).var(ddof=1),
+        np.array([0, 0, 0, 0, 1, -1]).var(ddof=1),
+    )
     spread = Spread(np.array([0.4, 0.6]), np.array([dangerous, harmless]))
     assert rows["6g"]["layouts"]["value"] == spread.episodes(0.05, 0.8)
     assert rows["6g"]["finds"] == pytest.approx(float(spread.difference(300, 0.8)))
@@ -147,7 +162,9 @@ def test_a_stated_rate_plans_without_a_run(harness: Harness) -> None:
         (("ALONE",), "has not both single-local and another condition"),
     ],
 )
-def test_bad_input_is_one_line(words: tuple[str, ...], says: str, tmp_path: Path, harness: Harness) -> None:
+def test_bad_input_is_one_line(
+    words: tuple[str, ...], says: str, tmp_path: Path, harness: Harness
+) -> None:
     from harness.coordination.operating_point import POINTS
 
     runs: dict[str, dict[str, object]] = {

@@ -1,7 +1,8 @@
-"""The seams from outside: `tests/plugin`, installed beside the harness, adds one of each kind of plug-in.
+"""The seams from outside: `tests/plugin`, installed beside the harness,
+adds one of each kind of plug-in.
 
-Commands run as typed, in processes of their own: one that has the package, for most of them, and one that
-has not. This one only reads what they wrote and said.
+Commands run as typed, in processes of their own: one that has the package, for most of them, and
+one that has not. This one only reads what they wrote and said.
 """
 
 import json
@@ -27,7 +28,11 @@ source = "card"
 inference_s = 0.01
 basis = "declared: for this test"
 """
-SMOOTHED, FOG_SMOOTHED, CLOSE = "6g:consensus=smoothing", "fog:consensus=smoothing", "fog:radius_m=60"
+SMOOTHED, FOG_SMOOTHED, CLOSE = (
+    "6g:consensus=smoothing",
+    "fog:consensus=smoothing",
+    "fog:radius_m=60",
+)
 MUMBLED, NEAREST = "6g:attack=mumble:share=1", "6g:schedule=near,max_helpers=1"
 FROZEN = ("single-local", "6g", SMOOTHED, "fog", FOG_SMOOTHED, CLOSE, MUMBLED, NEAREST)
 DRIVEN = (SMOOTHED, FOG_SMOOTHED)
@@ -37,7 +42,10 @@ Words = tuple[str, ...]
 # What is typed, and what is said of it.
 MISTAKES: dict[Words, str] = {
     ("--condition", "fogg"): "unknown operating point 'fogg'; did you mean 'fog'? known: 6g, ",
-    ("--condition", "fog:loss=0"): "loss is 0.0; it must be left out: channel profile fog has no such",
+    (
+        "--condition",
+        "fog:loss=0",
+    ): "loss is 0.0; it must be left out: channel profile fog has no such",
     ("--condition", "6g:consensus=smooth"): "unknown consensus 'smooth'; did you mean 'smoothing'?",
 }
 NAMES: dict[Words, str] = {
@@ -89,7 +97,16 @@ def with_package(project: Path, small_path: Path) -> dict[Words, Said]:
     """What is typed where the package is installed: two runs, a sweep, a report and mistakes."""
     evaluated = ("eval", "--model", "mine", "--dataset", str(small_path))
     driven = ("drive", "--model", "mine", "--episodes", "2", "--seeds", "0:2", "--out", "driven")
-    over = ("--over", "consensus", "--grid", "linear,smoothing", "--condition", "6g", "--condition", "fog")
+    over = (
+        "--over",
+        "consensus",
+        "--grid",
+        "linear,smoothing",
+        "--condition",
+        "6g",
+        "--condition",
+        "fog",
+    )
     lines = [
         (*evaluated, *conditions(FROZEN), "--tracker", "notebook", "--out", "frozen"),
         (*driven, *conditions(DRIVEN)),
@@ -126,7 +143,9 @@ def conditions(names: Words) -> list[str]:
 def typed(project: Path, lines: list[Words], *, package: bool) -> dict[Words, Said]:
     """What commands say that are typed one after the other, in one process."""
     site = [str(project.parent / "site")] if package else []
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*site, str(Path(__file__).parents[1])])}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([*site, str(Path(__file__).parents[1])])
+    }
     command = [sys.executable, "-c", TYPES]
     done = subprocess.run(
         command, cwd=project, env=environment, input=json.dumps(lines), capture_output=True, text=True,
@@ -152,13 +171,21 @@ def replies(decisions: pd.DataFrame) -> pd.DataFrame:
         )
         for n in PLACES
     ]
-    return pd.concat(parts).dropna(subset="helper").astype({"scene": str, "helper": str, "delivered": bool})
+    return (
+        pd.concat(parts)
+        .dropna(subset="helper")
+        .astype({"scene": str, "helper": str, "delivered": bool})
+    )
 
 
 def smoothed(run: Tables, decisions: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """What smoothing makes of the answers, and the linear pool, (n, A): by hand, decision by decision."""
+    """What smoothing makes of the answers, and the linear pool, (n, A):
+    by hand, decision by decision.
+    """
     said = {
-        (answer.scene, answer.viewer): np.array([getattr(answer, f"intent_{action}") for action in ACTIONS])
+        (answer.scene, answer.viewer): np.array(
+            [getattr(answer, f"intent_{action}") for action in ACTIONS]
+        )
         for answer in run.answers.itertuples()
     }
     memory: dict[tuple[int, int], np.ndarray] = {}
@@ -188,7 +215,9 @@ def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables
     graphs = {scene.id: scene.graphs for scene in asked}
     answers = frozen.answers
     assert sum(answers.role == "ego") == len(graphs)
-    wary = np.array([bool(graphs[str(a.scene)][str(a.viewer)].conflicts) for a in answers.itertuples()])
+    wary = np.array(
+        [bool(graphs[str(a.scene)][str(a.viewer)].conflicts) for a in answers.itertuples()]
+    )
     assert 0 < wary.sum() < len(wary)
     expected = np.where(wary[:, None], (0.6, 0.3, 0.1), (0.2, 0.4, 0.4))
     assert answers[[f"intent_{action}" for action in ACTIONS]].to_numpy() == pytest.approx(expected)
@@ -197,7 +226,9 @@ def test_the_backend_answers_by_its_rule_on_what_each_viewer_sees(frozen: Tables
 
 @pytest.mark.parametrize("condition", DRIVEN)
 @pytest.mark.parametrize("kind", ["frozen", "driven"])
-def test_the_rule_remembers_from_step_to_step(kind: str, condition: str, request: pytest.FixtureRequest):
+def test_the_rule_remembers_from_step_to_step(
+    kind: str, condition: str, request: pytest.FixtureRequest
+):
     run: Tables = request.getfixturevalue(kind)
     decisions = decided(run, condition)
     policies, pools = smoothed(run, decisions)
@@ -248,7 +279,9 @@ def test_helpers_that_mumble_are_half_as_sure(frozen: Tables):
         there = [n for n in PLACES if row[f"on_time_{n}"] is True]
         policy = (row["own_weight"] if there else 1.0) * said[row["scene"], "v1"]
         for n in there:
-            policy = policy + row[f"weight_{n}"] * (said[row["scene"], row[f"helper_{n}"]] + 1 / 3) / 2
+            policy = (
+                policy + row[f"weight_{n}"] * (said[row["scene"], row[f"helper_{n}"]] + 1 / 3) / 2
+            )
         assert [row[f"fused_{action}"] for action in ACTIONS] == pytest.approx(policy, abs=5e-6)
         heard += len(there)
     assert heard > 30
@@ -256,7 +289,8 @@ def test_helpers_that_mumble_are_half_as_sure(frozen: Tables):
 
 def test_the_nearest_helper_within_half_the_way_is_asked(frozen: Tables, small: Dataset):
     known_m = {
-        scene.id: scene.record.range_m for scene in small.scenes(frozen.answers.scene.unique().tolist())
+        scene.id: scene.record.range_m
+        for scene in small.scenes(frozen.answers.scene.unique().tolist())
     }
     decisions, asked = decided(frozen, NEAREST), 0
     sent = replies(decisions)
@@ -270,10 +304,16 @@ def test_the_nearest_helper_within_half_the_way_is_asked(frozen: Tables, small: 
 
 
 def test_the_metric_is_in_the_summary(frozen: Tables):
-    table = frozen.summary[(frozen.summary.metric == "sure_rate") & (frozen.summary.interval == "episodes")]
+    table = frozen.summary[
+        (frozen.summary.metric == "sure_rate") & (frozen.summary.interval == "episodes")
+    ]
     decisions = frozen.decisions[frozen.decisions.condition == "fog"]
-    by_episode = (decisions.normalised_entropy < 0.5).groupby([decisions.seed, decisions.episode]).mean()
-    assert table[table.condition == "fog"].value.item() == pytest.approx(by_episode.mean(), abs=1e-6)
+    by_episode = (
+        (decisions.normalised_entropy < 0.5).groupby([decisions.seed, decisions.episode]).mean()
+    )
+    assert table[table.condition == "fog"].value.item() == pytest.approx(
+        by_episode.mean(), abs=1e-6
+    )
 
 
 def test_a_sweep_plays_the_rule_on_what_is_stored(project: Path, frozen: Tables):
@@ -299,7 +339,9 @@ def test_a_report_of_a_run_needs_no_package(
 
 
 @pytest.mark.parametrize("words", MISTAKES)
-def test_a_mistake_is_one_line_that_knows_the_package(words: Words, with_package: dict[Words, Said]):
+def test_a_mistake_is_one_line_that_knows_the_package(
+    words: Words, with_package: dict[Words, Said]
+):
     code, _, message = with_package["eval", "--model", "mine", *words]
     assert code == 2
     assert MISTAKES[words] in message
@@ -307,7 +349,9 @@ def test_a_mistake_is_one_line_that_knows_the_package(words: Words, with_package
 
 
 @pytest.mark.parametrize("words", NAMES)
-def test_without_the_package_its_names_mean_nothing(words: Words, without_package: dict[Words, Said]):
+def test_without_the_package_its_names_mean_nothing(
+    words: Words, without_package: dict[Words, Said]
+):
     code, _, message = without_package["eval", *words]
     assert code == 2
     assert NAMES[words] in message

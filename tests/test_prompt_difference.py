@@ -14,9 +14,9 @@ from harness.prompts import versions as prompts
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
-TEXTS = st.lists(st.sampled_from(["drive", "slow", "down", " ", "  ", "\n", "%}", "\x1b["]), max_size=30).map(
-    "".join
-)
+TEXTS = st.lists(
+    st.sampled_from(["drive", "slow", "down", " ", "  ", "\n", "%}", "\x1b["]), max_size=30
+).map("".join)
 
 
 def test_a_change_by_hand() -> None:
@@ -32,7 +32,9 @@ def test_a_change_by_hand() -> None:
 
 def test_far_changes_are_hunks_of_their_own_with_their_lines() -> None:
     lines = [f"line {n} says so" for n in range(12)]
-    changed = difference.words("\n".join(lines), "\n".join([*lines[:3], "new", *lines[3:11], "last"]))
+    changed = difference.words(
+        "\n".join(lines), "\n".join([*lines[:3], "new", *lines[3:11], "last"])
+    )
     assert [(hunk.line_a, hunk.line_b) for hunk in changed.hunks] == [(2, 2), (10, 11)]
     assert ("added", "\nnew") in changed.hunks[0].pieces
 
@@ -50,7 +52,10 @@ def test_with_all_words_around_it_a_change_is_both_texts(a: str, b: str) -> None
 
 def test_the_end_of_a_line_is_shown_where_it_changes_and_nothing_reaches_the_terminal() -> None:
     [hunk] = difference.words("go\nnow \x1b[31m", "go now \x1b[32m").hunks
-    assert "".join(text for _, text in difference.marked(hunk)) == "go[-↵now \\x1b[31m-] {+now \\x1b[32m+}"
+    assert (
+        "".join(text for _, text in difference.marked(hunk))
+        == "go[-↵now \\x1b[31m-] {+now \\x1b[32m+}"
+    )
 
 
 def test_settings_that_decide_what_is_asked_are_compared_and_notes_are_not() -> None:
@@ -81,13 +86,17 @@ def test_v2_and_v3_differ_only_for_an_ego_with_messages(small_path: Path, harnes
 
 def test_every_hunk_is_of_what_prompt_show_prints(small_path: Path, harness: Harness) -> None:
     of = ("--scene", "00001-0", "--dataset", small_path)
-    shown = [json.loads(harness("prompt", "show", version, *of, "--json")[1]) for version in ("v3", "v4")]
+    shown = [
+        json.loads(harness("prompt", "show", version, *of, "--json")[1]) for version in ("v3", "v4")
+    ]
     told = json.loads(harness("prompt", "compare", "v3", "v4", *of, "--json")[1])
     assert told["scene"].startswith("00001-0-")
     alone = [sent for sent in told["sent"] if sent["role"] != "fusion"]
     for sent in alone:
         for version, kind in enumerate(("removed", "added")):
-            messages = {message["role"]: message["content"] for message in shown[version][sent["viewer"]]}
+            messages = {
+                message["role"]: message["content"] for message in shown[version][sent["viewer"]]
+            }
             assert sent["words"][version] == sum(len(text.split()) for text in messages.values())
             for part, changed in sent["parts"].items():
                 assert changed["hunks"]

@@ -41,7 +41,9 @@ def text_of(messages: tuple[dict[str, str], ...]) -> str:
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_prompt_is_the_golden_text(version: str, case: str) -> None:
-    """After a wanted change: `UPDATE_GOLDEN=1 pytest tests/test_prompts.py`, and read the difference."""
+    """After a wanted change: `UPDATE_GOLDEN=1 pytest tests/test_prompts.py`,
+    and read the difference.
+    """
     seen, messages = CASES[case]
     said = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
     file = GOLDEN / f"{version}-{case}.txt"
@@ -51,18 +53,27 @@ def test_a_prompt_is_the_golden_text(version: str, case: str) -> None:
 
 
 def test_every_golden_text_is_of_a_version_and_a_case() -> None:
-    assert {f.stem for f in GOLDEN.glob("*.txt")} == {f"{v}-{case}" for v in VERSIONS for case in CASES}
+    assert {f.stem for f in GOLDEN.glob("*.txt")} == {
+        f"{v}-{case}" for v in VERSIONS for case in CASES
+    }
 
 
-# -- what is told ---------------------------------------------------------------------------------------
+# -- what is told
+# ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_counted(version: str) -> None:
+def test_those_in_conflict_are_listed_first_then_the_nearest_and_the_rest_is_counted(
+    version: str,
+) -> None:
     near = [structs.replace(CAR, id=f"v{20 + i}", forward_m=1.0 + i, left_m=0.0) for i in range(4)]
     prompt = prompts.load(version)
     *_, user = prompt.render(graph("ego", [*near, TRUCK], [STANDING]), ACTIONS, (), CROSSING)
-    listed = [v for v in ("v4", "v20", "v21", "v22", "v23") if re.search(rf"^{v}\b", user["content"], re.M)]
+    listed = [
+        v
+        for v in ("v4", "v20", "v21", "v22", "v23")
+        if re.search(rf"^{v}\b", user["content"], re.M)
+    ]
     if version in LISTS_NOBODY:
         assert set(listed) <= {"v4"}
         return
@@ -84,7 +95,9 @@ def test_a_version_that_was_used_travels_to_another_process(version: str) -> Non
 @pytest.mark.parametrize("version", VERSIONS)
 def test_action_names_are_the_ones_passed_in(version: str) -> None:
     for role in prompts.ROLES:
-        said = text_of(prompts.load(version).render(graph(role, [], []), ("LANE_LEFT", "KEEP"), (), CROSSING))
+        said = text_of(
+            prompts.load(version).render(graph(role, [], []), ("LANE_LEFT", "KEEP"), (), CROSSING)
+        )
         assert "LANE_LEFT" in said
         assert "KEEP" in said
 
@@ -113,7 +126,8 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
         seen = graph(role, [node], [structs.replace(STANDING, vehicle=words)])
         messages = ({**MESSAGES[0], "sender": words, "evidence": words},) if role == "ego" else ()
         text = text_of(prompts.load(version).render(seen, ACTIONS, messages, CROSSING))
-        return text.replace("\n", " ").count(words.replace("\n", " "))  # evidence stands in one line
+        # evidence stands in one line
+        return text.replace("\n", " ").count(words.replace("\n", " "))
 
     assert count(WORDS) == count("plain-words".ljust(len(WORDS), "-"))
 
@@ -122,19 +136,28 @@ def test_hostile_words_in_a_graph_stay_words(version: str, role: str) -> None:
 @given(st.text(max_size=30), st.sampled_from(VERSIONS))
 def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
     said = text_of(
-        prompts.load(version).render(graph("ego", [structs.replace(CAR, id=name)], []), ACTIONS, (), CROSSING)
+        prompts.load(version).render(
+            graph("ego", [structs.replace(CAR, id=name)], []), ACTIONS, (), CROSSING
+        )
     )
     assert name in said or version in LISTS_NOBODY
 
 
 # Section III-C, Prompt Engineering for Multimodal Perception.
 PAPER = {
-    "helper": "You are a neighboring vehicle assisting the ego car. From your local view, report only the "
-              "most decision-relevant evidence for the conflict zone, summarize the visible risk, and send "
+    "helper": 
+        "You are a neighboring vehicle assisting the ego car. From your local view, report only "
+        "the "
+              "most decision-relevant evidence for the conflict zone, summarize the visible risk, "
+              "and send "
               "one compact semantic message with a recommended maneuver and confidence score.",
-    "ego": "You are the ego vehicle. Combine your local scene graph with the received cooperative messages, "
-           "reason step by step over occlusion, conflict-zone risk, and message agreement, and then output "
-           "only the final JSON action distribution over A. Prioritize safety over efficiency when the "
+    "ego": 
+        "You are the ego vehicle. Combine your local scene graph with the received cooperative "
+        "messages, "
+           "reason step by step over occlusion, conflict-zone risk, and message agreement, and "
+           "then output "
+           "only the final JSON action distribution over A. Prioritize safety over efficiency when "
+           "the "
            "evidence is uncertain or conflicting.",
 }  # fmt: skip
 
@@ -160,7 +183,8 @@ def test_v3_differs_from_v2_in_messages_alone(case: str) -> None:
     assert v3 == v2
 
 
-# -- versions that are wrong ----------------------------------------------------------------------------
+# -- versions that are wrong
+# ----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -212,7 +236,9 @@ def one_line(error: pytest.ExceptionInfo[UserError]) -> str:
         ("{{ '\x1b[31m' + 1 }}", "str"),
     ],
 )
-def test_a_template_that_fails_or_reaches_out_is_one_line(draft: Edit, template: str, said: str) -> None:
+def test_a_template_that_fails_or_reaches_out_is_one_line(
+    draft: Edit, template: str, said: str
+) -> None:
     prompt = draft("ego.j2", "Distribution:", template)
     with pytest.raises(UserError) as caught:
         prompt.render(graph("ego", [CAR], []), ACTIONS)
@@ -223,7 +249,9 @@ def test_a_template_that_fails_or_reaches_out_is_one_line(draft: Edit, template:
 
 
 @pytest.mark.parametrize("template", ["{% import os %}", "{{ graph.", "{% if %}", "{% endblock %}"])
-def test_a_template_that_is_no_jinja_is_one_line_with_its_number(draft: Edit, template: str) -> None:
+def test_a_template_that_is_no_jinja_is_one_line_with_its_number(
+    draft: Edit, template: str
+) -> None:
     prompt = draft("helper.j2", "Message to", f"{template} Message to")
     with pytest.raises(UserError) as caught:
         prompt.render(graph("ego", [], []), ACTIONS)
@@ -232,7 +260,9 @@ def test_a_template_that_is_no_jinja_is_one_line_with_its_number(draft: Edit, te
 
 def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
     prompt = draft("ego.j2", "block system", "block preamble")
-    with pytest.raises(UserError, match=r"does not render: 'system'; it needs the blocks system and user"):
+    with pytest.raises(
+        UserError, match=r"does not render: 'system'; it needs the blocks system and user"
+    ):
         prompt.render(graph("ego", [], []), ACTIONS)
 
 
@@ -257,7 +287,9 @@ def test_a_template_without_a_block_says_which_it_needs(draft: Edit) -> None:
         ('"distribution"', '"distributions"', "did you mean 'distribution'?"),
     ],
 )
-def test_a_prompt_toml_with_a_mistake_is_one_line(draft: Edit, old: str, new: str, said: str) -> None:
+def test_a_prompt_toml_with_a_mistake_is_one_line(
+    draft: Edit, old: str, new: str, said: str
+) -> None:
     with pytest.raises(UserError) as caught:
         draft("prompt.toml", old, new)
     message = one_line(caught)
@@ -275,19 +307,24 @@ def test_a_missing_or_unreadable_template_is_one_line(copied: Path) -> None:
         prompts.load(DRAFT, copied)
 
 
-@pytest.mark.parametrize("name", ["v22", "", ".", "..", "../prompts/v2", "v2/", "\x1b[31m", "v" * 5000])
+@pytest.mark.parametrize(
+    "name", ["v22", "", ".", "..", "../prompts/v2", "v2/", "\x1b[31m", "v" * 5000]
+)
 def test_a_version_is_a_name_and_no_path(name: str) -> None:
     with pytest.raises(UserError, match="unknown prompt") as caught:
         prompts.load(name)
     assert one_line(caught).endswith(f"known: {', '.join(VERSIONS)}")
 
 
-# -- release --------------------------------------------------------------------------------------------
+# -- release
+# --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", [*prompts.FILES, EXAMPLES])
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_released_version_whose_text_changed_is_refused(version: str, file: str, copied: Path) -> None:
+def test_a_released_version_whose_text_changed_is_refused(
+    version: str, file: str, copied: Path
+) -> None:
     if not (copied / version / file).exists():
         pytest.skip("a version without examples")
     assert prompts.load(version, copied) == prompts.load(version)
@@ -295,40 +332,57 @@ def test_a_released_version_whose_text_changed_is_refused(version: str, file: st
         f.write("\n")
     with pytest.raises(UserError) as caught:
         prompts.load(version, copied)
-    assert one_line(caught).startswith(f"prompt {version} was released and its text has changed; restore it")
+    assert one_line(caught).startswith(
+        f"prompt {version} was released and its text has changed; restore it"
+    )
 
 
 def test_every_version_here_is_released() -> None:
     assert all(prompts.load(version).released for version in VERSIONS)
 
 
-def test_a_version_says_whether_reasons_come_first_and_v1_was_released_before_it_could(copied: Path) -> None:
+def test_a_version_says_whether_reasons_come_first_and_v1_was_released_before_it_could(
+    copied: Path,
+) -> None:
     asked = {name: prompts.load(name).reasons_first for name in ("v1", "v2", "paper")}
     assert asked == {"v1": ("ego", "helper"), "v2": (), "paper": ("ego",)}
     shutil.copytree(copied / "v2", copied / DRAFT)
     toml = copied / DRAFT / "prompt.toml"
-    toml.write_text(toml.read_text(encoding="utf-8") + 'reasons_first = ["helper"]\n', encoding="utf-8")
+    toml.write_text(
+        toml.read_text(encoding="utf-8") + 'reasons_first = ["helper"]\n', encoding="utf-8"
+    )
     assert prompts.load(DRAFT, copied).reasons_first == ("helper",)
 
 
 @pytest.mark.parametrize(
     ("version", "of_ego", "of_helper"),
-    [("v1", "strict", "strict"), ("v2", "recovered", "recovered"), ("paper", "strict", "recovered")],
+    [
+        ("v1", "strict", "strict"),
+        ("v2", "recovered", "recovered"),
+        ("paper", "strict", "recovered"),
+    ],
 )
 def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
     version: str, of_ego: str, of_helper: str, small: Dataset
 ) -> None:
-    """What the v1 templates ask for, word by word, from the ego and from a helper, also in a fusion call."""
+    """What the v1 templates ask for, word by word, from the ego and from a helper,
+    also in a fusion call.
+    """
     spec = spec_of(small, prompt=version)
     scene = scenes_of(small)[0]
-    ego = 'The truck hides the left.\n{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": 0.1}}'
+    ego = (
+        'The truck hides the left.\n{"action_distribution": {"SLOWER": 0.7, "IDLE": 0.2, "FASTER": '
+        "0.1}}"
+    )
     judged = '"recommended_maneuver": "SLOWER", "confidence": 0.8'
     if spec.ego.prompt.helper_answer == "distribution":
         judged = ego.partition("{")[2][:-1]
     helper = f'A car comes from the left.\n{{"evidence": "car", "risk": "high", {judged}}}'
     told = {}
     for request in requests(spec, [scene]):
-        said = Completion(request.id, ego if request.role == "ego" else helper, None, None, "stop", None, 1)
+        said = Completion(
+            request.id, ego if request.role == "ego" else helper, None, None, "stop", None, 1
+        )
         told[request.id.partition("/")[2]] = answer_of(request, said)
     fused = fusion_request(spec, scene, told, scene.viewers[1:])
     told["merge"] = answer_of(fused, Completion(fused.id, ego, None, None, "stop", None, 1))
@@ -367,11 +421,13 @@ def test_a_file_that_is_missing_is_named_once(copied: Path) -> None:
     with pytest.raises(UserError) as said:
         prompts.load("v1", copied)
     assert (
-        str(said.value) == f"prompt file {file} cannot be read: No such file or directory; replace the file"
+        str(said.value)
+        == f"prompt file {file} cannot be read: No such file or directory; replace the file"
     )
 
 
-# -- length ---------------------------------------------------------------------------------------------
+# -- length
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -388,7 +444,9 @@ PICTURE = 128  # tokens, of 512 x 256 pixels with Qwen3-VL and 448 x 224 with Qw
 # As long as a message may be asked for: twelve words, and long ones.
 LONG = tuple(
     {**MESSAGES[0], "sender": f"v{n}", "risk": "medium", "intent": (0.33, 0.33, 0.34), "confidence": 0.34,
-     "evidence": "Speeding vehicles approaching intersection, obscured behind parked delivery truck "
+     "evidence": 
+         "Speeding vehicles approaching intersection, "
+         "obscured behind parked delivery truck "
                  "conflicting trajectories imminent"}
     for n in (12, 13, 14)
 )  # fmt: skip
@@ -407,7 +465,10 @@ def test_every_prompt_keeps_its_token_budget(
         for viewer, seen in scene.graphs.items():
             if messages and seen.role == "helper":
                 continue
-            n = count(prompt.render(seen, small.actions, messages, CROSSING)) + bool(prompt.image) * PICTURE
+            n = (
+                count(prompt.render(seen, small.actions, messages, CROSSING))
+                + bool(prompt.image) * PICTURE
+            )
             assert least <= n <= most, f"{version} {scene.id} {viewer}: {n} tokens"
 
 
@@ -416,7 +477,9 @@ def test_every_prompt_keeps_its_token_budget(
 def test_no_evidence_takes_a_fusion_call_over_its_budget(
     version: str, senders: int, small: Dataset, vocabulary: Path
 ) -> None:
-    """v1 and v2 exceed 400 tokens here: three messages of 40 characters have no room for a token each."""
+    """v1 and v2 exceed 400 tokens here:
+    three messages of 40 characters have no room for a token each.
+    """
     prompt, count = prompts.load(version), counter(vocabulary)
     assert count is not None
     assert count([{"content": EVIDENCE}]) == len(EVIDENCE)
@@ -436,7 +499,9 @@ def test_tokens_decode_to_the_prompt_and_every_digit_is_one(
     said = text_of(prompts.load(version).render(CASES[case][0], ACTIONS, CASES[case][1], CROSSING))
     encoded = qwen.encode(said)
     assert qwen.decode(encoded.ids) == said
-    assert [t for t in encoded.tokens if any(c.isdigit() for c in t)] == [c for c in said if c.isdigit()]
+    assert [t for t in encoded.tokens if any(c.isdigit() for c in t)] == [
+        c for c in said if c.isdigit()
+    ]
 
 
 def test_a_version_saved_with_byte_order_marks_is_the_same_version(copied: Path) -> None:
@@ -466,7 +531,8 @@ def test_without_a_scene_the_datasets_first_is_shown(
 ) -> None:
     first = next(iter(load(small_path).forest.place))
     shown = [
-        harness("prompt", "show", "v2", "--dataset", small_path, *more) for more in ((), ("--scene", first))
+        harness("prompt", "show", "v2", "--dataset", small_path, *more)
+        for more in ((), ("--scene", first))
     ]
     assert shown[0] == shown[1]
     assert shown[0][0] == 0

@@ -1,4 +1,6 @@
-"""What a signal loses: played by hand against the sources' equations, with the figures they are known by."""
+"""What a signal loses: played by hand against the sources' equations,
+with the figures they are known by.
+"""
 
 from dataclasses import replace
 
@@ -51,7 +53,9 @@ def test_snr_at_50_m():
 
 
 def test_round_the_corner():
-    """93.2 dB at 20 m from the crossing, 114.2 dB at 50 m; TR 37.885's NLOS law has 95.0 and 106.9."""
+    """93.2 dB at 20 m from the crossing, 114.2 dB at 50 m;
+    TR 37.885's NLOS law has 95.0 and 106.9.
+    """
     for metres, corner, nlos in ((20, 93.2, 95.0), (50, 114.2, 106.9)):
         straight = metres * np.sqrt(2)
         assert at(URBAN, straight, BUILDING, [metres, metres]) == pytest.approx(corner, abs=0.06)
@@ -61,7 +65,8 @@ def test_round_the_corner():
 def test_a_corner_is_reciprocal_and_falls_off_faster_beyond_the_breakpoint():
     assert at(URBAN, 60, BUILDING, [20, 50]) == pytest.approx(at(URBAN, 60, BUILDING, [50, 20]))
     near, far = (at(URBAN, d, BUILDING, [20, d]) for d in (200, 400))
-    # Beyond the breakpoint the far end counts squared as receiver, and with the power 0.957 as transmitter.
+    # Beyond the breakpoint the far end counts squared as receiver, and with the power 0.957 as
+    # transmitter.
     assert far - near == pytest.approx(26.9 * (2 + 0.957) / 2 * np.log10(2))
 
 
@@ -70,11 +75,14 @@ def test_at_the_corner_itself_the_street_s_own_law_holds():
 
 
 @pytest.mark.parametrize(
-    ("antenna_m", "mean_db", "deviation_db"), [(1.5, 9.0, 4.5), (1.6, 5.0, 4.0), (1.7, -np.inf, 1.0)]
+    ("antenna_m", "mean_db", "deviation_db"),
+    [(1.5, 9.0, 4.5), (1.6, 5.0, 4.0), (1.7, -np.inf, 1.0)],
 )
 def test_a_vehicle_between_adds_the_clipped_normal_of_its_heights(antenna_m, mean_db, deviation_db):
     law = replace(URBAN, antenna_m=antenna_m)
-    drawn = np.maximum(0, np.random.default_rng(0).normal(max(mean_db, -1e9), deviation_db, 400_000))
+    drawn = np.maximum(
+        0, np.random.default_rng(0).normal(max(mean_db, -1e9), deviation_db, 400_000)
+    )
     added = at(law, 100, VEHICLE) - at(law, 100)
     assert added == pytest.approx(drawn.mean(), abs=0.03)
     assert law.shadowing_db(VEHICLE) == pytest.approx(np.hypot(3, drawn.std()), abs=0.03)
@@ -92,7 +100,9 @@ def test_each_link_has_the_vehicle_that_stands_in_it():
 
 def test_shadowing():
     corner = np.array([[20.0, 20.0], [np.nan, np.nan]])
-    np.testing.assert_allclose(URBAN.shadowing_db(np.array([BUILDING, BUILDING]), None, corner), [4.1, 4.0])
+    np.testing.assert_allclose(
+        URBAN.shadowing_db(np.array([BUILDING, BUILDING]), None, corner), [4.1, 4.0]
+    )
     assert float(URBAN.shadowing_db()) == 3.0
     assert [law.decorrelation_m for law in (HIGHWAY, URBAN, WINNER)] == [25, 10, 10]
 
@@ -102,7 +112,9 @@ def test_share_of_clear_links():
     np.testing.assert_allclose(WINNER.clear_probability(far), 1.0)
     np.testing.assert_allclose(URBAN.clear_probability(far)[:2], [1.0, 1.05 * np.exp(-1.14)])
     np.testing.assert_allclose(
-        HIGHWAY.clear_probability(far), [1.0, 0.021013 - 0.2 + 1.0193, 0.5434, 0.415, 0.0], atol=1e-3
+        HIGHWAY.clear_probability(far),
+        [1.0, 0.021013 - 0.2 + 1.0193, 0.5434, 0.415, 0.0],
+        atol=1e-3,
     )
 
 

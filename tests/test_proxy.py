@@ -42,7 +42,9 @@ speeds = st.floats(0, 20).map(lambda x: round(x, 1))
 
 @st.composite
 def conflicts(draw: st.DrawFn) -> Conflict:
-    sector, route = draw(st.sampled_from([("left", "straight"), ("right", "straight"), ("oncoming", "left")]))
+    sector, route = draw(
+        st.sampled_from([("left", "straight"), ("right", "straight"), ("oncoming", "left")])
+    )
     return Conflict(
         f"v{draw(st.integers(2, 99))}", sector, route, Point(draw(tenths), draw(tenths)),
         EgoArrival(draw(tenths), draw(seconds)), Arrival(draw(tenths), draw(seconds), draw(speeds)),
@@ -93,7 +95,9 @@ def test_it_gives_a_distribution_in_hundredths_that_sums_to_one(graph: SceneGrap
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(graphs(), st.data())
 def test_every_answer_is_what_its_prompt_asks_for(graph: SceneGraph, data: st.DataObject) -> None:
-    """A prompt that asks for a distribution has JSON alone; one that asks for reasons has them first."""
+    """A prompt that asks for a distribution has JSON alone;
+    one that asks for reasons has them first.
+    """
     form = data.draw(st.sampled_from(FORMS[graph.role]))
     asked = request(graph, form)
     parsed = parse(answers([asked])[0], **asked.shape._asdict())
@@ -171,7 +175,9 @@ def test_without_a_view_it_has_nothing_to_say() -> None:
 
 
 def test_a_quarter_of_a_sector_hidden_leaves_it_just_sure_enough() -> None:
-    """SLOWER .05 + .33/4 = .1325, the third action .10, the planned one the rest .7675: 0.697 nats."""
+    """SLOWER .05 + .33/4 = .1325, the third action .10, the planned one the rest .7675:
+    0.697 nats.
+    """
     graph = SceneGraph(
         "v1", "ego", 0, Viewer(14.0, "approach-own", 60.0), Ego("v1", 14.0, 14.0, 0.0, 60.0, 0.0, 0.0),
         (), (), (Sector("left", 0.75, False, ("b1",)),),

@@ -64,7 +64,9 @@ def test_every_failure_has_its_status_whatever_was_answered(
     assert {request.role for request in asked} == {"ego", "helper"}
     for request in asked:
         text, finish_reason = spoil(answers([request])[0], how, request.actions)
-        parsed = parse(text, role=request.role, actions=request.actions, finish_reason=finish_reason)
+        parsed = parse(
+            text, role=request.role, actions=request.actions, finish_reason=finish_reason
+        )
         assert parsed.status == STATUS[how], text
 
 
@@ -103,11 +105,15 @@ def test_never_is_never_and_always_is_always(share: float) -> None:
 
 @pytest.mark.exhaustive
 def test_the_intervals_cover_the_declared_rate_as_often_as_they_say() -> None:
-    """The failed rate of 400 runs of 150 answers each, by the interval of the summary: 95 % of them."""
+    """The failed rate of 400 runs of 150 answers each, by the interval of the summary:
+    95 % of them.
+    """
     truth = sum(share for how, share in FAULTY.texts.items() if how in FAILED)
     covered = 0
     for start in range(0, 400 * 150, 150):
-        failed = np.array([float(draw_failure(FAULTY, name)[0] in FAILED) for name in made_up(150, start)])
+        failed = np.array(
+            [float(draw_failure(FAULTY, name)[0] in FAILED) for name in made_up(150, start)]
+        )
         interval = rate_interval(failed)
         covered += interval.low <= truth <= interval.high
     assert 0.92 <= covered / 400 <= 0.99
@@ -147,7 +153,9 @@ def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_neither_batches_nor_a_replay_nor_company_change_a_failure(small: Dataset, tmp_path: Path) -> None:
+def test_neither_batches_nor_a_replay_nor_company_change_a_failure(
+    small: Dataset, tmp_path: Path
+) -> None:
     run(spec_of(small, "proxy-faulty"), tmp_path / "run")
     run(spec_of(small, "proxy-faulty", batch_size=1), tmp_path / "single")
     run(spec_of(small, f"replay:{tmp_path / 'run'}"), tmp_path / "again")

@@ -1,4 +1,6 @@
-"""A published dataset: what stands in its tables is what the trees say, and other programs load it."""
+"""A published dataset: what stands in its tables is what the trees say,
+and other programs load it.
+"""
 
 import json
 import shutil
@@ -47,7 +49,11 @@ def test_a_row_has_what_the_trees_say_of_its_decision_point(
 ) -> None:
     forest = small.forest
     assert [row["scene"] for row in rows] == list(forest.ids)
-    for name, table in (("safe", forest.safe), ("avoids_harm", forest.avoids_harm), ("value", forest.worth)):
+    for name, table in (
+        ("safe", forest.safe),
+        ("avoids_harm", forest.avoids_harm),
+        ("value", forest.worth),
+    ):
         np.testing.assert_array_equal([row[name] for row in rows], table)
     delays_s = np.array([row["delay_s"] for row in rows], dtype=float)  # null becomes NaN
     np.testing.assert_array_equal(delays_s, forest.delay_s)
@@ -56,7 +62,9 @@ def test_a_row_has_what_the_trees_say_of_its_decision_point(
     assert {tuple(row["actions"]) for row in rows} == {small.actions}
 
 
-def test_an_episode_can_be_played_from_the_table_alone(rows: list[dict[str, Any]], small: Dataset) -> None:
+def test_an_episode_can_be_played_from_the_table_alone(
+    rows: list[dict[str, Any]], small: Dataset
+) -> None:
     points = {row["scene"]: row for row in rows}
     for driver in small.forest.drivers:
         successes = []
@@ -86,12 +94,17 @@ def test_a_row_shows_what_the_ego_is_asked_and_what_each_viewer_knows(
     assert len(json.loads(row["state"])["vehicles"]) == len(scene.state.vehicles)
 
 
-def test_the_card_and_the_croissant_file_name_every_table_and_column(published: Path, small: Dataset) -> None:
+def test_the_card_and_the_croissant_file_name_every_table_and_column(
+    published: Path, small: Dataset
+) -> None:
     [_, head, text] = (published / "README.md").read_text().split("---\n", 2)
     [config] = yaml.safe_load(head)["configs"]
     [part] = config["data_files"]
     assert (config["config_name"], part["split"]) == ("small", "validation")  # tune seeds
-    assert (yaml.safe_load(head)["license"], yaml.safe_load(head)["size_categories"]) == ("unknown", ["n<1K"])
+    assert (yaml.safe_load(head)["license"], yaml.safe_load(head)["size_categories"]) == (
+        "unknown",
+        ["n<1K"],
+    )
     assert "quote no result" in text
     assert small.sha256 in text
     document = json.loads((published / "croissant.json").read_text())
@@ -105,7 +118,13 @@ def test_the_card_and_the_croissant_file_name_every_table_and_column(published: 
 
 @pytest.mark.parametrize(
     ("rows", "word"),
-    [(1, "n<1K"), (1000, "1K<n<10K"), (22_761, "10K<n<100K"), (10**6, "1M<n<10M"), (10**9, "n>100M")],
+    [
+        (1, "n<1K"),
+        (1000, "1K<n<10K"),
+        (22_761, "10K<n<100K"),
+        (10**6, "1M<n<10M"),
+        (10**9, "n>100M"),
+    ],
 )
 def test_the_size_of_a_dataset_is_the_hubs_word(rows: int, word: str) -> None:
     assert hub_size(rows) == word
@@ -151,7 +170,10 @@ def test_a_suite_is_a_table_for_each_dataset_under_names_that_are_checked(
     assert harness("dataset", "export", "suite:both", "--out", "both")[0] == 0
     head = yaml.safe_load((tmp_path / "both/README.md").read_text().split("---\n")[1])
     assert [config["config_name"] for config in head["configs"]] == ["small", "two"]
-    assert {path.name for path in (tmp_path / "both/data").iterdir()} == {"small.parquet", "two.parquet"}
+    assert {path.name for path in (tmp_path / "both/data").iterdir()} == {
+        "small.parquet",
+        "two.parquet",
+    }
     for suite, says in (("twice", "two datasets are named two"), ("../\x1b[31m", "cannot name")):
         code, _, err = harness("dataset", "export", f"suite:{suite}", "--out", "new")
         assert (code, err.count("\n"), says in err, "\x1b" in err) == (2, 1, True, False)
@@ -176,7 +198,9 @@ def test_the_tools_of_others_read_the_folder(
     datasets = pytest.importorskip("datasets")
     hub = pytest.importorskip("huggingface_hub")
     assert hub.DatasetCard.load(published / "README.md").data.pretty_name == "small"
-    loaded = datasets.load_dataset(str(published), "small", split="validation", cache_dir=str(tmp_path))
+    loaded = datasets.load_dataset(
+        str(published), "small", split="validation", cache_dir=str(tmp_path)
+    )
     assert loaded.num_rows == small.nodes
     assert loaded[0]["safe"] == small.forest.safe[0].tolist()
     assert loaded[0]["prompt"][0]["role"] == "system"
@@ -184,7 +208,9 @@ def test_the_tools_of_others_read_the_folder(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of others
-def test_mlcroissant_accepts_the_file_and_reads_every_record(published: Path, small: Dataset) -> None:
+def test_mlcroissant_accepts_the_file_and_reads_every_record(
+    published: Path, small: Dataset
+) -> None:
     croissant = pytest.importorskip("mlcroissant")
     data = croissant.Dataset(published / "croissant.json")
     assert not data.metadata.ctx.issues.errors

@@ -1,4 +1,6 @@
-"""`harness model pull`, from a hub of our own: what is fetched, what is not, and what a hub refuses."""
+"""`harness model pull`, from a hub of our own:
+what is fetched, what is not, and what a hub refuses.
+"""
 
 import os
 import socket
@@ -28,10 +30,19 @@ CHECKPOINT: Mapping[str, bytes | None] = {
 def harness(
     home: Path, endpoint: str, *arguments: str, cwd: Path | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """A command line in a process of its own, since the hub's package reads its address when it loads."""
-    environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1"}
+    """A command line in a process of its own,
+    since the hub's package reads its address when it loads.
+    """
+    environment = {
+        **os.environ,
+        "HF_ENDPOINT": endpoint,
+        "HF_HOME": str(home),
+        "HF_HUB_DISABLE_XET": "1",
+    }
     command = [sys.executable, "-m", "harness", "model", *arguments]
-    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, env=environment, cwd=cwd, capture_output=True, text=True, check=False
+    )
 
 
 def snapshot(home: Path, repository: str) -> Path:
@@ -45,7 +56,12 @@ def test_a_checkpoint_is_fetched_once_without_what_nobody_loads(tmp_path: Path) 
             done = harness(tmp_path, hub.url, "pull", "some/model")
             assert (done.returncode, done.stderr) == (0, "")
             assert str(snapshot(tmp_path, "some/model")) in done.stdout
-    assert sorted(hub.asked) == ["chat_template.jinja", "config.json", "model.safetensors", "tokenizer.json"]
+    assert sorted(hub.asked) == [
+        "chat_template.jinja",
+        "config.json",
+        "model.safetensors",
+        "tokenizer.json",
+    ]
     fetched = snapshot(tmp_path, "some/model") / "model.safetensors"
     assert fetched.read_bytes() == CHECKPOINT["model.safetensors"]
 
@@ -69,7 +85,10 @@ def test_of_a_repository_of_gguf_files_the_cards_one_is_fetched_and_held_to_its_
         done = harness(tmp_path, hub.url, "pull", "qwen3-4b", "--engine", "llama-cpp")
         assert (done.returncode, hub.asked) == (2, ["Qwen3-4B-Q4_K_M.gguf"])
     assert "model 'qwen3-4b:llama-cpp': " in done.stderr
-    assert f"is not what its card says: sha256 {sha256_bytes(b'GGUF')}, and the card has 7485" in done.stderr
+    assert (
+        f"is not what its card says: sha256 {sha256_bytes(b'GGUF')}, and the card has 7485"
+        in done.stderr
+    )
     assert done.stderr.count("\n") == 1
 
 
@@ -95,7 +114,9 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
     card = Card("mine", "llama-cpp", "d", latency, weights=str(file), sha256=sha256_bytes(b"GGUF"))
     assert check_digest(card, file) == file
     file.write_bytes(b"GGUX")
-    with pytest.raises(UserError, match=r"is not what its card says: sha256 [0-9a-f]{64}, and the card has"):
+    with pytest.raises(
+        UserError, match=r"is not what its card says: sha256 [0-9a-f]{64}, and the card has"
+    ):
         check_digest(card, file)
 
 
@@ -104,7 +125,10 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
     ("repositories", "said"),
     [
         ({}, "there is no {url}/some/model, or it is private; see `hf auth login`"),
-        ({"some/model": {}}, "{url}/some/model asks for its licence to be accepted; do so on that page"),
+        (
+            {"some/model": {}},
+            "{url}/some/model asks for its licence to be accepted; do so on that page",
+        ),
         ({"some/model": {"config.json": b"{}"}}, "has no weights (*.safetensors)"),
         (
             {"some/model": {**CHECKPOINT, "model.safetensors": None}},

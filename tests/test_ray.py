@@ -76,18 +76,27 @@ def test_a_run_has_the_bytes_of_one_process_where_its_command_is_killed_and_goes
         assert (tmp_path / "killed" / name).read_bytes() == (whole / name).read_bytes(), name
 
 
-def test_a_command_that_is_terminated_while_it_connects_says_so(cluster: Any, tmp_path: Path) -> None:
-    """Ray has a handler of its own until it is connected: here the connection waits, and then it comes."""
+def test_a_command_that_is_terminated_while_it_connects_says_so(
+    cluster: Any, tmp_path: Path
+) -> None:
+    """Ray has a handler of its own until it is connected:
+    here the connection waits, and then it comes.
+    """
     waits = (
         "import os, signal, ray\n"
         "ray.init = lambda **options: ("
-        "signal.signal(signal.SIGTERM, lambda number, frame: exit(number)), os.kill(os.getpid(), 15))\n"
+        "signal.signal(signal.SIGTERM, lambda number, frame: exit(number)), os.kill(os.getpid(), "
+        "15))\n"
         "from harness.__main__ import main\n"
         "main()\n"
     )
     command = [*DRIVE, "--workers", "ray", "--out", "run"]
     done = subprocess.run(
-        [sys.executable, "-c", waits, *command], cwd=tmp_path, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", waits, *command],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert (done.returncode, done.stderr) == (143, "harness: terminated\n")
 
@@ -110,13 +119,17 @@ def test_what_kills_its_worker_three_times_is_named_and_the_rest_is_done(
     cluster: Any, tmp_path: Path
 ) -> None:
     taken: dict[int, int] = {}
-    with pytest.raises(Unfinished, match=r"^2: the worker was killed 3 times, .*; the other 5 are done$"):
+    with pytest.raises(
+        Unfinished, match=r"^2: the worker was killed 3 times, .*; the other 5 are done$"
+    ):
         each(partial(dies, tmp_path), range(6), Ray(), taken.__setitem__)
     assert taken == {n: n for n in (0, 1, 3, 4, 5)}
     assert len(list(tmp_path.iterdir())) == TRIES
 
 
-def test_an_error_of_the_works_own_is_raised_and_never_tried_again(cluster: Any, tmp_path: Path) -> None:
+def test_an_error_of_the_works_own_is_raised_and_never_tried_again(
+    cluster: Any, tmp_path: Path
+) -> None:
     for name, kind, said in (
         ("user", UserError, r"^node 127\.0\.0\.1 \(\w{8}\): the weights are missing$"),
         ("bug", ZeroDivisionError, "^a bug$"),
@@ -127,11 +140,16 @@ def test_an_error_of_the_works_own_is_raised_and_never_tried_again(cluster: Any,
         assert len(list((tmp_path / name).glob("1-*"))) == 1
 
 
-def test_another_version_is_named_with_its_node(cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_version_is_named_with_its_node(
+    cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ours = node_versions()
     for changed, said in (
         ({**ours, "numpy": "1.0"}, rf"numpy {ours['numpy']}, not 1\.0"),
-        ({**ours, "source of harness": "0" * 12}, rf"source of harness {ours['source of harness']}, not 0+"),
+        (
+            {**ours, "source of harness": "0" * 12},
+            rf"source of harness {ours['source of harness']}, not 0+",
+        ),
         ({**ours, "torch-of-mine": "3"}, "torch-of-mine missing, not 3"),
     ):
         monkeypatch.setattr(ray_tasks, "node_versions", lambda changed=changed: changed)
@@ -170,7 +188,16 @@ def test_what_is_still_worked_on_ends_with_an_error(cluster: Any, tmp_path: Path
 
 
 def test_no_cluster_at_an_address_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "harness", *DRIVE, "--workers", "ray:127.0.0.1:1", "--out", "none"]
+    command = [
+        sys.executable,
+        "-m",
+        "harness",
+        *DRIVE,
+        "--workers",
+        "ray:127.0.0.1:1",
+        "--out",
+        "none",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "--workers ray: no cluster at 127.0.0.1:1" in done.stderr

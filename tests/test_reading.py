@@ -1,4 +1,6 @@
-"""One reader opens every file: a regular one, of bounded size, without a wait; and nothing else reads."""
+"""One reader opens every file: a regular one, of bounded size, without a wait;
+and nothing else reads.
+"""
 
 import ast
 import os
@@ -24,7 +26,8 @@ from harness.runs.listing import runs as runs_in
 SOURCES = Path(package.__file__).parent
 Command = Callable[..., tuple[int, str, str]]
 TRACE = (
-    'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n[parameters]\nfile = "points.csv"'
+    'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n[parameters]\nfile = '
+    '"points.csv"'
 )
 # Where another exit code than 2 is right: a verdict; or what is no file is as good as not there.
 ELSE = {"small/layouts.zip": 1, "begun/.work/config.json": 0, "models/mine.toml": 0}
@@ -131,7 +134,15 @@ READ: dict[str, tuple[str, ...]] = {
     "curves.csv": ("radio", "check", "mode4", "--against", "curves.csv"),
     "config.json": ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", "1"),
     "answer.txt": ("prompt", "parse", "answer.txt"),
-    "tokenizer.json": ("prompt", "check", "v2", "--dataset", "small", "--tokenizer", "tokenizer.json"),
+    "tokenizer.json": (
+        "prompt",
+        "check",
+        "v2",
+        "--dataset",
+        "small",
+        "--tokenizer",
+        "tokenizer.json",
+    ),
     "small/manifest.json": ("dataset", "check", "small"),
     "small/layouts.zip": ("dataset", "check", "small"),
     "begun/.work/config.json": ("eval", "--dataset", "small", "--limit", "1", "--out", "begun"),
@@ -189,19 +200,24 @@ def test_a_table_of_few_bytes_and_a_thousand_million_rows_is_refused(tmp_path: P
     table = pq.read_table(file)
     rows = pa.concat_tables([table.slice(0, 1)] * 1_000).combine_chunks()
     pq.write_table(pa.concat_tables([rows] * 100), file, compression="zstd")  # 100 000
-    with pytest.raises(UserError, match=f"100000 rows; {2 * 10 * len(runs.read(run).episodes)} is the most"):
+    with pytest.raises(
+        UserError, match=f"100000 rows; {2 * 10 * len(runs.read(run).episodes)} is the most"
+    ):
         _ = runs.read(run).decisions
     text = pa.array(["x" * 70_000_000]).dictionary_encode()
     wide = table.slice(0, 1).set_column(table.column_names.index("danger"), "danger", text)
     pq.write_table(
-        pa.concat_tables([table.slice(1), wide], promote_options="permissive"), file, compression="zstd"
+        pa.concat_tables([table.slice(1), wide], promote_options="permissive"),
+        file,
+        compression="zstd",
     )
     assert file.stat().st_size < 1 << 20
     with pytest.raises(UserError, match="more bytes than decisions need"):
         _ = runs.read(run).decisions
 
 
-# What opens a file by itself: a name of a function or a method, and what must be its first argument's mode.
+# What opens a file by itself: a name of a function or a method, and what must be its first
+# argument's mode.
 READERS = {
     "read_bytes", "read_text", "open", "ZipFile", "read_csv", "read_table", "OSFile", "memory_map",
     "from_file", "load_file", "GGUFReader", "loadtxt", "fromfile", "memmap", "FileIO", "copyfile", "copytree",
@@ -228,18 +244,28 @@ def direct_reads(source: Path) -> list[str]:
             continue
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         words = [
-            a.value for a in [*node.args, *(k.value for k in node.keywords)] if isinstance(a, ast.Constant)
+            a.value
+            for a in [*node.args, *(k.value for k in node.keywords)]
+            if isinstance(a, ast.Constant)
         ]
         writes = any(
-            (isinstance(word, str) and word[:1] in ("w", "a", "x")) or word == "r+b" for word in words
+            (isinstance(word, str) and word[:1] in ("w", "a", "x")) or word == "r+b"
+            for word in words
         )
         given = node.args[0] if node.args else None
         # What is handed bytes or an open file opens none.
-        of_bytes = isinstance(given, ast.Call) and getattr(given.func, "id", "") in ("BytesIO", "StringIO")
-        of_file = (
-            isinstance(given, ast.Name) and name in ("ZipFile", "read_csv") and given.id in ("data", "lines")
+        of_bytes = isinstance(given, ast.Call) and getattr(given.func, "id", "") in (
+            "BytesIO",
+            "StringIO",
         )
-        ours = name == "open" and isinstance(node.func, ast.Attribute) and not is_path(node.func.value)
+        of_file = (
+            isinstance(given, ast.Name)
+            and name in ("ZipFile", "read_csv")
+            and given.id in ("data", "lines")
+        )
+        ours = (
+            name == "open" and isinstance(node.func, ast.Attribute) and not is_path(node.func.value)
+        )
         if name in READERS and not (writes or of_bytes or of_file or ours):
             found.append(f"{node.lineno}: {ast.unparse(node)}")
     return found

@@ -40,7 +40,10 @@ def test_each_answer_is_parsed_as_it_was() -> None:
         lines = "".join(json.dumps(record, ensure_ascii=False) + "\n" for record in found)
         FILE.write_bytes(lzma.compress(lines.encode(), preset=9))
     changed = [
-        (one["id"], {name: (before.get(name), one[name]) for name in SAID if before.get(name) != one[name]})
+        (
+            one["id"],
+            {name: (before.get(name), one[name]) for name in SAID if before.get(name) != one[name]},
+        )
         for before, one in zip(records, found, strict=True)
         if before != one
     ]

@@ -1,4 +1,5 @@
-"""Runs of earlier commits, kept under `records/`, are read by every command, or one line says why not.
+"""Runs of earlier commits, kept under `records/`, are read by every command,
+or one line says why not.
 
 `records/make.py` made them, each with the program of its commit.
 """
@@ -38,7 +39,9 @@ Typed = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def kept(tmp_path: Path) -> Callable[[str], Path]:
     """A kept run, or all of a commit, in a folder that a command may write to."""
-    return lambda name: Path(shutil.copytree(HERE / name, tmp_path / "kept" / name, dirs_exist_ok=True))
+    return lambda name: Path(
+        shutil.copytree(HERE / name, tmp_path / "kept" / name, dirs_exist_ok=True)
+    )
 
 
 def test_records_are_of_three_commits_and_small() -> None:
@@ -62,8 +65,8 @@ READERS = {
 }
 
 
-# A run of each kind, and one of each commit. Of the others `run check` reads all that there is, and the
-# other commands do in `make exhaustive`.
+# A run of each kind, and one of each commit. Of the others `run check` reads all that there is, and
+# the other commands do in `make exhaustive`.
 SOME = ("356ad2b/drive", "356ad2b/proxy", "8cccefb/mixed", "0103f23/attack")
 
 
@@ -75,7 +78,10 @@ def tier(run: str, command: str) -> tuple[pytest.MarkDecorator, ...]:
 
 @pytest.mark.parametrize(
     ("run", "command"),
-    [pytest.param(run, command, marks=tier(run, command)) for run, command in product(RUNS, READERS)],
+    [
+        pytest.param(run, command, marks=tier(run, command))
+        for run, command in product(RUNS, READERS)
+    ],
 )
 def test_commands_read_every_run(run: str, command: str, harness: Typed) -> None:
     code, _, error = harness(*READERS[command].format(run=HERE / run).split())
@@ -86,15 +92,18 @@ STUDIES = {
     "sft": "run export {run} --sft out.jsonl --report-seeds-too",
     "dpo": "run export {run} --dpo out.jsonl --report-seeds-too",
     "sweep": "study sweep {run} --over loss --grid 0,0.5 --seeds 0 --no-model --quiet",
-    "trust": "study trust {run} --attacks liar --rules median --share 1/3 --seeds 0 --no-model --quiet",
+    "trust": "study trust {run} --attacks liar --rules median "
+    "--share 1/3 --seeds 0 --no-model --quiet",
     "schedule": "study schedule compare {run} --schedule random --seeds 0 --quiet",
     "attribute": "study attribute {run} --sample 1 --quiet",
     "replay": f"eval --model replay:{{run}} --dataset {DATASET} {{same}} --quiet --out replayed",
 }
 SAME = {
-    "356ad2b/proxy": "--limit 2 --seeds 0,1 --condition single-local --condition v2x --condition 6g",
+    "356ad2b/proxy": "--limit 2 --seeds 0,1 --condition "
+    "single-local --condition v2x --condition 6g",
     "8cccefb/mixed": "--limit 2 --seeds 0 --condition 6g --helper-model replay:{run}",
-    "0103f23/attack": "--limit 2 --seeds 0,1 --condition 6g --condition 6g:consensus=trust --attack liar",
+    "0103f23/attack": "--limit 2 --seeds 0,1 --condition 6g "
+    "--condition 6g:consensus=trust --attack liar",
 }
 
 
@@ -122,13 +131,17 @@ def test_studies_read_frozen_runs(
     path = kept(run)
     if command in ("sft", "dpo"):
         pytest.importorskip("harness.extensions.learn")
-    code, _, error = harness(*STUDIES[command].format(run=path, same=SAME[run].format(run=path)).split())
+    code, _, error = harness(
+        *STUDIES[command].format(run=path, same=SAME[run].format(run=path)).split()
+    )
     assert (code, error) == (0, "")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", ["356ad2b/proxy", "0103f23/attack"])
-def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], harness: Typed) -> None:
+def test_a_replay_decides_as_the_run_did(
+    run: str, kept: Callable[[str], Path], harness: Typed
+) -> None:
     again = f"{SAME[run]} --dataset {DATASET} --ties first --quiet --out again"
     harness("eval", "--model", f"replay:{kept(run)}", *again.split())
     old, new = (folder.read(path).decisions for path in (HERE / run, Path("again")))
@@ -137,7 +150,9 @@ def test_a_replay_decides_as_the_run_did(run: str, kept: Callable[[str], Path], 
 
 def opened(reports: Path) -> TestClient:
     """A browser that may see a folder of runs."""
-    view, access = (pytest.importorskip(f"harness.extensions.view.{name}") for name in ("app", "access"))
+    view, access = (
+        pytest.importorskip(f"harness.extensions.view.{name}") for name in ("app", "access")
+    )
     cookies = {access.cookie(7654): "token"}
     return TestClient(view.app(reports, "token"), base_url="http://127.0.0.1:7654", cookies=cookies)
 
@@ -187,16 +202,22 @@ def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None
         assert why in error
 
 
-BEGUN = "drive --model local-view --episodes 40 --seeds 0 --workers 1 --condition single-local --quiet"
+BEGUN = (
+    "drive --model local-view --episodes 40 --seeds 0 --workers 1 --condition single-local --quiet"
+)
 
 
 @pytest.mark.parametrize(
     "commit",
-    [pytest.param("8cccefb", marks=pytest.mark.exhaustive), pytest.param("0103f23", marks=pytest.mark.slow)],
+    [
+        pytest.param("8cccefb", marks=pytest.mark.exhaustive),
+        pytest.param("0103f23", marks=pytest.mark.slow),
+    ],
 )
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
-    """The part that it had is taken as it is. Its bare name has come to mean other scenes, and its parser
-    read answers otherwise, so that it goes on only where it says that it has the present one.
+    """The part that it had is taken as it is. Its bare name has come to mean other scenes, and its
+    parser read answers otherwise, so that it goes on only where it says that it has the present
+    one.
     """
     begun = kept(f"{commit}/begun")
     [part] = begun.glob(".work/episodes-*/answers.jsonl")
@@ -207,7 +228,10 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     assert "with --scenario occluded-intersection:limits=2" in error
     code, _, error = harness(*typed, "--scenario", NAME)
     assert (code, error.count("\n")) == (2, 1)
-    assert "was begun with another version of parser; repeat its settings (version of parser 1)" in error
+    assert (
+        "was begun with another version of parser; repeat its settings (version of parser 1)"
+        in error
+    )
     config = begun / ".work/config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"versions": versions()}))
     code, _, error = harness(*typed, "--scenario", NAME)
@@ -216,7 +240,9 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     assert (begun / "answers.jsonl").read_bytes().startswith(answers)
 
 
-def test_a_begun_run_of_the_first_commit_is_refused(kept: Callable[[str], Path], harness: Typed) -> None:
+def test_a_begun_run_of_the_first_commit_is_refused(
+    kept: Callable[[str], Path], harness: Typed
+) -> None:
     """It has a digest of its model's identity, and its parts are single episodes."""
     code, _, error = harness(*BEGUN.split(), "--out", kept("356ad2b/begun"))
     assert (code, error.count("\n")) == (2, 1)
@@ -232,8 +258,12 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
     with (HERE / run / "episodes.csv").open() as file:
         head = next(csv.reader(file))
     of_extensions = {key for kind in more_parts().values() for key in kind.__struct_fields__}
-    condition, manifest = {*OperatingPoint.types()} - of_extensions, set(records.Manifest.__struct_fields__)
-    # Letters are a setting of the agent; an adapter, a price and a cost are stated where there is one.
+    condition, manifest = (
+        {*OperatingPoint.types()} - of_extensions,
+        set(records.Manifest.__struct_fields__),
+    )
+    # Letters are a setting of the agent; an adapter, a price and a cost are stated where there is
+    # one.
     card = {field.name for field in fields(Card)} - {"letters", "adapter", "price"}
     lacks = {
         "MANIFEST": manifest - {*stated, *formats.AGENT, *formats.BESIDE, "settings", "cost"},
@@ -242,25 +272,36 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
         "MODEL": card - {*stated["model"]},
         "CONDITION": set.union(*(condition - {*point} for point in stated["conditions"])),
         "COLUMNS": {
-            re.sub(r"_\d+$", "", name) for name in set(schema(stated["actions"], helpers).names) - {*columns}
+            re.sub(r"_\d+$", "", name)
+            for name in set(schema(stated["actions"], helpers).names) - {*columns}
         },
     }
     for table, names in lacks.items():
         assert names <= getattr(formats, table).keys(), f"add an entry to formats.{table}"
     assert {*records.Episode.__struct_fields__} <= {*head, *formats.EPISODE}
     with (HERE / run / "answers.jsonl").open() as lines:
-        assert {*records.Answer.__struct_fields__} <= {*json.loads(next(lines)), "heard", *formats.ANSWER}
+        assert {*records.Answer.__struct_fields__} <= {
+            *json.loads(next(lines)),
+            "heard",
+            *formats.ANSWER,
+        }
 
 
 @pytest.mark.parametrize(
     ("kind", "added"),
-    [(records.Answer, formats.ANSWER), (records.Episode, formats.EPISODE), (RunStart, formats.START)],
+    [
+        (records.Answer, formats.ANSWER),
+        (records.Episode, formats.EPISODE),
+        (RunStart, formats.START),
+    ],
 )
 def test_a_struct_has_the_defaults_that_the_table_states(kind: type, added: dict) -> None:
     stated = {field.name: field for field in msgspec.structs.fields(kind)}
     for name, entry in added.items():
         field = stated[name]
-        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        default = (
+            field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        )
         assert (formats.UNSET if default is msgspec.UNSET else default) == entry.absent
 
 

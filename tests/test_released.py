@@ -45,7 +45,8 @@ def test_a_shipped_suite_has_one_released_dataset_of_each_family(name: str) -> N
     suite = suites.named(f"suite:{name}")
     assert suite
     families = [
-        json.loads((ROOT / "datasets" / d / "manifest.json").read_text())["scenario"] for d in suite.datasets
+        json.loads((ROOT / "datasets" / d / "manifest.json").read_text())["scenario"]
+        for d in suite.datasets
     ]
     assert set(suite.datasets) <= set(DATASETS)
     assert len(set(families)) == len(families)
@@ -57,8 +58,12 @@ def test_a_shipped_prompt_is_released(version: str) -> None:
 
 
 def test_a_wheel_holds_the_newest_of_each_family_and_the_former_default() -> None:
-    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
-    held = {Path(source).name for source in wheel["force-include"] if source.startswith("datasets/")}
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"][
+        "targets"
+    ]["wheel"]
+    held = {
+        Path(source).name for source in wheel["force-include"] if source.startswith("datasets/")
+    }
     suite = suites.named("suite:v2v-safety-2")
     assert suite
     assert held & {*DATASETS} == {*suite.datasets, former.DATASET}

@@ -47,8 +47,10 @@ ONE, TWO, NONE = [True, False, False], [True, True, False], [False, False, False
     [
         ([0.7, 0.2, 0.1], ONE, 1.0, 2 * 0.3**2, -math.log(0.7)),
         ([0.2, 0.7, 0.1], ONE, 0.0, 2 * 0.8**2, -math.log(0.2)),
-        ([0.2, 0.7, 0.1], TWO, 1.0, 2 * 0.1**2, -math.log(0.9)),  # either of two; how they share is no matter
-        ([0.4, 0.2, 0.4], ONE, 0.5, 2 * 0.6**2, -math.log(0.4)),  # one of two equally likely actions
+        # either of two; how they share is no matter
+        ([0.2, 0.7, 0.1], TWO, 1.0, 2 * 0.1**2, -math.log(0.9)),
+        # one of two equally likely actions
+        ([0.4, 0.2, 0.4], ONE, 0.5, 2 * 0.6**2, -math.log(0.4)),
         ([0.0, 1.0, 0.0], ONE, 0.0, 2.0, -math.log(0.005)),  # the least probability that counts
         ([0.0, 1.0, 0.0], NONE, math.nan, math.nan, math.nan),
     ],
@@ -67,7 +69,9 @@ def judged(sure: list[float], hits: list[float], episode: list[int] | None = Non
 
 
 def test_the_calibration_error_by_hand() -> None:
-    """120 decisions make 15 bins of eight; in each four are right, and they are as sure as listed."""
+    """120 decisions make 15 bins of eight;
+    in each four are right, and they are as sure as listed.
+    """
     sure = [0.4 + 0.005 * n for n in range(120)]
     eights = [abs(0.5 - np.mean(sure[n : n + 8])) for n in range(0, 120, 8)]
     found = estimate(judged(sure, [0.0, 1.0] * 60), calibration_error, 120)
@@ -88,11 +92,14 @@ def test_equally_sure_decisions_are_in_one_bin() -> None:
 
 
 def test_coverage_by_hand() -> None:
-    """Of the 80 surest four are wrong, which is 5 %; the next three are, and then 60 more would be needed."""
+    """Of the 80 surest four are wrong, which is 5 %;
+    the next three are, and then 60 more would be needed.
+    """
     hits = [1.0] * 76 + [0.0] * 7 + [1.0] * 17
     sure = [0.99 - 0.005 * n for n in range(100)]
     assert estimate(judged(sure, hits), coverage, 100).value == 80 / 100
-    assert estimate(judged([0.9] * 100, hits), coverage, 100).value == 0.0  # all or nothing: 7 are wrong
+    # all or nothing: 7 are wrong
+    assert estimate(judged([0.9] * 100, hits), coverage, 100).value == 0.0
     assert estimate(judged(sure, [1.0] * 100), coverage, 100).value == 1.0
 
 
@@ -110,7 +117,9 @@ def test_figures_are_those_of_plain_loops(rows: list[tuple[float, bool]]) -> Non
     best, acted, wrong, gaps = 0.0, 0, 0, np.zeros(BINS)
     for level in levels:
         here = [r for r in rows if r[0] == level]
-        gaps[min(int(BINS * (acted + len(here) / 2) / len(rows)), BINS - 1)] += sum(r[1] - r[0] for r in here)
+        gaps[min(int(BINS * (acted + len(here) / 2) / len(rows)), BINS - 1)] += sum(
+            r[1] - r[0] for r in here
+        )
         acted, wrong = acted + len(here), wrong + sum(not r[1] for r in here)
         best = acted / len(rows) if wrong <= 0.05 * acted else best
     assert estimate(some, coverage, LEAST_EPISODES).value == pytest.approx(best)
@@ -129,18 +138,25 @@ def test_parts_of_a_run_are_judged_as_the_whole() -> None:
     parts = [Judged.of(p[first], optimal[first], episode[first]),
              Judged.of(p[~first], optimal[~first], episode[~first] - 20)]  # fmt: skip
     joined = Judged.joined(parts, [20, 40])
-    assert joined.episode.tolist() == whole.episode.tolist() == [n for n in range(60) for _ in (0, 1)]
+    assert (
+        joined.episode.tolist() == whole.episode.tolist() == [n for n in range(60) for _ in (0, 1)]
+    )
     assert estimate(joined, calibration_error, 60) == estimate(whole, calibration_error, 60)
     assert estimate(whole, decisions, 60).value == 120
 
 
 @pytest.fixture(scope="session")
 def trees(small: Dataset) -> tuple[Bools, Ints]:
-    """The optimal actions of all decision points of real trees, as often as it takes, and their episodes."""
+    """The optimal actions of all decision points of real trees, as often as it takes,
+    and their episodes.
+    """
     forest = small.forest
     times = LEAST_EPISODES + 2 * LEAST // int((forest.safe.sum(axis=1) == 1).sum())
-    again = np.repeat(np.arange(times), len(forest.tree))  # layouts that are alike, and not the same
-    return np.tile(forest.safe, (times, 1)), np.tile(forest.tree, times) + len(small.episodes) * again
+    # layouts that are alike, and not the same
+    again = np.repeat(np.arange(times), len(forest.tree))
+    return np.tile(forest.safe, (times, 1)), np.tile(forest.tree, times) + len(
+        small.episodes
+    ) * again
 
 
 def error(p: Floats, trees: tuple[Bools, Ints]) -> float:
@@ -159,10 +175,14 @@ def test_a_policy_that_takes_any_optimal_action_has_no_error(trees: tuple[Bools,
 
 
 @pytest.mark.parametrize("action", range(3))
-def test_a_constant_that_is_always_sure_has_what_it_is_wrong(action: int, trees: tuple[Bools, Ints]) -> None:
+def test_a_constant_that_is_always_sure_has_what_it_is_wrong(
+    action: int, trees: tuple[Bools, Ints]
+) -> None:
     optimal, _ = trees
     one = optimal[optimal.sum(axis=1) == 1]
-    assert error(np.eye(3)[np.full(len(optimal), action)], trees) == pytest.approx(1 - one[:, action].mean())
+    assert error(np.eye(3)[np.full(len(optimal), action)], trees) == pytest.approx(
+        1 - one[:, action].mean()
+    )
 
 
 def test_a_policy_that_is_as_sure_as_it_is_right_has_almost_none(trees: tuple[Bools, Ints]) -> None:
@@ -189,7 +209,9 @@ def test_differences_are_paired_and_calibrated_policies_have_a_small_error() -> 
     assert 0.08 < change.low < change.value < change.high < 0.2
     _, _, same = difference(honest, boasting, coverage, 300)  # the order of decisions is the same
     assert same.value == 0.0
-    assert (same.low, same.high) == (-3 / 300, 3 / 300), "what no resample shows may be in other episodes"
+    assert (same.low, same.high) == (-3 / 300, 3 / 300), (
+        "what no resample shows may be in other episodes"
+    )
 
 
 @pytest.mark.parametrize("n", [LEAST - 1, LEAST])
@@ -207,7 +229,9 @@ def test_of_few_decisions_only_their_number_is_known(n: int) -> None:
 def test_many_decisions_of_few_layouts_are_few() -> None:
     """Other channel seeds repeat them where nobody is heard."""
     for layouts, known in ((LEAST_EPISODES - 1, False), (LEAST_EPISODES, True)):
-        some = judged([0.9] * 20 * layouts, [1.0] * 20 * layouts, [n % layouts for n in range(20 * layouts)])
+        some = judged(
+            [0.9] * 20 * layouts, [1.0] * 20 * layouts, [n % layouts for n in range(20 * layouts)]
+        )
         found = estimate(some, calibration_error, layouts)
         assert math.isnan(found.value) is not known
     assert (found.low, found.high) == pytest.approx((0.1 - 3 / layouts, 0.1 + 3 / layouts))
@@ -225,13 +249,17 @@ OLDER = "calibration_error", "coverage_at_5_risk"
 
 
 def one_optimal_in_half(row: Row) -> None:
-    """Make IDLE the one action that is optimal at the first of two steps, and all of them at the second."""
+    """Make IDLE the one action that is optimal at the first of two steps,
+    and all of them at the second.
+    """
     row.update(dict.fromkeys(("safe_SLOWER", "safe_FASTER"), row["step"] == 1))
     row |= {"fused_SLOWER": 0.4, "fused_IDLE": 0.6}
 
 
 @pytest.mark.parametrize(("layouts", "known"), [(49, False), (50, True)])
-def test_a_run_says_of_how_many_decisions_its_figures_are(tmp_path: Path, layouts: int, known: bool) -> None:
+def test_a_run_says_of_how_many_decisions_its_figures_are(
+    tmp_path: Path, layouts: int, known: bool
+) -> None:
     """Alike in its summary, in what its page shows and in a comparison with another."""
     for name in ("a", "b"):
         made_up(tmp_path / name, decision=one_optimal_in_half, episodes=layouts)
@@ -248,7 +276,8 @@ def test_a_run_says_of_how_many_decisions_its_figures_are(tmp_path: Path, layout
         [(name, 2 * layouts) for name in run.conditions] if known else []
     )
     compared = {
-        d.metric: d.a for d in compare(pair(tmp_path / "a", tmp_path / "b")).conditions[1].differences
+        d.metric: d.a
+        for d in compare(pair(tmp_path / "a", tmp_path / "b")).conditions[1].differences
     }
     assert compared[ONE_OPTIMAL] == 2 * layouts
     assert (ECE in compared, COVERAGE in compared) == (known, known)
@@ -269,16 +298,27 @@ def test_figures_of_an_older_definition_are_read_and_not_shown(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_a_run_by_older_rules_is_held_against_these(tmp_path: Path) -> None:
-    """Version 1 knew a figure of twenty layouts, without an interval if all its decisions are alike."""
-    run = read(made_up(tmp_path / "run", decision=one_optimal_in_half, episodes=20, seeds=tuple(range(5))))
+    """Version 1 knew a figure of twenty layouts,
+    without an interval if all its decisions are alike.
+    """
+    run = read(
+        made_up(tmp_path / "run", decision=one_optimal_in_half, episodes=20, seeds=tuple(range(5)))
+    )
     assert run.score("6g", ECE) is None, "too few layouts by today's rules"
     stated = structs.replace(run.manifest, versions={"harness": "0"})
     figures = Figures.of(run.world, run.grid, run.decisions, run.episodes, list(run.answers))
     scores = figures.scores(older=True)
     [ece] = [score for score in scores if score.key == ("6g", ECE, "episodes")]
     assert (ece.value, ece.low, ece.high, ece.n) == (*[pytest.approx(0.4)] * 3, 20)
-    for change, found in (({}, 0), ({"low": None, "high": None}, 0), ({"value": 0.1}, 1), ({"low": 0.3}, 1)):
-        changed = [score if score is not ece else structs.replace(ece, **change) for score in scores]
+    for change, found in (
+        ({}, 0),
+        ({"low": None, "high": None}, 0),
+        ({"value": 0.1}, 1),
+        ({"low": 0.3}, 1),
+    ):
+        changed = [
+            score if score is not ece else structs.replace(ece, **change) for score in scores
+        ]
         (run.path / "run.json").write_bytes(msgspec.json.encode(stated))
         (run.path / "summary.csv").write_text(csv_text(Score, changed, stated.variant))
         assert len(list(contradictions(read(run.path)))) == found

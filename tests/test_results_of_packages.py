@@ -29,7 +29,9 @@ LINKS = Links(HEARD, ONE, ONE, ONE, HEARD, HEARD)
 DELIVERED = Delivery(HEARD, *np.ones((3, 2, 1)))
 SAID = Intents(P, np.full((2, 2, 2), 0.5), np.ones((2, 2), dtype=bool), np.ones((2, 3)), 2 * P, 2 * P,
                np.ones((2, 3)))  # fmt: skip
-TURN = Turn(SAID, np.array([[True, False]] * 2), SAID.helpers, np.empty((2, 0, 2, 2)), np.zeros((2, 2)))
+TURN = Turn(
+    SAID, np.array([[True, False]] * 2), SAID.helpers, np.empty((2, 0, 2, 2)), np.zeros((2, 2))
+)
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,10 @@ def masked(values: Any) -> Any:
         (Rule(FUSED._replace(weights=P.astype(str))), "weights of type <U"),
         (Rule(FUSED._replace(weights=P * np.inf)), "weights that are not from 0 to 1, such as inf"),
         (Rule(FUSED._replace(weights=-P)), "weights that are not from 0 to 1, such as -0.5"),
-        (Rule(FUSED._replace(trust=np.full((2, 1), 7.0))), "trust that are not from 0 to 1, such as 7"),
+        (
+            Rule(FUSED._replace(trust=np.full((2, 1), 7.0))),
+            "trust that are not from 0 to 1, such as 7",
+        ),
         (Rule(FUSED._replace(trust=np.full((2, 1), None))), "trust of type object"),
         (Rule(FUSED, np.zeros(3)), r"memory of shape \(3,\), not \(2, 3\)"),
         (Rule(FUSED, np.zeros(())), r"memory of shape \(\), not \(2, 0\)"),
@@ -110,7 +115,9 @@ def test_what_a_rule_writes_later_moves_nothing(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_ints_and_float32_are_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken = fused(monkeypatch, Rule(FUSED._replace(policy=np.eye(2, dtype=int), weights=P.astype("f4"))))
+    taken = fused(
+        monkeypatch, Rule(FUSED._replace(policy=np.eye(2, dtype=int), weights=P.astype("f4")))
+    )
     assert [each.dtype for each in taken] == [np.float64] * 4
 
 
@@ -118,11 +125,17 @@ def test_ints_and_float32_are_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     ("result", "says"),
     [
         (DELIVERED._replace(up=masked(HEARD)), "up of type MaskedArray"),
-        (DELIVERED._replace(delay_s=np.full((2, 1), np.inf)), "a delay that is negative, infinite or NaN"),
+        (
+            DELIVERED._replace(delay_s=np.full((2, 1), np.inf)),
+            "a delay that is negative, infinite or NaN",
+        ),
         (DELIVERED._replace(delay_s=np.full((2, 1), 1.0, object)), "delays of type object"),
         (DELIVERED._replace(loss=masked(np.full((2, 1), 9.0))), "losses of type MaskedArray"),
         (DELIVERED._replace(loss=np.full((2, 1), np.nan)), "a loss that is no probability"),
-        (DELIVERED._replace(airtime_s=np.full((2, 1), np.inf)), "an airtime that is negative or infinite"),
+        (
+            DELIVERED._replace(airtime_s=np.full((2, 1), np.inf)),
+            "an airtime that is negative or infinite",
+        ),
     ],
 )
 def test_what_a_channel_delivers_is_held_to_what_it_must_be(result: Delivery, says: str) -> None:
@@ -140,19 +153,35 @@ def test_a_channel_cannot_write_to_the_draws_of_others_when_it_is_asked_for_a_re
     assert np.isnan(broadcast(Radio(asked=Broadcast(np.nan, 0)), 1.0, DRAWS).heard_s)
 
 
-def test_a_channel_whose_parameters_no_file_can_hold_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_channel_whose_parameters_no_file_can_hold_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(CHANNELS._loaded, "mine", Radio(table=np.zeros(3)))
-    with pytest.raises(UserError, match=r"^channel profile mine fails \(TypeError: Encoding objects"):
+    with pytest.raises(
+        UserError, match=r"^channel profile mine fails \(TypeError: Encoding objects"
+    ):
         CHANNELS.record("mine")
 
 
 @pytest.mark.parametrize(
     ("lie", "says"),
     [
-        (lambda s: replace(s, distance_m=0 * s.distance_m), "it changes distance_m of the ego, or of a hel"),
-        (lambda s: replace(s, inference_s=0 * s.inference_s), "it changes inference_s of the ego, or of a "),
-        (lambda s: replace(s, silent=np.ones((2, 2), dtype=bool)), "it changes silent of the ego, or of a "),
-        (lambda s: replace(s, valid=~s.valid), "it changes valid of the ego, or of a helper that is no att"),
+        (
+            lambda s: replace(s, distance_m=0 * s.distance_m),
+            "it changes distance_m of the ego, or of a hel",
+        ),
+        (
+            lambda s: replace(s, inference_s=0 * s.inference_s),
+            "it changes inference_s of the ego, or of a ",
+        ),
+        (
+            lambda s: replace(s, silent=np.ones((2, 2), dtype=bool)),
+            "it changes silent of the ego, or of a ",
+        ),
+        (
+            lambda s: replace(s, valid=~s.valid),
+            "it changes valid of the ego, or of a helper that is no att",
+        ),
         (lambda s: replace(s, silent=s.valid.tolist()), "silent of type list"),
         (lambda s: replace(s, helpers=masked(7 * s.helpers)), "intents of type MaskedArray"),
         (lambda s: replace(s, text_bytes=s.range_m), "it adds or leaves out text_bytes"),

@@ -1,8 +1,9 @@
 """A roadside unit with a place, played by hand: read it as the specification.
 
-One scene throughout. The ego is in doubt, at 145 ms. Two helpers have answered by then; a building stands
-between the ego and the second one, and nothing between the unit and anybody. Every message takes 20 ms, the
-unit 5 ms. In sight all messages cross; behind the building half of them do, and the draws say which.
+One scene throughout. The ego is in doubt, at 145 ms. Two helpers have answered by then; a building
+stands between the ego and the second one, and nothing between the unit and anybody. Every message
+takes 20 ms, the unit 5 ms. In sight all messages cross; behind the building half of them do, and
+the draws say which.
 """
 
 from collections.abc import Iterator
@@ -33,10 +34,17 @@ from harness.world.state import Building, VehicleState, WorldState
 
 SHARES = {"clear": 1.0, "vehicle": 1.0, "building": 0.5}
 TRACE = Trace(
-    Table("", "", tuple(Point(0.0, share, sight, 0.02) for sight, share in SHARES.items())), 0.02, "held"
+    Table("", "", tuple(Point(0.0, share, sight, 0.02) for sight, share in SHARES.items())),
+    0.02,
+    "held",
 )
 SPREAD = Trace(
-    Table("", "", (Point(0.0, 1.0, None, Spread(0.01, 0.03)), Point(60.0, 0.5, None, Spread(0.03, 0.2)))), 0.0
+    Table(
+        "",
+        "",
+        (Point(0.0, 1.0, None, Spread(0.01, 0.03)), Point(60.0, 0.5, None, Spread(0.03, 0.2))),
+    ),
+    0.0,
 )
 ABOVE = Unit(0.0, 0.0, 5.0)
 DOUBT = (0.3, 0.4, 0.3)
@@ -83,9 +91,13 @@ def test_without_a_unit_a_reply_lost_behind_the_building_is_lost():
 
 
 def test_a_relay_sends_the_reply_once_more():
-    """The unit has it at 185 ms as the ego would, sends its copy at 190, and the ego has that at 210."""
+    """The unit has it at 185 ms as the ego would, sends its copy at 190,
+    and the ego has that at 210.
+    """
     decision = play(point("relay"))
-    assert decision.arrival_s == pytest.approx([0.185, 0.210]), "what came directly is not waited for twice"
+    assert decision.arrival_s == pytest.approx([0.185, 0.210]), (
+        "what came directly is not waited for twice"
+    )
     assert decision.on_time.tolist() == [True, True]
     assert decision.latency_s == pytest.approx(0.210)
     assert (decision.requests, decision.messages, decision.lost) == (1, 2, 0)
@@ -99,7 +111,8 @@ def test_a_relay_knows_nothing_of_a_helper_that_the_request_did_not_reach():
 
 
 def test_a_unit_that_fuses_asks_for_the_ego_and_sends_it_the_policy():
-    """It has the ego's request at 165 ms, asks at 170, has the replies at 210, sends at 215: 235 ms.
+    """It has the ego's request at 165 ms, asks at 170, has the replies at 210,
+    sends at 215: 235 ms.
 
     Weights are the ego's own: 1/20 : 1/10 : 1/5.
     """
@@ -112,7 +125,9 @@ def test_a_unit_that_fuses_asks_for_the_ego_and_sends_it_the_policy():
 
 
 def test_the_unit_sends_in_time_for_the_window_and_without_who_is_late():
-    """To be back by 300 ms it sends at 275 at the latest: a reply at 270 is in the policy, at 280 not."""
+    """To be back by 300 ms it sends at 275 at the latest:
+    a reply at 270 is in the policy, at 280 not.
+    """
     almost = play(point("fusion"), inference_s=(0.145, 0.145, 0.250))
     assert almost.on_time.tolist() == [True, True]
     assert almost.latency_s == pytest.approx(0.295)
@@ -124,7 +139,9 @@ def test_the_unit_sends_in_time_for_the_window_and_without_who_is_late():
 
 
 def test_a_window_too_short_for_the_way_over_the_unit_leaves_the_ego_alone():
-    """Back by 185 ms it would have to send at 160, before it has the request at 165: it sends nothing."""
+    """Back by 185 ms it would have to send at 160, before it has the request at 165:
+    it sends nothing.
+    """
     decision = play(point("fusion", window_s=0.185))
     assert not decision.on_time.any()
     assert decision.fused.tolist() == list(DOUBT)
@@ -133,7 +150,9 @@ def test_a_window_too_short_for_the_way_over_the_unit_leaves_the_ego_alone():
 
 
 def test_every_message_over_a_unit_that_fuses_is_counted():
-    """Requests of 800 bits with the ego's intent and of 400; two replies of 1000; a policy of 400."""
+    """Requests of 800 bits with the ego's intent and of 400; two replies of 1000;
+    a policy of 400.
+    """
     decision = play(point("fusion"))
     assert (decision.requests, decision.messages) == (2, 2)
     assert (decision.request_bits, decision.reply_bits) == (1200, 2400)
@@ -142,7 +161,9 @@ def test_every_message_over_a_unit_that_fuses_is_counted():
 
 
 def test_an_ego_whose_request_or_policy_is_lost_has_heard_nobody():
-    """Behind a building from the unit, half of either are lost: all four ends are met over 40 seeds."""
+    """Behind a building from the unit, half of either are lost:
+    all four ends are met over 40 seeds.
+    """
     met = set()
     for seed in range(40):
         decision = play(point("fusion"), to_ego=BUILDING, seed=seed)
@@ -150,7 +171,11 @@ def test_an_ego_whose_request_or_policy_is_lost_has_heard_nobody():
         if decision.requests == 1:
             assert (decision.messages, decision.request_bits, decision.reply_bits) == (0, 800, 0)
         else:
-            assert (decision.messages, decision.request_bits, decision.reply_bits) == (2, 1200, 2400)
+            assert (decision.messages, decision.request_bits, decision.reply_bits) == (
+                2,
+                1200,
+                2400,
+            )
         if not decision.on_time.any():
             assert decision.lost == decision.messages
             assert decision.fused.tolist() == list(DOUBT)
@@ -160,13 +185,19 @@ def test_an_ego_whose_request_or_policy_is_lost_has_heard_nobody():
 
 def test_airtime_counts_both_hops_and_copies_that_nobody_needs():
     """Messages of 400, 800 and 1000 bits fit one block, 1 ms on air, and all cross."""
-    alike: dict[str, Any] = {"profile": "mode2", "loss": 0.0, "window_s": 0.5, "further": "numerology=0"}
+    alike: dict[str, Any] = {
+        "profile": "mode2",
+        "loss": 0.0,
+        "window_s": 0.5,
+        "further": "numerology=0",
+    }
     slot_s = 1e-3
     for edge, messages in (("none", 3), ("relay", 5), ("fusion", 5)):
         assert play(point(edge, **alike)).airtime_s == pytest.approx(messages * slot_s)
 
 
-# -- properties --------------------------------------------------------------------------------------------
+# -- properties
+# --------------------------------------------------------------------------------------------
 
 
 @st.composite
@@ -194,7 +225,8 @@ def cases(draw: st.DrawFn) -> tuple[Intents, Draws]:
 
 RADIOS = ("mode4", "mode2", "its-g5", "traced", "its-g5:loss=0.3")
 radios = st.sampled_from(RADIOS)
-all_radios = st.sampled_from([*RADIOS, "spread"])  # over the last a relay may be faster than the direct link
+# over the last a relay may be faster than the direct link
+all_radios = st.sampled_from([*RADIOS, "spread"])
 delays = st.sampled_from([0.0, 0.01])
 
 
@@ -276,7 +308,8 @@ def lossless() -> tuple[Intents, Draws]:
     return intents, Draws(rng.random((6, 3, 2)), rng.random((6, 3)), trips)
 
 
-# -- where it stands ---------------------------------------------------------------------------------------
+# -- where it stands
+# ---------------------------------------------------------------------------------------
 
 
 def car(name: str, x_m: float, y_m: float, kind: str = "car") -> VehicleState:
@@ -295,13 +328,19 @@ def test_a_unit_above_the_crossing_sees_round_the_corner_and_past_no_truck():
     assert links.units[beside].sight.tolist() == [[VEHICLE, CLEAR]]
     assert links.units[beside].blocker_m.tolist() == [[3.6, 0.0]]
     assert links.units[ABOVE].distance_m.tolist() == [[25, 25]]
-    assert site([(state, ["v1"])], [beside], zone_m=(-30.0, 0.0)).units[beside].distance_m.tolist() == [[25]]
+    assert site([(state, ["v1"])], [beside], zone_m=(-30.0, 0.0)).units[
+        beside
+    ].distance_m.tolist() == [[25]]
     assert links.units[beside].first_m == 5.0
 
 
-@pytest.mark.parametrize(("blocker_m", "row"), [(1.4, (0.0, 0.0)), (3.6, (5.0, 4.0)), (6.0, (9.0, 4.5))])
+@pytest.mark.parametrize(
+    ("blocker_m", "row"), [(1.4, (0.0, 0.0)), (3.6, (5.0, 4.0)), (6.0, (9.0, 4.5))]
+)
 def test_a_vehicle_between_blocks_by_the_higher_and_the_lower_antenna(blocker_m, row):
-    """TR 37.885: nothing where both are higher than it, the middle row where one is, all where none is."""
+    """TR 37.885: nothing where both are higher than it, the middle row where one is,
+    all where none is.
+    """
     law = Propagation(environment="tr37885-urban")
     mean, deviation = row
     drawn = np.maximum(0, np.random.default_rng(0).normal(mean, deviation, 400_000))
@@ -320,7 +359,9 @@ def test_two_rays_reach_further_from_a_higher_antenna():
 
 
 @pytest.mark.slow
-def test_a_run_beside_a_unit_hears_more_and_the_condition_says_so(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_beside_a_unit_hears_more_and_the_condition_says_so(
+    small: Dataset, tmp_path: Path
+) -> None:
     names = ("its-g5", "its-g5:edge=relay", "its-g5:edge=fusion", "its-g5:edge=relay,edge_x_m=500")
     run = evaluate(spec_of(small, points=tuple(map(named_point, names))), tmp_path / "run").out
     summary = pd.read_csv(run / "summary.csv")

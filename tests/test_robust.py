@@ -1,4 +1,6 @@
-"""Rules that count heads, and the one that learns whom to trust, by hand and by what they promise."""
+"""Rules that count heads, and the one that learns whom to trust,
+by hand and by what they promise.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -11,7 +13,13 @@ from hypothesis.extra.numpy import arrays
 
 from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, capped, inverse_distance_weights
-from harness.coordination.robust import HEADS, bayes, centred_clipping, geometric_median, head_trimmed_mean
+from harness.coordination.robust import (
+    HEADS,
+    bayes,
+    centred_clipping,
+    geometric_median,
+    head_trimmed_mean,
+)
 from harness.coordination.rules import RULES, reads_plans
 from harness.coordination.trust import Trust, divergence
 
@@ -32,7 +40,9 @@ def claims(distance_m: Any, sensed_m: Any, **other: Any) -> Claims:
     return Claims(**usual | other)
 
 
-def messages(p: Any, distance_m: Any, sensed_m: Any = None, heard: Any = None, **claimed: Any) -> Messages:
+def messages(
+    p: Any, distance_m: Any, sensed_m: Any = None, heard: Any = None, **claimed: Any
+) -> Messages:
     p, distance_m = np.array(p, dtype=float), np.array(distance_m, dtype=float)
     heard = np.ones(len(p) - 1, dtype=bool) if heard is None else np.array(heard)
     weights = inverse_distance_weights(distance_m, heard, 1.0)
@@ -46,8 +56,12 @@ def decided(rule: str, told: Messages) -> int:
 
 
 def test_one_liar_at_three_metres_flips_every_weighted_rule_and_no_rule_of_heads():
-    """The ego 15 m off and two helpers at 10 and 12 m are for SLOWER; one claims 3 m and says FASTER."""
-    told = messages([[0.6, 0.3, 0.1], CAREFUL, CAREFUL, BOLD], [15, 10, 12, 3], sensed_m=[10, 12, 30])
+    """The ego 15 m off and two helpers at 10 and 12 m are for SLOWER;
+    one claims 3 m and says FASTER.
+    """
+    told = messages(
+        [[0.6, 0.3, 0.1], CAREFUL, CAREFUL, BOLD], [15, 10, 12, 3], sensed_m=[10, 12, 30]
+    )
     assert {rule for rule in RULES if not reads_plans(rule) and decided(rule, told) == 2} == {
         "linear",
         "log-pool",
@@ -69,7 +83,9 @@ def test_the_geometric_median_of_three_alike_and_one_other_is_the_three():
 
 
 def test_centred_clipping_steps_no_farther_for_a_louder_voice():
-    """From (.8, .1, .1) a message at distance 1.21 and one at .6 pull alike: 0.3 in their direction."""
+    """From (.8, .1, .1) a message at distance 1.21 and one at .6 pull alike:
+    0.3 in their direction.
+    """
     loud, soft = (np.array([CAREFUL, said]) for said in (BOLD, [0.4, 0.05, 0.55]))
     half = np.array([0.5, 0.5])
     moved = [np.linalg.norm(centred_clipping(p, half) - p[0]) for p in (loud, soft)]
@@ -78,7 +94,9 @@ def test_centred_clipping_steps_no_farther_for_a_louder_voice():
 
 
 def test_in_the_bayesian_pool_a_voice_counts_for_so_much_and_no_more():
-    """At reliability .8 and three actions a sure voice is worth (.8 + .0667) / .0667 = 13 to one."""
+    """At reliability .8 and three actions a sure voice is worth (.8 + .0667) / .0667 = 13 to
+    one.
+    """
     p = np.array([[1 / 3, 1 / 3, 1 / 3], BOLD])
     policy = bayes(p, np.array([0.5, 0.5]))
     assert policy[2] / policy[0] == pytest.approx(13.0)
@@ -86,7 +104,9 @@ def test_in_the_bayesian_pool_a_voice_counts_for_so_much_and_no_more():
 
 @st.composite
 def agreed(draw: Any) -> tuple[np.ndarray, np.ndarray, int]:
-    """The ego and one to three helpers that agree on an action, and one voice more that may say anything."""
+    """The ego and one to three helpers that agree on an action,
+    and one voice more that may say anything.
+    """
     actions, others = draw(st.integers(2, 5)), draw(st.integers(2, 4))
     choice = draw(st.integers(0, actions - 1))
     raw = draw(arrays(float, (others + 1, actions), elements=st.floats(0.01, 1)))
@@ -112,7 +132,9 @@ def test_no_single_helper_flips_a_decision_on_which_all_others_agree(rule: str, 
     heard=st.lists(st.booleans(), min_size=3, max_size=3),
 )
 @settings(max_examples=30)
-def test_every_rule_gives_a_distribution_and_the_egos_own_where_it_is_alone(rule: str, p: Any, heard: Any):
+def test_every_rule_gives_a_distribution_and_the_egos_own_where_it_is_alone(
+    rule: str, p: Any, heard: Any
+):
     told = messages(p / p.sum(axis=-1, keepdims=True), [10, 10, 10, 10], heard=heard)
     fused = RULES[rule].fuse(told, RULES[rule].start((), 3, 3))
     assert fused.policy.sum() == pytest.approx(1.0)
@@ -131,7 +153,9 @@ START = TRUST.start((), 3, 3)
 
 
 def test_who_is_not_where_it_claims_is_trusted_no_more_and_counts_by_where_it_is():
-    """Helper 1 claims 3 m and is seen at 30 m: all that can speak against it does. 1.5 to .3 + 4."""
+    """Helper 1 claims 3 m and is seen at 30 m: all that can speak against it does.
+    1.5 to .3 + 4.
+    """
     told = messages([DOUBT] * 4, [20, 3, 10, 10], sensed_m=[30, np.nan, 10])
     fused = TRUST.fuse(told, START)
     assert fused.trust == pytest.approx([1.5 / 5.8, 2.5 / 2.8, 2.5 / 2.8])
@@ -163,7 +187,9 @@ def places(*helpers: Any) -> Any:
 
 
 def test_who_claims_to_drive_and_stays_where_it_is_is_trusted_no_more():
-    """Two that claim 7 m/s and have moved 7 m and 0 m in a second; the slack is 2 + 2 x 4 x .2 = 3.6 m."""
+    """Two that claim 7 m/s and have moved 7 m and 0 m in a second;
+    the slack is 2 + 2 x 4 x .2 = 3.6 m.
+    """
     speed = {"speed_mps": np.array([7.0, 7.0, 3.5])}
     moved = [[0.0, 17.0], [-20.0, 0.0], [0.0, -30.0]]
     steps = places(*ABOUT) | speed, places(*moved) | speed | {"time_s": np.array(1.0)}
@@ -172,10 +198,16 @@ def test_who_claims_to_drive_and_stays_where_it_is_is_trusted_no_more():
 
 
 def test_no_vehicle_is_as_fast_as_that_whatever_it_claims():
-    """The third moves by 70 m in a second, as it claims to; the first jumps by 70 m and claims 7 m/s."""
+    """The third moves by 70 m in a second, as it claims to;
+    the first jumps by 70 m and claims 7 m/s.
+    """
     later = {"time_s": np.array(1.0), "speed_mps": FAST}
     moved = [[0.0, 80.0], [-27.0, 0.0], [0.0, -100.0]]
-    assert trusted(places(*ABOUT) | {"speed_mps": FAST}, places(*moved) | later) == [False, True, False]
+    assert trusted(places(*ABOUT) | {"speed_mps": FAST}, places(*moved) | later) == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_who_has_not_been_heard_for_a_while_may_be_farther_off():
@@ -212,7 +244,9 @@ def test_where_nobody_looked_nothing_is_held_against_anybody():
     errors=arrays(float, (6, 3, 2), elements=st.floats(-0.6, 0.6)),
 )
 def test_nobody_is_distrusted_for_driving(speed: Any, pulls: Any, heading: Any, errors: Any):
-    """Braking at 8 m/s² at most and pulling away at 3, straight on, with errors up to three sigma."""
+    """Braking at 8 m/s² at most and pulling away at 3, straight on,
+    with errors up to three sigma.
+    """
     at = np.array([[0.0, 500.0], [-500.0, 0.0], [500.0, 900.0]])
     along, steps = np.stack([np.cos(heading), np.sin(heading)], axis=-1), []
     for n in range(6):
@@ -237,14 +271,18 @@ def test_a_liar_far_from_all_others_is_distrusted_at_once_and_forgiven_in_time()
 
 
 def test_a_witness_that_nobody_backs_is_believed_at_first():
-    """Others are in doubt; one is surer of SLOWER than they are: it is far from all, but not very far."""
+    """Others are in doubt; one is surer of SLOWER than they are:
+    it is far from all, but not very far.
+    """
     fused = TRUST.fuse(messages([DOUBT, [0.9, 0.05, 0.05], DOUBT, DOUBT], [20, 5, 10, 10]), START)
     assert fused.trust[0] > 0.5
     assert np.argmax(fused.policy) == 0
 
 
 def test_what_the_ego_sees_later_speaks_against_who_said_otherwise():
-    """At the second step the ego is sure of SLOWER; helper 1 had been sure of FASTER, helper 2 in doubt."""
+    """At the second step the ego is sure of SLOWER;
+    helper 1 had been sure of FASTER, helper 2 in doubt.
+    """
     before = TRUST.fuse(messages([DOUBT, BOLD, DOUBT, BOLD], [20, 10, 10, 10]), START)
     now = TRUST.fuse(messages([[1.0, 0, 0], DOUBT, DOUBT, DOUBT], [20, 10, 10, 10]), before.state)
     assert now.trust[0] < now.trust[1]
@@ -258,7 +296,8 @@ def test_who_is_not_heard_keeps_its_reputation():
 
 
 def test_a_cap_takes_weight_from_one_helper_and_gives_it_to_all_others_in_proportion():
-    """Of .1, .2, .1 and .6 the last may have .3: the other .7 are shared as 1 to 2 to 1, and .35 is too much.
+    """Of .1, .2, .1 and .6 the last may have .3:
+    the other .7 are shared as 1 to 2 to 1, and .35 is too much.
 
     So that one has .3 as well, and the ego and the third helper share the rest.
     """

@@ -50,11 +50,14 @@ ALL = tuple(POINTS)
 
 
 def without_company(answers: list[Answer]) -> list[Answer]:
-    """Answers less what may differ with the batch: its size, and the seconds of an answer asked alone."""
+    """Answers less what may differ with the batch:
+    its size, and the seconds of an answer asked alone.
+    """
     return [msgspec.structs.replace(answer, batch_size=0, **UNTIMED) for answer in answers]
 
 
-# -- twins ----------------------------------------------------------------------------------------------
+# -- twins
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("batch_size", [1, 3, 64, 1000])
@@ -111,7 +114,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
     card = replace(
-        cards.resolve(str(tiny)), max_new_tokens=6, latency=Latency("card", 0.1, "declared: for this test")
+        cards.resolve(str(tiny)),
+        max_new_tokens=6,
+        latency=Latency("card", 0.1, "declared: for this test"),
     )
     points = tuple(POINTS.values())
     source = FrozenSource(data)
@@ -126,8 +131,13 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     data, runs, tables = load(small_path, limit=1), {}, {}
     for batch_size in (1, 3):
         spec = tiny_spec(tiny, data, batch_size=batch_size)
-        done = walked(spec, open_backend(spec.ego.card, device="cpu", dtype="float32", batch_size=batch_size))
-        runs[batch_size], tables[batch_size] = without_company(list(done.answers)), done.decisions.table
+        done = walked(
+            spec, open_backend(spec.ego.card, device="cpu", dtype="float32", batch_size=batch_size)
+        )
+        runs[batch_size], tables[batch_size] = (
+            without_company(list(done.answers)),
+            done.decisions.table,
+        )
     assert runs[1] == runs[3]
     assert tables[1].equals(tables[3])
     assert {a.finish_reason for a in runs[1]} >= {"length", "error"}
@@ -151,12 +161,15 @@ def test_prompts_that_are_too_long_for_the_model_got_no_answer(
     assert {answer.finish_reason for answer in answers.values()} <= {"stop", "length"}
 
 
-# -- replay ---------------------------------------------------------------------------------------------
+# -- replay
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
-def test_a_replay_makes_the_tables_of_the_run_it_replays(prompt: str, small: Dataset, tmp_path: Path) -> None:
+def test_a_replay_makes_the_tables_of_the_run_it_replays(
+    prompt: str, small: Dataset, tmp_path: Path
+) -> None:
     first = run(spec_of(small, prompt=prompt), tmp_path / "run")
     again = run(spec_of(small, f"replay:{tmp_path / 'run'}", prompt), tmp_path / "again")
     assert same_record(tmp_path / "again", tmp_path / "run")
@@ -210,20 +223,35 @@ def test_a_replay_of_another_dataset_or_fewer_scenes_is_refused(
     run(spec_of(load(small_path, limit=3)), tmp_path / "three")
     said = refused(spec_of(small, f"replay:{tmp_path / 'three'}"), tmp_path / "out")
     assert said.endswith(
-        f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and limit"
+        f"holds no answer for {small.scene('00003-0').id}/v1; replay a run of the same dataset and "
+        "limit"
     )
     root, after = scenes_of(small)[:2]
     moved = root.changed(graphs=after.graphs)
     other = replace(small, _scenes={root.id: moved})
-    assert "another prompt or dataset" in refused(spec_of(other, f"replay:{proxy_run}"), tmp_path / "out")
+    assert "another prompt or dataset" in refused(
+        spec_of(other, f"replay:{proxy_run}"), tmp_path / "out"
+    )
 
 
 @pytest.mark.parametrize(
     ("file", "content", "said"),
     [
-        ("answers.jsonl", None, "answers.jsonl is broken (No such file or directory); make the run again"),
-        ("run.json", None, "is no finished run: it has no run.json; give a folder made by `harness eval`"),
-        ("run.json", "{}", "run.json has format 'None', not 'swarmdrive-run/2'; give a folder made by"),
+        (
+            "answers.jsonl",
+            None,
+            "answers.jsonl is broken (No such file or directory); make the run again",
+        ),
+        (
+            "run.json",
+            None,
+            "is no finished run: it has no run.json; give a folder made by `harness eval`",
+        ),
+        (
+            "run.json",
+            "{}",
+            "run.json has format 'None', not 'swarmdrive-run/2'; give a folder made by",
+        ),
         ("run.json", "[", "run.json is broken ("),
         ("answers.jsonl", "{}\n", "answers.jsonl is broken (Object missing required field"),
         ("answers.jsonl", "[]\n", "answers.jsonl is broken ("),
@@ -246,7 +274,8 @@ def test_a_drivers_run_is_not_replayed_but_run_again(small: Dataset, tmp_path: P
     assert said.endswith("is a run of a driver; run it again with --model local-view")
 
 
-# -- refused, and nothing written -------------------------------------------------------------------------
+# -- refused, and nothing written
+# -------------------------------------------------------------------------
 
 
 def test_a_folder_in_use_is_refused_and_left_as_it_is(
@@ -274,7 +303,12 @@ def test_a_folder_in_use_is_refused_and_left_as_it_is(
 def test_an_empty_folder_is_a_fine_place(small: Dataset, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     run(spec_of(small, "cruise"), tmp_path / "empty")
-    assert {p.name for p in (tmp_path / "empty").iterdir()} == {*FILES, "run.json", "run.toml", "sources"}
+    assert {p.name for p in (tmp_path / "empty").iterdir()} == {
+        *FILES,
+        "run.json",
+        "run.toml",
+        "sources",
+    }
 
 
 def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Path) -> None:
@@ -286,10 +320,16 @@ def test_a_model_that_cannot_be_had_leaves_nothing(small: Dataset, tmp_path: Pat
     assert "has no weights" in refused(spec_of(small, str(tmp_path / "hollow")), tmp_path / "out")
 
 
-def test_a_prompt_that_does_not_render_some_scene_leaves_no_run(small: Dataset, tmp_path: Path) -> None:
-    """The template fails at the third step only. The answers until then have been paid for, and stay."""
+def test_a_prompt_that_does_not_render_some_scene_leaves_no_run(
+    small: Dataset, tmp_path: Path
+) -> None:
+    """The template fails at the third step only.
+    The answers until then have been paid for, and stay.
+    """
     prompt = prompts.load("v2")
-    text = prompt.texts["ego"].replace("Distribution:", "{{ graph.step + (0 if graph.step < 2 else 'x') }}")
+    text = prompt.texts["ego"].replace(
+        "Distribution:", "{{ graph.step + (0 if graph.step < 2 else 'x') }}"
+    )
     broken = replace(prompt, texts={**prompt.texts, "ego": text})
     with pytest.raises(UserError, match=r"prompt v2 ego\.j2 does not render"):
         run(with_ego(spec_of(small), prompt=broken), tmp_path / "out")
@@ -313,7 +353,9 @@ def test_a_prompt_that_does_not_render_some_scene_leaves_no_run(small: Dataset, 
         ),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(options: dict[str, Any], said: str, small: Dataset) -> None:
+def test_settings_that_mean_nothing_are_refused(
+    options: dict[str, Any], said: str, small: Dataset
+) -> None:
     with pytest.raises(UserError) as caught:
         spec_of(small, **options)
     assert str(caught.value).startswith(said)
@@ -332,7 +374,8 @@ def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to() -> None:
     assert Agent(cards.load("qwen3-4b"), prompts.load("v2")).thinking is False
 
 
-# -- conditions -------------------------------------------------------------------------------------------
+# -- conditions
+# -------------------------------------------------------------------------------------------
 
 
 def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
@@ -389,7 +432,10 @@ def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_pat
     for prompt in ("v1", "v2"):
         run(spec_of(data, prompt=prompt, points=(point,)), tmp_path / prompt)
         links.append(
-            [[(m.sender, m.delivered) for m in d.messages] for d in decisions(tmp_path / prompt, "half")]
+            [
+                [(m.sender, m.delivered) for m in d.messages]
+                for d in decisions(tmp_path / prompt, "half")
+            ]
         )
     assert links[0] == links[1]
 
@@ -418,18 +464,23 @@ def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
 
 
 @pytest.mark.slow
-def test_the_driver_that_sees_everything_is_the_upper_reference(small: Dataset, tmp_path: Path) -> None:
+def test_the_driver_that_sees_everything_is_the_upper_reference(
+    small: Dataset, tmp_path: Path
+) -> None:
     best = run(spec_of(small, "full-view"), tmp_path / "full")
     worst = run(spec_of(small, "brake"), tmp_path / "brake")
     assert figure(best, "6g", "success_rate").value == 1.0
     assert figure(worst, "6g", "success_rate").value < 1.0
 
 
-# -- the record -------------------------------------------------------------------------------------------
+# -- the record
+# -------------------------------------------------------------------------------------------
 
 
 def test_the_summary_can_be_made_again_from_the_decisions(proxy_run: Path) -> None:
-    """Recounted with pandas, from nothing but `decisions.parquet`: the last decision tells the success."""
+    """Recounted with pandas, from nothing but `decisions.parquet`:
+    the last decision tells the success.
+    """
     table = pd.DataFrame([
         {"episode": d["episode"], "condition": d["condition"], "seed": d["seed"], "sent": d["messages"],
          "triggered": d["triggered"], "ms": d["latency_ms"], "missed": d["deadline_missed"],
@@ -467,7 +518,9 @@ def test_the_episodes_table_agrees_with_the_decisions(proxy_run: Path) -> None:
         assert e.deadline_misses == sum(d["deadline_missed"] for d in mine)
         regrets = [d["regret"] for d in mine if d["value"]]
         assert e.success == mine[-1]["safe"] == (regrets == [False] * len(mine))
-        assert e.success or sum(regrets) == 1 or regrets == [], "one decision lost it, or it was lost before"
+        assert e.success or sum(regrets) == 1 or regrets == [], (
+            "one decision lost it, or it was lost before"
+        )
         assert (e.failure == "") == e.success
         cleared = e.failure in ("", "late")
         assert (e.delay_s != "") == cleared
@@ -487,7 +540,9 @@ def test_the_manifest_says_how_to_run_it_again(small_path: Path, tmp_path: Path)
     assert (done.manifest.world.limit, done.manifest.world.episodes) == (2, 2)
 
 
-def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(small: Dataset, tmp_path: Path) -> None:
+def test_a_model_folder_named_like_a_card_is_not_taken_for_the_card(
+    small: Dataset, tmp_path: Path
+) -> None:
     (tmp_path / "proxy").mkdir()
     (tmp_path / "proxy" / "config.json").write_text("{}")
     spec = spec_of(small, str(tmp_path / "proxy"))

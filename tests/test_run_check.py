@@ -83,16 +83,22 @@ IN_TABLES = {
         score("success_rate", "value", 0.987),
         "summary.csv has success_rate 0.987 in 6g (episodes)",
     ),
-    "an end of its interval": (score("success_rate", "ci_low", 0.9), "success_rate, low, 0.9 in 6g"),
+    "an end of its interval": (score("success_rate", "ci_low", 0.9), 
+        "success_rate, "
+        "low, 0.9 in 6g"),
     "a figure over seeds": (
         score("latency_proxy_ms", "value", 20.0, "seed means"),
         "has latency_proxy_ms 20.0 in 6g (seed means)",
     ),
     "one that holds at every look": (
-        added("success_rate", "any time"), "has success_rate 0.987 in 6g (any time), which its other tables",
+        added("success_rate", "any time"), 
+            "has success_rate 0.987 in 6g (any "
+            "time), which its other tables",
     ),
     "success corrected for difficulty": (
-        added("adjusted_success_rate", "episodes"), "has adjusted_success_rate 0.987 in 6g (episodes), which",
+        added("adjusted_success_rate", "episodes"), 
+            "has adjusted_success_rate 0.987 "
+            "in 6g (episodes), which",
     ),
     "success of episodes": (
         lambda run: damage(run, episode=won), "episodes.csv has another success in ",
@@ -125,7 +131,9 @@ def test_a_run_that_nobody_changed_is_equal(run: Path, harness: Harness) -> None
 
 
 @pytest.mark.parametrize("changed", IN_TABLES)
-def test_tables_that_contradict_each_other_are_named(changed: str, run: Path, harness: Harness) -> None:
+def test_tables_that_contradict_each_other_are_named(
+    changed: str, run: Path, harness: Harness
+) -> None:
     check_finds(IN_TABLES[changed], run, harness)
 
 
@@ -177,7 +185,10 @@ def renamed(run: Path) -> None:
     """Let an easier radio have the name of another."""
     stated = json.loads((run / "run.json").read_text())
     configure(
-        run, conditions=[{**each, "loss": 0.0} if each["profile"] else each for each in stated["conditions"]]
+        run,
+        conditions=[
+            {**each, "loss": 0.0} if each["profile"] else each for each in stated["conditions"]
+        ],
     )
 
 
@@ -209,32 +220,44 @@ def sooner(run: Path) -> None:
 OF_THE_RUN = {
     "older rules": (older, "success_rate, low, 0.9 in 6g"),
     "older rules, without a row": (
-        lambda run: (older(run), without("off_lag_rate")(run)), "summary.csv lacks off_lag_rate in 6g",
+        lambda run: (older(run), without("off_lag_rate")(run)), 
+            "summary.csv lacks "
+            "off_lag_rate in 6g",
     ),
     "older rules, without a row of several": (
-        lambda run: (older(run), without("6g,optimal_brier,")(run)), "summary.csv lacks optimal_brier in 6g",
+        lambda run: (older(run), without("6g,optimal_brier,")(run)), 
+            "summary.csv lacks "
+            "optimal_brier in 6g",
     ),
     "older rules, with another figure of all decisions": (
         lambda run: (older(run), score("decisions_one_optimal", "value", 5000)(run)),
         "summary.csv has decisions_one_optimal 5000.0 in 6g",
     ),
     "rules in another spelling": (
-        lambda run: configure(run, versions={"figures": "01"}), "run.json has figures of version 01, and",
+        lambda run: configure(run, versions={"figures": "01"}), 
+            "run.json has figures "
+            "of version 01, and",
     ),
     "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
     "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
     "a radio's name": (renamed, "run.json has other settings of v2x than that name says"),
-    "which layouts": (picked, "episodes.csv has other episodes than run.json says that were selected"),
+    "which layouts": (picked, 
+        "episodes.csv has other episodes than "
+        "run.json says that were selected"),
     "the paper's latency": (
         lambda run: latency(run, source="paper", ego_s=0.02),
         "run.json has another latency than the paper, which it names as the source",
     ),
     "a latency of helpers": (
-        lambda run: latency(run, helper_s=0.02), "run.json has another latency of the helpers than of",
+        lambda run: latency(run, helper_s=0.02), 
+            "run.json has another latency "
+            "of the helpers than of",
     ),
     "a latency of fusion": (
-        lambda run: latency(run, fusion_s=0.02), "run.json has another latency of a fusion call than of the",
+        lambda run: latency(run, fusion_s=0.02), 
+            "run.json has another latency of "
+            "a fusion call than of the",
     ),
     "a latency's source": (sooner, "run.json has another latency than its model's card"),
     "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
@@ -264,8 +287,14 @@ def failed(answer: Row) -> None:
     ("changed", "said"),
     [
         (failed, "another verdict in 1 answer than its texts say"),
-        (lambda answer: answer.update(repairs=("fence",)), "another repairs in 1 answer than its texts say"),
-        (lambda answer: answer.update(intent=(0.0, 1.0, 0.0)), "another intent in 1 answer than its texts"),
+        (
+            lambda answer: answer.update(repairs=("fence",)),
+            "another repairs in 1 answer than its texts say",
+        ),
+        (
+            lambda answer: answer.update(intent=(0.0, 1.0, 0.0)),
+            "another intent in 1 answer than its texts",
+        ),
         (lambda answer: answer.update(viewer="v99"), "1 answer to questions that nobody asked"),
     ],
 )
@@ -291,7 +320,9 @@ def test_a_table_that_agrees_with_the_others_and_not_with_the_answers_is_found(
     read_table = pq.read_table(file)
     place = read_table.column_names.index("fusion_ms")
     kind = read_table.schema.field("fusion_ms")
-    pq.write_table(read_table.set_column(place, kind, pa.array([1.0] * len(read_table), kind.type)), file)
+    pq.write_table(
+        read_table.set_column(place, kind, pa.array([1.0] * len(read_table), kind.type)), file
+    )
     code, out, _ = harness("run", "check", run)
     assert code == 1
     assert "decisions.parquet has another fusion_ms in" in out
@@ -333,21 +364,27 @@ def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
 
 
 @pytest.mark.slow
-def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(drive: Path, harness: Harness) -> None:
+def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
+    drive: Path, harness: Harness
+) -> None:
     """Though all tables agree with each other."""
     change(drive, episode=otherwise)
     code, out, _ = harness("run", "check", drive)
     assert code == 1
     words = " ".join(out.split())
     for number, name in enumerate(OTHERWISE):
-        found = f"another {name} of episode {number} in single-local, seed 0, than its actions lead to"
+        found = (
+            f"another {name} of episode {number} in single-local, seed 0, than its actions lead to"
+        )
         assert f"episodes.csv has {found}" in words
     assert "summary.csv" not in words
     assert harness("report", drive)[0] == 0
 
 
 @pytest.mark.slow
-def test_a_latency_of_a_driven_run_is_held_against_its_source(drive: Path, harness: Harness) -> None:
+def test_a_latency_of_a_driven_run_is_held_against_its_source(
+    drive: Path, harness: Harness
+) -> None:
     latency(drive, source="paper", ego_s=0.02)
     code, out, _ = harness("run", "check", drive)
     assert code == 1
@@ -361,9 +398,10 @@ def test_a_latency_of_a_card_that_only_the_run_states_is_named(run: Path, harnes
     configure(run, model=card, latency={**stated["latency"], **times})
     said = harness("run", "check", run)
     words = " ".join(said[1].split())
-    assert "of 0.144 s is that of a card in run.json; the card proxy that is here states 0.145 s" in words, (
-        said
-    )
+    assert (
+        "of 0.144 s is that of a card in run.json; the card proxy that is here states 0.145 s"
+        in words
+    ), said
 
 
 @pytest.mark.slow
@@ -398,7 +436,8 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
     added("comfort", "episodes")(run)
     said = (
         "comfort: as summary.csv states, and not checked, since",
-        "Its figures are made by the rules of version 1, as run.json states. It lacks optimal_action_rate, "
+        "Its figures are made by the rules of version 1, as run.json states. It lacks "
+        "optimal_action_rate, "
         "optimal_brier and optimal_nll_nats, and whether they were left out cannot be checked.",
     )
     code, out, _ = harness("run", "check", run)
@@ -411,7 +450,9 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
         assert all(sentence in words for sentence in said)
 
 
-def test_a_column_that_a_run_by_older_rules_left_empty_is_named(longer: Path, harness: Harness) -> None:
+def test_a_column_that_a_run_by_older_rules_left_empty_is_named(
+    longer: Path, harness: Harness
+) -> None:
     """Here by a forger, whose regret is not to be seen."""
     run, stated = longer, json.loads((longer / "run.json").read_text())
     change(run, decision=lambda row: row.update(regret=None))

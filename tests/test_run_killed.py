@@ -80,7 +80,9 @@ def test_killed_at_any_time_and_resumed_it_is_the_same_run(
 SOME = ("between two parts", "while a part is written", "while the work is cleared away")
 
 
-@pytest.mark.parametrize("place", some(SOME, exhaustive=[place for place in PLACES if place not in SOME]))
+@pytest.mark.parametrize(
+    "place", some(SOME, exhaustive=[place for place in PLACES if place not in SOME])
+)
 def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
     place: str, whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path
 ) -> None:
@@ -149,7 +151,9 @@ def test_a_torn_last_line_is_dropped_and_asked_again(
     assert same_files(out, proxy_run)
 
 
-def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+def test_what_follows_a_torn_line_can_be_read_again(
+    answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
     """Killed twice: the answers of the second try stand on lines of their own."""
     kept, spec = tmp_path / "answers.jsonl", spec_of(small)
     kept.write_bytes(answers[:5000])
@@ -159,8 +163,12 @@ def test_what_follows_a_torn_line_can_be_read_again(answers: bytes, small: Datas
 
 
 @pytest.mark.slow
-def test_a_torn_chunk_is_asked_again_as_a_whole(answers: bytes, small: Dataset, tmp_path: Path) -> None:
-    """Wherever it is torn, also between two lines: its batches must hold the same questions again."""
+def test_a_torn_chunk_is_asked_again_as_a_whole(
+    answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    """Wherever it is torn, also between two lines:
+    its batches must hold the same questions again.
+    """
     spec, kept = spec_of(small), tmp_path / "answers.jsonl"
     lines = answers.splitlines(keepends=True)
     ends = [n for n, line in enumerate(lines, 1) if not line.endswith(MORE_FOLLOWS)]
@@ -201,9 +209,13 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
 
 
 @pytest.mark.parametrize("line", [b"[1", b"\xff", b'{"scene": "\xae"}', b"[" * 100_000])
-def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Dataset, tmp_path: Path) -> None:
+def test_damaged_answers_are_one_line(
+    line: bytes, answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
     out = unfinished(spec_of(small), tmp_path / "run", line + b"\n" + answers)
-    with pytest.raises(UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"):
+    with pytest.raises(
+        UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"
+    ):
         run(spec_of(small), out)
 
 
@@ -216,12 +228,21 @@ def test_damaged_answers_are_one_line(line: bytes, answers: bytes, small: Datase
         ({"model": "cruise"}, "--model proxy, and not with --model cruise"),
         ({"points": ()}, "--condition .*, and not with no --condition"),
         ({"limit": 4}, "no --limit, and not with --limit 4"),
-        ({"prompt": "v1", "seeds": (7,)}, "--prompt v2 --seeds 0,1, and not with --prompt v1 --seeds 7:8"),
+        (
+            {"prompt": "v1", "seeds": (7,)},
+            "--prompt v2 --seeds 0,1, and not with --prompt v1 --seeds 7:8",
+        ),
     ],
 )
 @pytest.mark.parametrize("finished", [True, False])
 def test_other_settings_are_refused_by_name_and_change_nothing(
-    finished: bool, other, named: str, proxy_run: Path, answers: bytes, small: Dataset, tmp_path: Path
+    finished: bool,
+    other,
+    named: str,
+    proxy_run: Path,
+    answers: bytes,
+    small: Dataset,
+    tmp_path: Path,
 ) -> None:
     out = tmp_path / "run"
     if finished:
@@ -262,7 +283,9 @@ def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(
     assert list(again.scores) == list(first.scores)
 
 
-def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Dataset, tmp_path: Path) -> None:
+def test_a_run_is_written_by_one_process_at_a_time(
+    answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
     out = unfinished(spec_of(small), tmp_path / "run", answers[:5000])
     with (
         alone(out / ".work" / "lock"),
@@ -274,7 +297,9 @@ def test_a_run_is_written_by_one_process_at_a_time(answers: bytes, small: Datase
 
 
 @pytest.mark.slow
-def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(small: Dataset, tmp_path: Path) -> None:
+def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(
+    small: Dataset, tmp_path: Path
+) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     card = cards.resolve("swarm-tiny", "transformers")
     spec = with_ego(spec_of(small.of_episodes([0])), card=card, answer="readout", letters="cyclic")

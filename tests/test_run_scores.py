@@ -1,4 +1,6 @@
-"""Scores of runs whose every answer and outcome is written down here, so that they can be counted by hand."""
+"""Scores of runs whose every answer and outcome is written down here,
+so that they can be counted by hand.
+"""
 
 import json
 import math
@@ -40,7 +42,8 @@ ALONE = OperatingPoint.of("single-local", None)
 CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0)  # nothing is lost, and no jitter
 DEAF = OperatingPoint.of("deaf", "v2x", loss=1.0)
 
-# Seconds until the intersection is cleared, or how it ends; what is not here leads to the next step.
+# Seconds until the intersection is cleared, or how it ends; what is not here leads to the next
+# step.
 OUTCOMES: dict[str, dict[str, float | str]] = {
     # Episode 0: nothing dangerous. The second SLOWER comes 1.0 s late, which is just allowed.
     "00000-0": {"FASTER": "collision"},
@@ -71,7 +74,9 @@ def played(small: Dataset) -> Dataset:
 @pytest.fixture
 def told(played: Dataset) -> Walked:
     """Three conditions, one seed, 0.1 s an answer."""
-    return walked(spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,), ask="all"), Scripted(SAID))
+    return walked(
+        spec_of(played, points=(ALONE, CLEAR, DEAF), seeds=(0,), ask="all"), Scripted(SAID)
+    )
 
 
 def value(told: Walked, condition: str, metric: str, interval: str = "") -> tuple[Any, int, int]:
@@ -81,7 +86,10 @@ def value(told: Walked, condition: str, metric: str, interval: str = "") -> tupl
 
 def test_a_summarys_columns(told: Walked) -> None:
     head, first, *_ = csv_text(Score, told.scores, Variant("proxy", "v2", "json")).splitlines()
-    assert head == "model,prompt,answer,helpers,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
+    assert (
+        head
+        == "model,prompt,answer,helpers,condition,metric,value,ci_low,ci_high,n,n_excluded,interval"
+    )
     assert first.startswith("proxy,v2,json,,single-local,success_rate,0.25,")
 
 
@@ -125,7 +133,9 @@ def test_regret_is_the_decision_that_gave_success_away(told: Walked) -> None:
 
 
 def test_a_safe_decision_costs_the_seconds_that_it_puts_success_off(told: Walked) -> None:
-    """The second SLOWER of episode 0 costs 1.0 s, the first of 2 costs 0.6 s; an unsafe one has none."""
+    """The second SLOWER of episode 0 costs 1.0 s, the first of 2 costs 0.6 s;
+    an unsafe one has none.
+    """
     delay_s = {d.scene: d.delay_s for d in told.records("clear")}
     assert delay_s == {
         "00000-0": 0.0, "00000-1": 1.0, "00001-0": 0.0, "00001-1": 0.0,
@@ -138,9 +148,16 @@ def test_a_safe_decision_costs_the_seconds_that_it_puts_success_off(told: Walked
 
 
 def test_decisions_that_would_act_in_another_frame_than_the_datasets_lag(played: Dataset) -> None:
-    """The lag is 145 ms, frames are of 20 ms: 145 and 160 ms act in the 8th, and V2X's replies come later."""
+    """The lag is 145 ms, frames are of 20 ms:
+    145 and 160 ms act in the 8th, and V2X's replies come later.
+    """
     spec = spec_of(played, points=(ALONE, CLEAR), seeds=(0,))
-    for seconds, alone, one in ((0.14, 1.0, 1.0), (0.145, 0.0, 1.0), (0.16, 0.0, 1.0), (0.161, 1.0, 1.0)):
+    for seconds, alone, one in (
+        (0.14, 1.0, 1.0),
+        (0.145, 0.0, 1.0),
+        (0.16, 0.0, 1.0),
+        (0.161, 1.0, 1.0),
+    ):
         latency = Latency("card", "declared", seconds, seconds, seconds)
         told = walked(spec, Scripted(SAID), latency)
         assert value(told, "single-local", "off_lag_rate") == (alone, 4, 0)
@@ -161,7 +178,8 @@ def test_the_gain_over_single_local_is_paired_by_episode(told: Walked) -> None:
 
 def test_messages_triggers_and_loss_by_hand(told: Walked) -> None:
     """One decision is unsure; it schedules three replies whether or not they come through."""
-    for condition, of_episode_1 in (("clear", 1 / 2), ("deaf", 1)):  # it is one of two, or the only one
+    # it is one of two, or the only one
+    for condition, of_episode_1 in (("clear", 1 / 2), ("deaf", 1)):
         assert value(told, condition, "message_count", "seed means")[0] == 3
         assert value(told, condition, "messages_per_episode")[0] == 3 / 4
         assert value(told, condition, "trigger_rate")[0] == of_episode_1 / 4
@@ -174,7 +192,9 @@ def test_messages_triggers_and_loss_by_hand(told: Walked) -> None:
 
 
 def test_latency_by_hand(told: Walked, played: Dataset) -> None:
-    """100 ms everywhere; the request, three V2X replies of 25 ms each, and their bits, at 10 Mbit/s."""
+    """100 ms everywhere; the request, three V2X replies of 25 ms each, and their bits,
+    at 10 Mbit/s.
+    """
     bits = 400 + bits_of_replies(played)
     consulted = 100 + 3 * 25 + bits / 10e6 * 1000
     assert value(told, "single-local", "latency_proxy_ms")[0] == pytest.approx(100)
@@ -193,12 +213,16 @@ def bits_of_replies(played: Dataset) -> float:
 
 
 def test_the_channels_cost_by_hand(told: Walked, played: Dataset) -> None:
-    """One request of 400 bits and three replies in one of four episodes, lost or not, at 10 Mbit/s."""
+    """One request of 400 bits and three replies in one of four episodes, lost or not,
+    at 10 Mbit/s.
+    """
     bits = 400 + bits_of_replies(played)
     for condition in ("clear", "deaf"):
         assert value(told, condition, "requests_per_episode")[0] == 1 / 4
         assert value(told, condition, "bits_per_episode")[0] == pytest.approx(bits / 4)
-        assert value(told, condition, "airtime_ms")[0] == pytest.approx(bits / 10e6 * 1000 / 4, abs=1e-6)
+        assert value(told, condition, "airtime_ms")[0] == pytest.approx(
+            bits / 10e6 * 1000 / 4, abs=1e-6
+        )
     assert value(told, "single-local", "bits_per_episode") == (0.0, 4, 0)
 
 
@@ -209,17 +233,21 @@ def test_a_total_with_an_unknown_part_is_unknown() -> None:
 
 
 def test_percentiles_are_over_all_decisions(told: Walked) -> None:
-    """Six decisions of 100 ms and one that consults: the median is 100 ms, the 99th almost the longest."""
+    """Six decisions of 100 ms and one that consults:
+    the median is 100 ms, the 99th almost the longest.
+    """
     longest = 4 * 2 * value(told, "clear", "latency_proxy_ms")[0] - 700
     assert value(told, "clear", "latency_p50_ms", "seed means") == (pytest.approx(100), 1, 0)
     near = value(told, "clear", "latency_p99_ms", "seed means")[0]
-    assert near == pytest.approx(100 + 0.94 * (longest - 100))  # linear between the sixth and the seventh
+    # linear between the sixth and the seventh
+    assert near == pytest.approx(100 + 0.94 * (longest - 100))
     assert value(told, "clear", "fusion_ms")[0] == 0
 
 
 def test_brier_and_likelihood_by_hand(told: Walked) -> None:
     """Decisions in which no action is safe have no score, and an episode of such is excluded."""
-    # Two safe actions, sure of one: 1/4 + 1/4; of neither: 1 + 1/4 + 1/4. Three safe: 4/9 + 1/9 + 1/9.
+    # Two safe actions, sure of one: 1/4 + 1/4; of neither: 1 + 1/4 + 1/4. Three safe: 4/9 + 1/9 +
+    # 1/9.
     sure_of_one_of_two, sure_of_none_of_two, sure_of_one_of_three = 1 / 2, 3 / 2, 2 / 3
     unsure_and_one_safe = 0.7**2 + 0.4**2 + 0.3**2
     episodes = [
@@ -274,19 +302,23 @@ def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: 
     assert told.result(DEAF, "fused")[at] == pytest.approx([0.3, 0.4, 0.3])
 
 
-# -- seeds ------------------------------------------------------------------------------------------------
+# -- seeds
+# ------------------------------------------------------------------------------------------------
 
 
 def test_intervals_of_what_hangs_on_the_seed(small: Dataset) -> None:
     lossy = OperatingPoint.of("lossy", "6g", loss=0.3, tau_nats=0.0)
     seeds = (0, 1, 2, 3, 4)
     lines = {f"{s.id}/v1": says([0.3, 0.4, 0.3]) for s in all_scenes(small)}
-    lines |= {f"{s.id}/v{n}": sure("SLOWER", "helper") for s in all_scenes(small) for n in (2, 3, 4)}
+    lines |= {
+        f"{s.id}/v{n}": sure("SLOWER", "helper") for s in all_scenes(small) for n in (2, 3, 4)
+    }
     told = walked(spec_of(small, points=(lossy,), seeds=seeds), Scripted(lines))
     by_seed = [np.mean([e.success for e in told.episodes if e.seed == seed]) for seed in seeds]
     assert len(set(by_seed)) > 1, "seeds that all agree would not show the interval"
     row = figure(told, "lossy", "success_rate", "seed means")
-    half = stats.t.ppf(0.975, 16) * math.sqrt(20 * 2 * (1 - 1 / 5) / 16 + 2) / 20  # one of 5 seeds, twice
+    # one of 5 seeds, twice
+    half = stats.t.ppf(0.975, 16) * math.sqrt(20 * 2 * (1 - 1 / 5) / 16 + 2) / 20
     assert (row.value, row.low, row.high) == pytest.approx((np.mean(by_seed), 0.0, 0.1 + half))
     assert (row.n, row.n_excluded) == (5, 0)
 
@@ -307,19 +339,25 @@ def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: Walked) -> No
     assert (row.low, row.high) == pytest.approx((0.5 - half, 0.5 + half))
 
 
-# -- failed answers ---------------------------------------------------------------------------------------
+# -- failed answers
+# ---------------------------------------------------------------------------------------
 
 
 def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:
     """Uniform over three actions: ln 3 = 1.099 nats, above the threshold of 0.7."""
     spec = spec_of(played, points=(CLEAR,), seeds=(0,))
     lines = {**SAID, "00000-0/v1": "no idea", "00001-0/v1": ""}
-    told, intents = walked(spec, Scripted(lines)), asker_of(spec, Scripted(lines))(scenes_of(played))
+    told, intents = (
+        walked(spec, Scripted(lines)),
+        asker_of(spec, Scripted(lines))(scenes_of(played)),
+    )
     failing = [0, 2]
     assert np.isnan(intents.own[failing]).all()
     assert told.result(CLEAR, "own_failed") == [i in failing for i in range(7)]
     assert [told.result(CLEAR, "own")[i] for i in failing] == [pytest.approx([1 / 3] * 3)] * 2
-    assert [told.result(CLEAR, "entropy_nats")[i] for i in failing] == pytest.approx([math.log(3)] * 2)
+    assert [told.result(CLEAR, "entropy_nats")[i] for i in failing] == pytest.approx(
+        [math.log(3)] * 2
+    )
     assert told.result(CLEAR, "triggered") == [i in failing for i in range(7)]
     assert value(told, "clear", "fallback_rate")[0] == (1 / 2 + 1 / 2) / 4
     assert value(told, "all", "failed_rate_ego", "answers") == (2 / 7, 7, 0)
@@ -342,7 +380,10 @@ def test_alone_an_undecided_ego_takes_the_most_careful_action_where_ties_fall_to
     [
         ("", "empty"),
         ("The lorry hides a car.", "no_json"),
-        ('{"evidence": "a", "risk": "low", "action_distribution": {"SLOWER": 0.7, "IDLE"', "truncated_json"),
+        (
+            '{"evidence": "a", "risk": "low", "action_distribution": {"SLOWER": 0.7, "IDLE"',
+            "truncated_json",
+        ),
         (failed("00001-0/v3", "CUDA out of memory"), "engine_error"),
     ],
 )
@@ -362,10 +403,14 @@ def test_a_helper_whose_answer_failed_sends_nothing(
 
 
 def test_every_answer_takes_what_is_declared_for_its_role(small: Dataset) -> None:
-    """Whatever it took; one that its proxy makes slower takes that on top, and who was not asked no time."""
+    """Whatever it took; one that its proxy makes slower takes that on top,
+    and who was not asked no time.
+    """
     asked = {r.role: r for r in requests(spec_of(small), scenes_of(small)[:1])}
 
-    def took(role: Role, seconds: float | None, slow_s: float = 0.0, error: str | None = None) -> Answer:
+    def took(
+        role: Role, seconds: float | None, slow_s: float = 0.0, error: str | None = None
+    ) -> Answer:
         said = Completion(
             asked[role].id, sure("IDLE", role), None, None, "stop", seconds, 1, error, slow_s=slow_s
         )

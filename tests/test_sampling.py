@@ -29,15 +29,19 @@ from harness.runs.folder import read
 
 ACTIONS = ("SLOWER", "IDLE", "FASTER")
 LOG_P = np.log([0.1, 0.2, 0.3, 0.4])
-logits = st.lists(st.integers(-800, 800).map(lambda n: n / 100), min_size=1, max_size=9, unique=True)
+logits = st.lists(
+    st.integers(-800, 800).map(lambda n: n / 100), min_size=1, max_size=9, unique=True
+)
 shares = st.floats(0, 1, exclude_max=True)
 
 
-# -- one token, by hand -------------------------------------------------------------------------------------
+# -- one token, by hand
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("u", "token"), [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.2999, 1), (0.3001, 2), (0.6001, 3), (0.9999, 3)]
+    ("u", "token"),
+    [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.2999, 1), (0.3001, 2), (0.6001, 3), (0.9999, 3)],
 )
 def test_tokens_have_their_share_of_the_draws(u: float, token: int) -> None:
     assert drawn(LOG_P, None, 1.0, u) == token
@@ -46,7 +50,8 @@ def test_tokens_have_their_share_of_the_draws(u: float, token: int) -> None:
 def test_a_temperature_of_a_half_squares_the_shares() -> None:
     """1 : 4 : 9 : 16 of 30."""
     ends = [
-        drawn(LOG_P, None, 0.5, u) for u in (0.9 / 30, 1.1 / 30, 4.9 / 30, 5.1 / 30, 13.9 / 30, 14.1 / 30)
+        drawn(LOG_P, None, 0.5, u)
+        for u in (0.9 / 30, 1.1 / 30, 4.9 / 30, 5.1 / 30, 13.9 / 30, 14.1 / 30)
     ]
     assert ends == [0, 1, 1, 2, 2, 3]
 
@@ -62,14 +67,17 @@ def test_the_colder_the_more_greedy(values: list[float], u: float) -> None:
 
 
 @given(logits, shares, st.floats(0.01, 2), st.data())
-def test_a_draw_is_allowed_and_possible(values: list[float], u: float, heat: float, data: Any) -> None:
+def test_a_draw_is_allowed_and_possible(
+    values: list[float], u: float, heat: float, data: Any
+) -> None:
     some = data.draw(st.lists(st.integers(0, len(values) - 1), min_size=1, unique=True))
     barred = np.array([*values, -np.inf])
     assert drawn(barred, some, heat, u) in some
     assert drawn(barred, None, heat, u) < len(values)
 
 
-# -- a real tiny model --------------------------------------------------------------------------------------
+# -- a real tiny model
+# --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +89,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_qwen3.build(tmp_path_factory.mktemp("models") / "tiny", context_tokens=2048)
 
 
-@pytest.fixture(scope="module", params=["transformers", pytest.param("llama-cpp", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=["transformers", pytest.param("llama-cpp", marks=pytest.mark.slow)]
+)
 def card(request: pytest.FixtureRequest, tiny: Path) -> Card:
     if request.param == "transformers":
         return resolve(str(tiny))
@@ -129,7 +139,9 @@ def test_a_cold_answer_is_the_greedy_one(card: Card, answer: AnswerMode) -> None
 def test_a_drawn_constrained_answer_is_read(card: Card) -> None:
     texts = said(card, [ask(1, "constrained", temperature=2.0, sample=s) for s in range(12)])
     assert len(set(texts)) > 6
-    assert None not in {parse(text, role="ego", actions=ACTIONS, divides=True).intent for text in texts}
+    assert None not in {
+        parse(text, role="ego", actions=ACTIONS, divides=True).intent for text in texts
+    }
 
 
 def test_greedy_and_drawn_answers_share_a_batch(card: Card) -> None:
@@ -138,7 +150,9 @@ def test_greedy_and_drawn_answers_share_a_batch(card: Card) -> None:
 
 
 def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
-    """The first token of 600 answers to one question: the likeliest ones' shares within 4 standard errors."""
+    """The first token of 600 answers to one question:
+    the likeliest ones' shares within 4 standard errors.
+    """
     import torch
 
     from harness.backends.language_model import LanguageModel
@@ -153,17 +167,21 @@ def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
     p = row.softmax(-1).numpy()
     n = 600
     texts = [
-        c.text for c in hot.complete([ask(2, max_tokens=1, temperature=1.5, sample=s) for s in range(n)])
+        c.text
+        for c in hot.complete([ask(2, max_tokens=1, temperature=1.5, sample=s) for s in range(n)])
     ]
     for token in np.argsort(p)[::-1][:4].tolist():
         text = "" if token in hot.engine.stops else hot.chat.decode([token])
         expected = (
-            sum(float(p[t]) for t in range(len(p)) if hot.chat.decode([t]) == text) if text else p[token]
+            sum(float(p[t]) for t in range(len(p)) if hot.chat.decode([t]) == text)
+            if text
+            else p[token]
         )
         assert abs(texts.count(text) / n - expected) < 4 * (expected * (1 - expected) / n) ** 0.5
 
 
-# -- what a server is sent ----------------------------------------------------------------------------------
+# -- what a server is sent
+# ----------------------------------------------------------------------------------
 
 
 def test_a_server_is_sent_temperature_and_seed() -> None:
@@ -180,14 +198,21 @@ def test_a_server_is_sent_temperature_and_seed() -> None:
     assert (greedy["temperature"], greedy["seed"]) == (0, 0)
 
 
-# -- a run --------------------------------------------------------------------------------------------------
+# -- a run
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_path: Path) -> None:
     alone = (POINTS["single-local"],)
     spec = spec_of(
-        small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=2, points=alone
+        small,
+        str(tiny),
+        answer="constrained",
+        temperature=1.0,
+        sampling_seed=1,
+        limit=2,
+        points=alone,
     )
     one, again = (run(spec.changed(batch_size=n), tmp_path / str(n)) for n in (8, 3))
     assert same_decisions(one.out, again.out)
@@ -202,7 +227,10 @@ def test_in_a_mix_the_half_that_writes_is_drawn(small: Dataset, tiny: Path) -> N
     rule, asked = spec_of(small).ego, {"temperature": 0.7, "sampling_seed": 3}
     for spec, drawn_role in (
         (spec_of(small, str(tiny), helpers=(rule,), **asked), "ego"),
-        (replace(spec_of(small, str(tiny), **asked), ego=rule, helpers=(agent_of(tiny),)), "helper"),
+        (
+            replace(spec_of(small, str(tiny), **asked), ego=rule, helpers=(agent_of(tiny),)),
+            "helper",
+        ),
         (replace(spec_of(small, str(tiny), **asked), helpers=(agent_of(tiny, "readout"),)), "ego"),
     ):
         found = {(r.role, r.temperature, r.sample) for r in requests(spec, scenes_of(small)[:1])}
@@ -229,7 +257,13 @@ def test_a_replay_asks_on_as_the_run_was_asked(
     )
     alone, both = (POINTS["single-local"],), (POINTS["single-local"], POINTS["6g"])
     spec = spec_of(
-        small, str(tiny), answer="constrained", temperature=1.0, sampling_seed=1, limit=1, points=both
+        small,
+        str(tiny),
+        answer="constrained",
+        temperature=1.0,
+        sampling_seed=1,
+        limit=1,
+        points=both,
     )
     stored = run(replace(spec, points=alone), tmp_path / "stored")
     replayed = spec_of(small, f"replay:{stored.out}", answer="constrained", limit=1, points=both)
@@ -242,16 +276,23 @@ def test_a_replay_asks_on_as_the_run_was_asked(
     ("options", "said"),
     [
         ({"temperature": 0.7}, "--temperature 0.7: proxy has nothing to sample; leave it out"),
-        ({"temperature": -1.0}, "--temperature -1: give 0, which takes the likeliest token each time, to 2"),
+        (
+            {"temperature": -1.0},
+            "--temperature -1: give 0, which takes the likeliest token each time, to 2",
+        ),
         ({"temperature": float("nan")}, "--temperature nan: give 0"),
         ({"sampling_seed": 2}, "--sampling-seed 2: give 0 or more, with a --temperature above 0"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(small: Dataset, options: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_drawn_is_refused(
+    small: Dataset, options: dict[str, Any], said: str
+) -> None:
     with pytest.raises(UserError, match=said):
         spec_of(small, **options)
 
 
 def test_a_read_out_is_not_drawn(small: Dataset, tiny: Path) -> None:
-    with pytest.raises(UserError, match=r"--temperature 0.7: a readout is a distribution already; use"):
+    with pytest.raises(
+        UserError, match=r"--temperature 0.7: a readout is a distribution already; use"
+    ):
         spec_of(small, str(tiny), answer="readout", temperature=0.7)

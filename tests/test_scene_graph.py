@@ -33,7 +33,9 @@ def shown(text: str, seen: SceneGraph) -> str:
 
 
 def kinds(value: Any) -> set[type]:
-    inner = [*value, *value.values()] if type(value) is dict else value if type(value) is list else []
+    inner = (
+        [*value, *value.values()] if type(value) is dict else value if type(value) is list else []
+    )
     return {type(value)}.union(*map(kinds, inner))
 
 
@@ -42,7 +44,9 @@ def test_a_released_record_that_is_read_is_written_as_it_was(name: str) -> None:
     dataset = first(name)
     kind, tree = plain_type(dataset.scenario), dataset.trees[0]
     with opened(dataset.path) as file:
-        for line in (line for step in range(len(tree.levels)) for line in read_level(file, tree, step)):
+        for line in (
+            line for step in range(len(tree.levels)) for line in read_level(file, tree, step)
+        ):
             record = msgspec.json.decode(line, type=kind)
             assert canonical_json(msgspec.to_builtins(record)).encode() == line
 
@@ -58,7 +62,10 @@ def test_a_template_reads_plain_data_alone(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "there"),
-    [("occluded-intersection-v2", "False False False False"), ("do-not-pass-v1", "True True True True")],
+    [
+        ("occluded-intersection-v2", "False False False False"),
+        ("do-not-pass-v1", "True True True True"),
+    ],
 )
 def test_what_is_not_in_the_file_is_undefined_to_a_template(name: str, there: str) -> None:
     dataset = first(name)
@@ -68,7 +75,9 @@ def test_what_is_not_in_the_file_is_undefined_to_a_template(name: str, there: st
     assert shown(" ".join(f"{{{{ graph.{member} is defined }}}}" for member in asks), seen) == there
 
 
-@pytest.mark.parametrize("member", ["blinded", "plain", "seen", "itself", "__class__", "__struct_fields__"])
+@pytest.mark.parametrize(
+    "member", ["blinded", "plain", "seen", "itself", "__class__", "__struct_fields__"]
+)
 def test_no_member_of_the_class_is_one_of_the_graph(member: str) -> None:
     seen, _ = CASES["ego-occluded"]
     assert shown("{{ graph.viewer }}", seen) == "v1"

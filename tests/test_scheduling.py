@@ -1,8 +1,8 @@
 """Whom the ego asks, and when: every schedule played by hand, and what holds for all of them.
 
-One scene throughout. The ego is in doubt: .5, .3, .2, which is 1.0297 nats, and its margin is .2. It does not
-see 80 % of the left region and 40 % of the right. The helpers at 10, 20 and 30 m see, of what it does not, 0,
-50 and 60 % of the left, and 10, 10 and 40 % of the right.
+One scene throughout. The ego is in doubt: .5, .3, .2, which is 1.0297 nats, and its margin is .2.
+It does not see 80 % of the left region and 40 % of the right. The helpers at 10, 20 and 30 m see,
+of what it does not, 0, 50 and 60 % of the left, and 10, 10 and 40 % of the right.
 """
 
 from dataclasses import fields, replace
@@ -19,7 +19,14 @@ from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import Formula, Outlook, Schedule, ScheduleInputs, always, chosen
+from harness.coordination.scheduling import (
+    Formula,
+    Outlook,
+    Schedule,
+    ScheduleInputs,
+    always,
+    chosen,
+)
 from harness.core.errors import UserError
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
@@ -36,7 +43,9 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCHEDULES._loaded, "near", NEAR)
 
 
-def scene(own=(0.5, 0.3, 0.2), range_m=(10.0, 20.0, 30.0), valid=(True, True, True), unseen=(0.8, 0.4)):
+def scene(
+    own=(0.5, 0.3, 0.2), range_m=(10.0, 20.0, 30.0), valid=(True, True, True), unseen=(0.8, 0.4)
+):
     added = np.array([(0.0, 0.1), (0.5, 0.1), (0.6, 0.4)])
     return Intents(
         np.array(own), np.full((3, 3), 1 / 3), np.array(valid), np.full(4, 10.0), np.array(range_m),
@@ -110,17 +119,23 @@ def wide(intents: Intents, n: int) -> Intents:
 
 
 def test_random_asks_in_its_share_of_decisions_whatever_the_channel_draws():
-    """Lots are keyed by seed, layout and step, and a larger share asks wherever a smaller one did."""
+    """Lots are keyed by seed, layout and step,
+    and a larger share asks wherever a smaller one did.
+    """
     places = np.array(
         [(seed, layout, step) for seed in range(5) for layout in range(40) for step in range(6)]
     )
     lots = Draws(
-        np.full((1200, 3, 2), 0.9), np.zeros((1200, 3)), Trips(places[:, 0], places[:, 1], places[:, 2], 6)
+        np.full((1200, 3, 2), 0.9),
+        np.zeros((1200, 3)),
+        Trips(places[:, 0], places[:, 1], places[:, 2], 6),
     )
     point = SIXG.changed(schedule="random")
 
     def asks(share, at=lots):
-        return exchange(point.changed(threshold=1 - share), wide(scene(), 1200), at).asked.any(axis=1)
+        return exchange(point.changed(threshold=1 - share), wide(scene(), 1200), at).asked.any(
+            axis=1
+        )
 
     for share in (0.2, 0.5, 1.0):
         assert asks(share).mean() == pytest.approx(share, abs=0.045)  # 3 standard errors
@@ -133,7 +148,9 @@ def test_random_asks_in_its_share_of_decisions_whatever_the_channel_draws():
 
 @pytest.mark.parametrize("profile", ["v2x", "6g"])
 def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, monkeypatch):
-    """The share of 4000 decisions with draws of their own; what is expected looks at none of them."""
+    """The share of 4000 decisions with draws of their own;
+    what is expected looks at none of them.
+    """
     rng, expected = np.random.default_rng(3), []
 
     def spied(known: ScheduleInputs) -> np.ndarray:
@@ -148,7 +165,8 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
     assert (expected[0] == expected[0][0]).all()
 
 
-# -- every schedule ----------------------------------------------------------------------------------------
+# -- every schedule
+# ----------------------------------------------------------------------------------------
 
 
 def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> ScheduleInputs:
@@ -175,7 +193,9 @@ def test_every_schedule_asks_whom_it_may_as_a_batch_and_one_at_a_time(name: str)
     schedule, every = SCHEDULES[name], known(np.random.default_rng(5))
     assert isinstance(schedule, Schedule)
     assert set(schedule.needs) <= {"in_time", "outlook", "lot"}
-    blind = replace(every, **{n: None for n in ("in_time", "outlook", "lot") if n not in schedule.needs})
+    blind = replace(
+        every, **{n: None for n in ("in_time", "outlook", "lot") if n not in schedule.needs}
+    )
     worth = schedule.worth(blind)
     assert worth.shape in ((40, 4), (40, 1))
     previous = None
@@ -189,7 +209,9 @@ def test_every_schedule_asks_whom_it_may_as_a_batch_and_one_at_a_time(name: str)
             )
             assert single.tolist() == who[7].tolist()
         if previous is not None:
-            assert not (who & ~previous).any(), "a higher threshold asks nobody whom a lower one did not"
+            assert not (who & ~previous).any(), (
+                "a higher threshold asks nobody whom a lower one did not"
+            )
         previous = who
 
 
@@ -199,7 +221,9 @@ def test_every_schedule_asks_whom_it_may_as_a_batch_and_one_at_a_time(name: str)
     arrays(bool, (5, 4)),
     st.integers(0, 5),
 )
-def test_of_those_worth_it_the_most_worth_are_asked_and_of_equals_the_nearest(worth, range_m, may_ask, most):
+def test_of_those_worth_it_the_most_worth_are_asked_and_of_equals_the_nearest(
+    worth, range_m, may_ask, most
+):
     who = chosen(worth, 0.1, may_ask, range_m, most)
     for i in range(5):
         able = [h for h in range(4) if may_ask[i, h] and worth[i, h] > 0.1]
@@ -222,7 +246,8 @@ NEVER = named_point("6g:schedule=never")
 
 def same(a: Exchange, b: Exchange) -> bool:
     return all(
-        np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=True) for f in fields(Exchange)
+        np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=True)
+        for f in fields(Exchange)
     )
 
 
@@ -240,10 +265,22 @@ def test_asking_whom_a_schedule_asks_is_the_same_exchange():
             "6g:schedule=oracle",
             "schedule oracle looks at how scenes end; `harness study schedule compare` plays it",
         ),
-        ("6g:threshold=0.5", "threshold is 0.5; it must be left out where schedule is entropy: its is tau_n"),
-        ("6g:schedule=always,threshold=0.5", "it must be left out where schedule is always, which has none"),
-        ("6g:schedule=margin,threshold=-1", "threshold is -1.0; it must be a finite number, 0 or more"),
-        ("6g:schedule=margin,threshold=x", "threshold is 'x'; it must be a finite number, 0 or more"),
+        (
+            "6g:threshold=0.5",
+            "threshold is 0.5; it must be left out where schedule is entropy: its is tau_n",
+        ),
+        (
+            "6g:schedule=always,threshold=0.5",
+            "it must be left out where schedule is always, which has none",
+        ),
+        (
+            "6g:schedule=margin,threshold=-1",
+            "threshold is -1.0; it must be a finite number, 0 or more",
+        ),
+        (
+            "6g:schedule=margin,threshold=x",
+            "threshold is 'x'; it must be a finite number, 0 or more",
+        ),
     ],
 )
 def test_a_schedule_that_cannot_be_is_one_line(point, says):
@@ -256,4 +293,6 @@ def test_a_schedule_that_cannot_be_is_one_line(point, says):
 def test_the_papers_study_has_no_scene_to_look_at(name):
     nowhere = replace(scene(), outlook=None)
     with pytest.raises(UserError, match=f"schedule {name} needs vehicles that are somewhere"):
-        exchange(named_point(f"6g:schedule={name}"), nowhere, Draws(np.full((3, 2), 0.9), np.zeros(3)))
+        exchange(
+            named_point(f"6g:schedule={name}"), nowhere, Draws(np.full((3, 2), 0.9), np.zeros(3))
+        )

@@ -92,4 +92,6 @@ def test_layout_seeds_in_the_documents_are_report_seeds_or_say_what_they_are(pag
         r"\b[Ss]eeds (\d[\d ]*) to (\d[\d ]*\d)(?:\s\((\w+)\))?", page.read_text()
     ):
         low, high = int(first.replace(" ", "")), int(last.replace(" ", ""))
-        assert purpose(low, high + 1 - low) == (said or "report"), f"{page.name}: seeds {first} to {last}"
+        assert purpose(low, high + 1 - low) == (said or "report"), (
+            f"{page.name}: seeds {first} to {last}"
+        )

@@ -1,4 +1,6 @@
-"""Which episodes of a dataset are evaluated: by number, by danger, drawn; and that a run says so."""
+"""Which episodes of a dataset are evaluated: by number, by danger, drawn;
+and that a run says so.
+"""
 
 import json
 import shlex
@@ -34,7 +36,9 @@ def test_numbers_ranges_dangers_and_the_first_are_joined(shipped: Dataset) -> No
 
 @given(st.integers(0, 50), st.integers(1, 59))
 def test_a_larger_sample_has_the_smaller_in_it(shipped: Dataset, seed: int, size: int) -> None:
-    small, large = (set(Selection(sample=n, sample_seed=seed).of(shipped).episodes) for n in (size, size + 1))
+    small, large = (
+        set(Selection(sample=n, sample_seed=seed).of(shipped).episodes) for n in (size, size + 1)
+    )
     assert small < large
     assert len(small) == size
 
@@ -46,7 +50,18 @@ def test_a_seed_draws_what_another_does_not(shipped: Dataset) -> None:
 
 @pytest.mark.slow
 def test_a_run_says_which_and_its_command_selects_them_again(harness: Callable[..., Any]) -> None:
-    words = ("--danger", "left", "--sample", "2", "--sample-seed", "7", "--condition", "6g", "--seeds", "3:4")
+    words = (
+        "--danger",
+        "left",
+        "--sample",
+        "2",
+        "--sample-seed",
+        "7",
+        "--condition",
+        "6g",
+        "--seeds",
+        "3:4",
+    )
     code, out, _ = harness("eval", *words, "--out", "a")
     assert code == 0
     assert "n = 2 episodes × 1 channel seed; of layout seeds 200000 to 200199 (report);" in out

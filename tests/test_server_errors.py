@@ -1,4 +1,6 @@
-"""Errors that a server sends with HTTP 200, in one piece or in a stream: their words, and what is retried."""
+"""Errors that a server sends with HTTP 200, in one piece or in a stream:
+their words, and what is retried.
+"""
 
 import json
 from typing import Any
@@ -31,14 +33,18 @@ def card(url: str) -> Card:
 
 
 def ask(*replies: Any, timed: bool = False, **headers: str) -> tuple[Completion, list[Asked]]:
-    """Ask once; the server gives these replies one after the other, and the last one from then on."""
+    """Ask once; the server gives these replies one after the other,
+    and the last one from then on.
+    """
 
     def play(asked: Asked) -> None:
         reply = replies[min(asked.number, len(replies) - 1)]
         asked.stream(*reply) if timed else asked.reply(reply, **headers)
 
     with serving(play) as there:
-        asking = Request("s/v1", "ego", ({"role": "user", "content": "?"},), ("A", "B"), 64, timed=timed)
+        asking = Request(
+            "s/v1", "ego", ({"role": "user", "content": "?"},), ("A", "B"), 64, timed=timed
+        )
         [done] = openai_backend.open(card(there.url), batch_size=1).complete([asking])
     return done, there.asked
 
@@ -87,7 +93,9 @@ def test_a_stream_says_it_too(error: Any) -> None:
     done, asked = ask([*begun, error], timed=True)
     assert done.error == f"the stream broke off: {WORDS}"
     coded = (
-        isinstance(error, dict) and isinstance(error.get("error"), dict) and error["error"].get("code") == 400
+        isinstance(error, dict)
+        and isinstance(error.get("error"), dict)
+        and error["error"].get("code") == 400
     )
     assert len(asked) == (1 if coded else 3), "a stream that breaks off may go through next time"
     done, asked = ask([*begun, error], pieces("hello"), timed=True)
@@ -111,7 +119,10 @@ def test_a_list_of_models_that_is_an_error_is_none(monkeypatch: pytest.MonkeyPat
     def listed(asked: Asked) -> None:
         asked.reply({"error": {"message": "no such key", "code": 401}})
 
-    with serving(lambda asked: None, listed) as there, pytest.raises(UserError, match="refuses the key"):
+    with (
+        serving(lambda asked: None, listed) as there,
+        pytest.raises(UserError, match="refuses the key"),
+    ):
         openai_backend.open(card(there.url), batch_size=1)
 
 

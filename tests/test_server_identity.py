@@ -1,4 +1,6 @@
-"""A server's statements are the model's identity: other weights, template or context are another model."""
+"""A server's statements are the model's identity:
+other weights, template or context are another model.
+"""
 
 import json
 from collections.abc import Callable
@@ -52,7 +54,9 @@ OLLAMA: Paths = {
          "details": {"format": "gguf", "families": None, "quantization_level": "Q4_0"}},
         {"name": "n:latest", "digest": "fe93"},
     ]},
-    "/api/show": {"template": "{{ .Prompt }}", "parameters": "num_ctx 4096", "modified_at": "2026-01-01",
+    "/api/show": {"template": 
+        "{{ "
+        ".Prompt }}", "parameters": "num_ctx 4096", "modified_at": "2026-01-01",
                   "details": {"parameter_size": "4B"}, "model_info": {"general.parameter_count": 4000}},
 }  # fmt: skip
 STUDIO: Paths = {
@@ -96,7 +100,9 @@ def changed(paths: Paths, path: str, *steps: Any, to: Any) -> Paths:
 
 def opened(url: str, kind: Kind) -> openai_backend.OpenAIBackend:
     where = Server(url, kind, key_env="NO_KEY", timeout_s=20.0, retries=0)
-    return openai_backend.open(Card("mine", "openai", "d", Latency("paper", None, "b"), "m", server=where))
+    return openai_backend.open(
+        Card("mine", "openai", "d", Latency("paper", None, "b"), "m", server=where)
+    )
 
 
 def identity(kind: Kind, paths: Paths) -> dict[str, Any]:
@@ -119,7 +125,10 @@ def test_a_llama_server_states_its_file_template_context_and_size() -> None:
 
 def test_an_ollama_states_its_digest_template_and_parameters() -> None:
     found = identity("ollama", OLLAMA)
-    assert (found["listed"], found["version"]) == ({"id": "m:latest", "owned_by": "library"}, "0.12.3")
+    assert (found["listed"], found["version"]) == (
+        {"id": "m:latest", "owned_by": "library"},
+        "0.12.3",
+    )
     assert found["states"] == {
         "details.parameter_size": "4B", "digest": "9f43", "model_info": '{"general.parameter_count": 4000}',
         "parameters": "num_ctx 4096", "size": 77, "template": "{{ .Prompt }}",
@@ -159,13 +168,17 @@ ALIKE: list[tuple[Kind, tuple[Any, ...], Any]] = [
 
 
 @pytest.mark.parametrize(("kind", "steps", "to"), OTHER)
-def test_what_is_served_otherwise_is_another_model(kind: Kind, steps: tuple[Any, ...], to: Any) -> None:
+def test_what_is_served_otherwise_is_another_model(
+    kind: Kind, steps: tuple[Any, ...], to: Any
+) -> None:
     paths = SERVERS[kind]
     assert digest(identity(kind, paths)) != digest(identity(kind, changed(paths, *steps, to=to)))
 
 
 @pytest.mark.parametrize(("kind", "steps", "to"), ALIKE)
-def test_what_a_new_start_changes_is_the_same_model(kind: Kind, steps: tuple[Any, ...], to: Any) -> None:
+def test_what_a_new_start_changes_is_the_same_model(
+    kind: Kind, steps: tuple[Any, ...], to: Any
+) -> None:
     paths = SERVERS[kind]
     assert identity(kind, paths) == identity(kind, changed(paths, *steps, to=to))
 
@@ -180,7 +193,10 @@ def test_a_server_that_states_nothing_more_is_opened_all_the_same(kind: Kind) ->
 
 def test_two_servers_with_other_templates_are_one_line_that_says_in_what_they_differ() -> None:
     other = changed(LLAMA, "/props", "chat_template", to="short")
-    with serving(lambda a: None, answering(LLAMA)) as one, serving(lambda a: None, answering(other)) as two:
+    with (
+        serving(lambda a: None, answering(LLAMA)) as one,
+        serving(lambda a: None, answering(other)) as two,
+    ):
         where = Server((one.url, two.url), "llama-server", key_env="NO_KEY")
         card = Card("mine", "openai", "d", Latency("paper", None, "b"), "m", server=where)
         with pytest.raises(
@@ -190,7 +206,9 @@ def test_two_servers_with_other_templates_are_one_line_that_says_in_what_they_di
 
 
 def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() -> None:
-    """It did not store what a server states, which is no other model; what it stored must be the same."""
+    """It did not store what a server states, which is no other model;
+    what it stored must be the same.
+    """
     now = identity("llama-server", LLAMA)
     before = {key: value for key, value in now.items() if key != "states"}
     other = {**now, "states": {**now["states"], "meta.size": 1}}
@@ -205,7 +223,8 @@ def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() ->
     assert not same_model({**before, "helpers": 3}, {**now, "helpers": [now]})
 
 
-# -- the cache follows --------------------------------------------------------------------------------------
+# -- the cache follows
+# --------------------------------------------------------------------------------------
 
 
 def request(name: str = "s/v1") -> Request:
@@ -220,7 +239,9 @@ def test_swapped_weights_are_asked_again(tmp_path: Path, capfd: pytest.CaptureFi
         [done] = backend.complete([request()])
         return done.text, done.cached
 
-    with serving(lambda asked: asked.reply(completion(texts[0])), lambda a: answering(paths)(a)) as there:
+    with serving(
+        lambda asked: asked.reply(completion(texts[0])), lambda a: answering(paths)(a)
+    ) as there:
         card = Card("mine", "openai", "d", Latency("paper", None, "b"), "m")
         assert asked_once() == ("one", False)
         assert asked_once() == ("one", True)
@@ -242,12 +263,14 @@ def test_a_server_that_cannot_tell_its_weights_is_doubted_once_and_where_it_matt
         for _ in range(2):
             cached(opened(there.url, kind), card, tmp_path / "kept").complete([request("a")])
     assert capfd.readouterr().err == (
-        "harness: model 'mine': some answers come from the completion cache, and its server does not say "
+        "harness: model 'mine': some answers come from the completion cache, and its server does "
+        "not say "
         "which weights it has; if these have changed since, use --no-cache\n"
     )
 
 
-# -- hostile servers ----------------------------------------------------------------------------------------
+# -- hostile servers
+# ----------------------------------------------------------------------------------------
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -277,7 +300,9 @@ def is_short(facts: dict[str, Any], kind: Kind) -> None:
     from harness.backends.openai.http import Reply
 
     async def ask(path: str, content: bytes | None) -> Reply:
-        return Reply({**facts, "models": [facts], "data": [facts], "default_generation_settings": facts})
+        return Reply(
+            {**facts, "models": [facts], "data": [facts], "default_generation_settings": facts}
+        )
 
     model = asyncio.run(read_statement(kind, "m", {"data": [{**facts, "id": "m"}]}, ask))
     text = canonical_json([model.listed, model.version, dict(model.states)])

@@ -13,7 +13,10 @@ from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 
 LISTED = {"data": [{"id": "m", "owned_by": "tests"}]}
-CHAT = ({"role": "system", "content": "You drive. \n"}, {"role": "user", "content": "A lorry ahead."})
+CHAT = (
+    {"role": "system", "content": "You drive. \n"},
+    {"role": "user", "content": "A lorry ahead."},
+)
 Tell = Callable[[list[Any]], Any]
 
 
@@ -26,7 +29,9 @@ def users(messages: list[Any]) -> list[Any]:
 
 
 def asked_of(kind: Any, tell: Tell, system: Any = None) -> tuple[list[str], list[str]]:
-    """Paths that a server of a kind was asked, and its answers; `tell` says what its model reads."""
+    """Paths that a server of a kind was asked, and its answers;
+    `tell` says what its model reads.
+    """
     paths: list[str] = []
 
     def play(asked: Asked) -> None:
@@ -34,13 +39,17 @@ def asked_of(kind: Any, tell: Tell, system: Any = None) -> tuple[list[str], list
             asked.reply(LISTED)
             return
         paths.append(asked.path)
-        asked.reply(completion() if asked.path.endswith("completions") else tell(asked.body["messages"]))
+        asked.reply(
+            completion() if asked.path.endswith("completions") else tell(asked.body["messages"])
+        )
 
     with serving(play, play) as server:
         card = cards.load("openai-example")
         assert card.server
         there = replace(card.server, kind=kind, base_url=server.url, retries=0)
-        backend = open_backend(replace(card, weights="m", server=there, system=system), batch_size=2)
+        backend = open_backend(
+            replace(card, weights="m", server=there, system=system), batch_size=2
+        )
         requests = [Request(f"{n}/v1", "ego", CHAT, ("A",), 9) for n in range(2)]
         texts = [answer.text for _ in range(2) for answer in backend.complete(requests)]
     return paths, texts
@@ -53,7 +62,9 @@ def asked_of(kind: Any, tell: Tell, system: Any = None) -> tuple[list[str], list
      ("llama-server", lambda messages: {"error": "no such thing"}, "/apply-template", 1),
      ("vllm", lambda messages: [], "/tokenize", 2), ("generic", lambda messages: None, "/", 0)],
 )  # fmt: skip
-def test_a_server_is_asked_once_and_then_answers(kind: str, tell: Tell, path: str, times: int) -> None:
+def test_a_server_is_asked_once_and_then_answers(
+    kind: str, tell: Tell, path: str, times: int
+) -> None:
     paths, texts = asked_of(kind, tell)
     assert paths == [path] * times + ["/v1/chat/completions"] * 4
     assert texts == ["hello"] * 4
@@ -74,11 +85,15 @@ def test_a_server_that_drops_the_system_text_answers_nothing(kind: str, tell: Te
 
 
 def test_a_card_with_the_system_text_in_the_first_user_turn_is_served() -> None:
-    _, texts = asked_of("llama-server", lambda messages: {"prompt": said(users(messages))}, "first-user")
+    _, texts = asked_of(
+        "llama-server", lambda messages: {"prompt": said(users(messages))}, "first-user"
+    )
     assert texts == ["hello"] * 4
 
 
-@pytest.mark.parametrize(("counts", "said_once"), [((40, 90), False), ((40, 40), True), ((40, 30), True)])
+@pytest.mark.parametrize(
+    ("counts", "said_once"), [((40, 90), False), ((40, 40), True), ((40, 30), True)]
+)
 def test_it_is_said_once_if_longer_prompts_have_no_more_tokens(
     counts: tuple[int, int], said_once: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -87,7 +102,9 @@ def test_it_is_said_once_if_longer_prompts_have_no_more_tokens(
             asked.reply(LISTED)
             return
         long = len(asked.body["messages"][1]["content"]) > 100
-        asked.reply({**completion(), "usage": {"prompt_tokens": counts[long], "completion_tokens": 1}})
+        asked.reply(
+            {**completion(), "usage": {"prompt_tokens": counts[long], "completion_tokens": 1}}
+        )
 
     longer = (CHAT[0], {"role": "user", "content": "A lorry ahead. " * 10})
     with serving(play, play) as server:

@@ -1,4 +1,6 @@
-"""Answers of servers in shapes of their own: why they end, refusals, contents in parts, packed bodies."""
+"""Answers of servers in shapes of their own:
+why they end, refusals, contents in parts, packed bodies.
+"""
 
 import gzip
 import json
@@ -41,7 +43,9 @@ def request(answer: AnswerMode = "json", timed: bool = False, **more: Any) -> Re
 
 
 def ask(*replies: Any, timed: bool = False, **headers: str) -> tuple[Completion, list[Asked]]:
-    """Ask once; the server gives these replies one after the other, and the last one from then on."""
+    """Ask once; the server gives these replies one after the other,
+    and the last one from then on.
+    """
 
     def play(asked: Asked) -> None:
         asked.reply(replies[min(asked.number, len(replies) - 1)], **headers)
@@ -61,7 +65,8 @@ def streamed(*deltas: dict[str, Any], finish_reason: str = "stop") -> Stream:
     return stream
 
 
-# -- why it ends --------------------------------------------------------------------------------------------
+# -- why it ends
+# --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("finish", ["error", "abort", "ABORTED", "insufficient_system_resource"])
@@ -89,16 +94,20 @@ def test_what_the_server_says_of_its_error_goes_before_the_reason() -> None:
 def test_a_text_that_was_cut_off_is_so_by_any_name(finish: str) -> None:
     assert read(completion(GOOD[:20], finish), request()).finish_reason == "length"
     assert (
-        read(streamed({"content": "{"}, finish_reason=finish).payload(), request()).finish_reason == "length"
+        read(streamed({"content": "{"}, finish_reason=finish).payload(), request()).finish_reason
+        == "length"
     )
 
 
-@pytest.mark.parametrize("finish", ["stop", "eos", "COMPLETE", "end_turn", "tool_calls", "", 3, ["length"]])
+@pytest.mark.parametrize(
+    "finish", ["stop", "eos", "COMPLETE", "end_turn", "tool_calls", "", 3, ["length"]]
+)
 def test_any_other_word_says_that_it_is_whole(finish: Any) -> None:
     assert read(completion(GOOD, finish), request()).finish_reason == "stop"
 
 
-# -- refusals -----------------------------------------------------------------------------------------------
+# -- refusals
+# -----------------------------------------------------------------------------------------------
 
 NO = "I cannot help with driving."
 
@@ -137,12 +146,15 @@ def test_a_refusal_in_one_of_several_orders_is_that_of_all() -> None:
     messages = ({"role": "user", "content": "?"},)
     orders = request("readout", orders=(messages, messages))
     with serving(lambda asked: asked.reply(completion(None, refusal=NO))) as there:
-        card = Card("mine", "openai", "d", Latency("paper", None, "b"), "m", server=Server(there.url))
+        card = Card(
+            "mine", "openai", "d", Latency("paper", None, "b"), "m", server=Server(there.url)
+        )
         [done] = openai_backend.open(card, batch_size=1).complete([orders])
     assert (done.finish_reason, done.text, done.request_id) == ("refusal", NO, "s/v1")
 
 
-# -- contents in parts --------------------------------------------------------------------------------------
+# -- contents in parts
+# --------------------------------------------------------------------------------------
 
 TEXT = {"type": "text", "text": GOOD}
 THINKS = {"type": "thinking", "thinking": [{"type": "text", "text": THOUGHT}]}
@@ -206,7 +218,8 @@ def test_whatever_parts_come_are_texts_or_an_error(parts: list[Any]) -> None:
     assert said.error is None or said.error.isprintable()
 
 
-# -- packed bodies ------------------------------------------------------------------------------------------
+# -- packed bodies
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -243,11 +256,15 @@ def test_a_mark_that_comes_in_pieces_is_no_text() -> None:
 @pytest.mark.parametrize(
     ("packed", "coding", "said"),
     [
-        (WHOLE, "br", "the answer is compressed (Content-Encoding: br), though it was asked for as it is; "
+        (WHOLE, "br", 
+            "the answer is compressed (Content-Encoding: br), "
+            "though it was asked for as it is; "
          "have the server, or the proxy before it, leave it so"),
         (WHOLE, "gzip", "the answer is no gzip, though its Content-Encoding says so"),
         (gzip.compress(WHOLE), "", "the answer is no JSON: it begins '\\x1f"),
-        (gzip.compress(b" " * (MOST_BYTES + 1)), "gzip", f"the answer is longer than {MOST_BYTES} bytes"),
+        (gzip.compress(b" " * (MOST_BYTES + 1)), "gzip", 
+            "the answer is longer "
+            f"than {MOST_BYTES} bytes"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_unpacked_is_an_error_that_names_the_cause(
@@ -260,7 +277,9 @@ def test_what_cannot_be_unpacked_is_an_error_that_names_the_cause(
 
 
 def test_a_packed_error_has_its_words() -> None:
-    done, _ = ask(gzip.compress(b'{"error": {"message": "too long", "code": 400}}'), content_encoding="gzip")
+    done, _ = ask(
+        gzip.compress(b'{"error": {"message": "too long", "code": 400}}'), content_encoding="gzip"
+    )
     assert done.error == "error 400 with HTTP 200: too long"
 
 

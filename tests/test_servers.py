@@ -1,4 +1,6 @@
-"""One model behind several servers: who is asked, who is set aside, and that no row depends on it."""
+"""One model behind several servers: who is asked, who is set aside,
+and that no row depends on it.
+"""
 
 import gc
 import json
@@ -77,23 +79,28 @@ def names(server: Server) -> list[str]:
 
 
 def opened(*servers: Server, batch_size: int = 4, **options: Any) -> openai_backend.OpenAIBackend:
-    return openai_backend.open(card(*(there.url for there in servers), **options), batch_size=batch_size)
+    return openai_backend.open(
+        card(*(there.url for there in servers), **options), batch_size=batch_size
+    )
 
 
-# -- who is asked -------------------------------------------------------------------------------------------
+# -- who is asked
+# -------------------------------------------------------------------------------------------
 
 
 def test_requests_of_a_decision_go_to_one_server_and_each_server_has_some_decisions() -> None:
     with serving(said_back) as one, serving(said_back) as other:
         backend, asked = opened(one, other), decisions(24)
-        for start in range(0, len(asked), 4):  # so few at a time that no server lacks work for the other
+        # so few at a time that no server lacks work for the other
+        for start in range(0, len(asked), 4):
             done = backend.complete(asked[start : start + 4])
             assert [c.text for c in done] == [r.id for r in asked[start : start + 4]]
         again = [c.text for r in asked for c in backend.complete([r])]
     assert again == [r.id for r in asked]
     of_one, of_other = ({name.partition("/")[0] for name in names(there)} for there in (one, other))
     assert not of_one & of_other
-    assert min(len(of_one), len(of_other)) >= 1  # ports are drawn: one has all once in eight million
+    # ports are drawn: one has all once in eight million
+    assert min(len(of_one), len(of_other)) >= 1
     assert len(one.asked) + len(other.asked) == 2 * len(asked)
 
 
@@ -131,12 +138,15 @@ def test_connections_stay_open_between_calls_and_are_closed_with_the_backend() -
         del backend
         gc.collect()
     until_s = time.monotonic() + 20
-    while set(threading.enumerate()) - before and time.monotonic() < until_s:  # the server's end as these do
+    # the server's end as these do
+    while set(threading.enumerate()) - before and time.monotonic() < until_s:
         time.sleep(0.01)
     assert not set(threading.enumerate()) - before
 
 
-def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Dataset, tmp_path: Path) -> None:
+def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(
+    small: Dataset, tmp_path: Path
+) -> None:
     """The first request of many is answered only when one of the second chunk has come."""
     second = threading.Event()
 
@@ -150,12 +160,16 @@ def test_a_chunk_does_not_wait_for_the_last_answer_of_the_one_before(small: Data
     with serving(play) as there:
         spec = with_ego(spec_of(small, batch_size=4), card=card(there.url))
         backend, asked, counts = opened(there), decisions(32), []
-        asker = Asker(spec, lambda: backend, PAPER, tmp_path / "answers.jsonl", progress=counts.append)
+        asker = Asker(
+            spec, lambda: backend, PAPER, tmp_path / "answers.jsonl", progress=counts.append
+        )
         asked += [request(f"t/v{v}") for v in range(3)]
         asker.ask([request("t/v9")])  # until something is answered, only a few are asked
         asker.ask(asked)
     assert list(asker.answers) == ["t/v9", *(r.id for r in asked)]
-    assert sorted(counts) == [1, 64, 67], "the last is too few to fill a batch, and goes with the others"
+    assert sorted(counts) == [1, 64, 67], (
+        "the last is too few to fill a batch, and goes with the others"
+    )
     assert {a.batch_size for a in list(asker.answers.values())[1:]} == {4}
 
 
@@ -169,7 +183,9 @@ def test_an_answer_that_had_company_has_no_time() -> None:
     with serving(play) as there:
         backend, done = opened(there), []
         calls = [
-            threading.Thread(target=lambda name=name: done.extend(backend.complete([request(name)])))
+            threading.Thread(
+                target=lambda name=name: done.extend(backend.complete([request(name)]))
+            )
             for name in "ab"
         ]
         for call in calls:
@@ -194,14 +210,17 @@ def test_a_server_that_is_gone_moves_no_decision_but_its_own(
     assert ranked(left) == ranked(left[::-1]) == [url for url in ranked(urls) if url != gone]
 
 
-# -- who is set aside ---------------------------------------------------------------------------------------
+# -- who is set aside
+# ---------------------------------------------------------------------------------------
 
 
 def broken(asked: Asked) -> None:
     asked.reply({"error": "out of memory"}, 503)
 
 
-def test_what_one_server_cannot_answer_another_does_at_once(capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_one_server_cannot_answer_another_does_at_once(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     """Three failures set it aside, so that it is asked no more."""
     with serving(broken) as one, serving(said_back) as other:
         asked = decisions(40)
@@ -222,7 +241,9 @@ def test_a_server_that_recovers_is_asked_again() -> None:
         (broken if down.is_set() else said_back)(asked)
 
     def listed(asked: Asked) -> None:
-        broken(asked) if down.is_set() and recovering.asked else asked.reply({"data": [{"id": "m"}]})
+        broken(asked) if down.is_set() and recovering.asked else asked.reply(
+            {"data": [{"id": "m"}]}
+        )
 
     with serving(play, listed) as recovering, serving(
         said_back, lambda asked: asked.reply({"data": [{"id": "m"}]})
@@ -249,9 +270,15 @@ def test_a_server_that_comes_back_with_another_model_ends_the_run(entry: Any) ->
     with serving(play, listed) as there:
         backend = opened(there, batch_size=1)
         if entry is None:
-            match = r"no server is left: http://127\.0\.0\.1:\d+/v1 \(the answer is no JSON: .*\); start one"
+            match = (
+                r"no server is left: http://127\.0\.0\.1:\d+/v1 \(the answer is no JSON: .*\); "
+                r"start one"
+            )
         else:
-            match = r"server http\S+ has id=m, and server http\S+ id=m root=/other; serve the same model"
+            match = (
+                r"server http\S+ has id=m, and server http\S+ id=m root=/other; serve the same "
+                r"model"
+            )
         with pytest.raises(UserError, match=match):
             backend.complete(decisions(10))
 
@@ -311,7 +338,8 @@ def test_a_header_that_is_none_says_nothing_on_the_terminal(
 
     def play(asked: Asked) -> None:
         asked.raw(
-            b"HTTP/1.1 200 OK\r\n%b\r\nContent-Length: %d\r\n\r\n%b" % (header.encode(), len(data), data)
+            b"HTTP/1.1 200 OK\r\n%b\r\nContent-Length: %d\r\n\r\n%b"
+            % (header.encode(), len(data), data)
         )
 
     with serving(play) as there:
@@ -320,7 +348,8 @@ def test_a_header_that_is_none_says_nothing_on_the_terminal(
     assert caplog.records == []
 
 
-# -- the same model -----------------------------------------------------------------------------------------
+# -- the same model
+# -----------------------------------------------------------------------------------------
 
 
 def lists(entry: Any, version: str | None = None) -> Play:
@@ -334,9 +363,11 @@ def lists(entry: Any, version: str | None = None) -> Play:
     ("entries", "versions", "said"),
     [
         (({"id": "m", "max_model_len": 1}, {"id": "m", "max_model_len": 2}), ("1", "1"),
-         "has id=m max_model_len=1 version=1, and server {1} id=m max_model_len=2 version=1; serve the same"),
+         "has id=m max_model_len=1 version=1, and server {1} id=m max_model_len=2 version=1; "
+         "serve the same"),
         (({"id": "m"}, {"id": "m"}), ("1", "2"),
-         "server {0} has id=m version=1, and server {1} id=m version=2; serve the same model, by the same"),
+         "server {0} has id=m version=1, and server {1} id=m version=2; serve the same model, by "
+         "the same"),
         (({"id": "m"}, "m"), ("1", "1"), "server {1} lists no m at {1}/models"),
     ],
 )  # fmt: skip
@@ -367,7 +398,8 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
     assert identities == [expected, expected]
 
 
-# -- whole runs ---------------------------------------------------------------------------------------------
+# -- whole runs
+# ---------------------------------------------------------------------------------------------
 
 
 def served_spec(small: Dataset, *urls: str) -> Spec:
@@ -393,7 +425,9 @@ def whole(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_server_killed_in_mid_run_loses_nothing(
     whole: Path, small: Dataset, tmp_path: Path, answers: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Its process ends when it is asked for one more; of what it had then, each is answered elsewhere."""
+    """Its process ends when it is asked for one more;
+    of what it had then, each is answered elsewhere.
+    """
     with served(answers) as one, served() as other:
         out = evaluated(served_spec(small, one, other), tmp_path / "run")
     assert f"server {one} is set aside" in capfd.readouterr().err
@@ -436,7 +470,10 @@ def test_workers_ask_what_one_process_asks(
         spec, runs = served_spec(small, one, other), {}
         for workers in (1, 3):
             runs[workers] = evaluated(
-                spec, tmp_path / f"{workers}", tmp_path / f"{workers}.sqlite" if cached else None, workers
+                spec,
+                tmp_path / f"{workers}",
+                tmp_path / f"{workers}.sqlite" if cached else None,
+                workers,
             )
     assert same_decisions(runs[1], runs[3])
     for name in ("episodes.csv", "summary.csv"):
@@ -482,7 +519,12 @@ def test_a_run_that_workers_began_or_go_on_with_asks_nothing_twice(
     with served() as url, pytest.raises(KeyboardInterrupt):
         evaluate(served_spec(small, url), tmp_path / "run", stop, workers=before)
     work = tmp_path / "run/.work"
-    kept = {name for file in work.rglob("*.jsonl") if file.name != servers.FILE for name in read_kept(file)}
+    kept = {
+        name
+        for file in work.rglob("*.jsonl")
+        if file.name != servers.FILE
+        for name in read_kept(file)
+    }
     assert kept
     with served() as other:
         out = evaluated(served_spec(small, other), tmp_path / "run", None, after)
@@ -494,7 +536,9 @@ def test_a_run_that_workers_began_or_go_on_with_asks_nothing_twice(
 
 
 @pytest.mark.slow
-def test_servers_that_fail_workers_are_one_line(parted: None, small: Dataset, tmp_path: Path) -> None:
+def test_servers_that_fail_workers_are_one_line(
+    parted: None, small: Dataset, tmp_path: Path
+) -> None:
     with served(40) as url, pytest.raises(UserError) as caught:
         evaluated(served_spec(small, url), tmp_path / "run", None, 3)
     assert url.removeprefix("http://").partition(":")[0] in str(caught.value)
@@ -518,7 +562,9 @@ def lines(run: Path) -> list[dict[str, Any]]:
 def test_which_server_gave_each_answer_stands_beside_the_tables(
     whole: Path, small: Dataset, tmp_path: Path
 ) -> None:
-    """One of two servers dies in mid-run: the tables are those of one server, and the file tells of both."""
+    """One of two servers dies in mid-run:
+    the tables are those of one server, and the file tells of both.
+    """
     with served(20) as one, served() as other:
         out = evaluated(served_spec(small, one, other), tmp_path / "run")
         again = evaluated(served_spec(small, other), tmp_path / "again")
@@ -526,14 +572,18 @@ def test_which_server_gave_each_answer_stands_beside_the_tables(
     asked, of_one = lines(out), [line for line in lines(out) if line["server"] == one]
     assert {line["server"] for line in asked} == {one, other}
     assert 0 < len(of_one) <= 20, "it was asked about tokens of prompts, too"
-    assert [line["id"] for line in asked] == sorted(answer.id for answer in folder.read(out).answers)
+    assert [line["id"] for line in asked] == sorted(
+        answer.id for answer in folder.read(out).answers
+    )
     assert {line["server"] for line in lines(again)} == {other}
     assert {*map(str, asked[0])} == {"id", "server", "model"}
     assert not any(one.encode() in (out / name).read_bytes() for name in FILES)
 
 
 @pytest.mark.slow
-def test_a_run_that_is_stopped_and_goes_on_still_says_who_answered(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_and_goes_on_still_says_who_answered(
+    small: Dataset, tmp_path: Path
+) -> None:
     with served(70) as one, pytest.raises(UserError):
         evaluated(served_spec(small, one), tmp_path / "run")
     kept = (tmp_path / "run/.work/answers.jsonl").read_bytes().count(b"\n")
@@ -586,9 +636,19 @@ def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: 
 
     came = threading.Event()
     with serving(play) as there:
-        command = [sys.executable, "-m", "harness", "eval", "--model", "mine", "--server", there.url]
+        command = [
+            sys.executable,
+            "-m",
+            "harness",
+            "eval",
+            "--model",
+            "mine",
+            "--server",
+            there.url,
+        ]
         command += ["--dataset", str(small_path), "--no-cache", "--out", "run"]
-        restored = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a background job may ignore it
+        # a background job may ignore it
+        restored = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         with subprocess.Popen(
             command, cwd=project, stderr=subprocess.PIPE, text=True, preexec_fn=restored
         ) as process:
@@ -599,7 +659,8 @@ def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: 
     assert f"to continue: harness eval --model mine --server {there.url}" in err
 
 
-# -- what is typed ------------------------------------------------------------------------------------------
+# -- what is typed
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -608,7 +669,8 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "models").mkdir()
     for name in ("mine", "another"):
         (tmp_path / f"models/{name}.toml").write_text(
-            'engine = "openai"\ndescription = "d"\nweights = "m"\n[server]\nbase_url = "http://127.0.0.1:9/v1"\n'
+            'engine = "openai"\ndescription = "d"\nweights = "m"\n[server]\nbase_url = '
+            '"http://127.0.0.1:9/v1"\n'
             f'[latency]\nsource = "paper"\nbasis = "{name}"\n'
         )
     return tmp_path
@@ -618,13 +680,26 @@ Typed = Callable[..., tuple[int, str, str]]
 
 
 @pytest.mark.slow
-def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, small_path: Path) -> None:
+def test_servers_are_named_on_the_command_line(
+    harness: Typed, project: Path, small_path: Path
+) -> None:
     with served() as one, served() as other:
         options = ("--model", "mine", "--server", one, "--server", other + "/", "--no-cache")
-        code, _, err = harness("eval", *options, "--dataset", small_path, "--limit", "2", "--out", "run")
+        code, _, err = harness(
+            "eval", *options, "--dataset", small_path, "--limit", "2", "--out", "run"
+        )
         assert (code, err) == (0, "")
         code, _, err = harness(
-            "drive", *options, "--episodes", "1", "--seeds", "0:1", "--condition", "6g", "--out", "driven"
+            "drive",
+            *options,
+            "--episodes",
+            "1",
+            "--seeds",
+            "0:1",
+            "--condition",
+            "6g",
+            "--out",
+            "driven",
         )
         assert (code, err) == (0, "")
     manifest = json.loads((project / "run/run.json").read_text())
@@ -645,7 +720,9 @@ def test_servers_are_named_on_the_command_line(harness: Typed, project: Path, sm
          "--server: proxy is asked at none; leave it out, and give base_url in a card"),
         (["--model", "mine", "--helper-model", "another", "--server", "http://a/v1"],
          "--server: another and mine are asked at servers of their own; leave it out"),
-        (["--model", "mine", "--server", "http://me:5ecret@a/v1"], "--server: base_url holds credentials"),
+        (["--model", "mine", "--server", "http://me:5ecret@a/v1"], 
+            "--server: base_url "
+            "holds credentials"),
         (["--model", "mine", "--server", "http://a/v1", "--server", "http://a/v1/"],
          "--server: base_url names a server twice"),
     ],

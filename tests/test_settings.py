@@ -1,4 +1,6 @@
-"""The settings of an evaluation: one record for the command line, a run's file and a run's command."""
+"""The settings of an evaluation: one record for the command line,
+a run's file and a run's command.
+"""
 
 import tomllib
 from collections.abc import Callable
@@ -49,7 +51,9 @@ def every_setting(draw: Callable[..., Any]) -> Settings:
         if draw(st.booleans()):
             *table, key = each.path
             tables["".join(table)][key] = draw(VALUES[str(each.kind)])
-    return Settings(helpers=HelperSettings(**tables["helpers"]), world=world(**tables["world"]), **tables[""])
+    return Settings(
+        helpers=HelperSettings(**tables["helpers"]), world=world(**tables["world"]), **tables[""]
+    )
 
 
 @given(every_setting())
@@ -70,7 +74,9 @@ def test_what_is_no_command_of_a_run_is_refused() -> None:
 
 
 def test_an_evaluation_states_the_settings_that_make_it(small: Dataset) -> None:
-    settings = replace(spec_of(small), seeds=(3, 7)).changed(tag=("nightly",), latency="paper").settings
+    settings = (
+        replace(spec_of(small), seeds=(3, 7)).changed(tag=("nightly",), latency="paper").settings
+    )
     assert (settings.tag, settings.latency, settings.seeds) == (("nightly",), "paper", "3,7")
     spec = resolve.spec(settings, FrozenSource(small))
     assert (spec.settings, spec.seeds, spec.points) == (settings, (3, 7), tuple(POINTS.values()))
@@ -97,7 +103,12 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     stated = tomllib.loads(Path("a/run.toml").read_text())
     assert (stated["model"], stated["prompt"], stated["seeds"]) == ("proxy", "v2", "3,7")
     assert stated["ties"] == "drawn", "its default is another than that of older versions"
-    assert stated["world"] == {"kind": "frozen", "dataset": str(small_path), "limit": 2, "sample_seed": 0}
+    assert stated["world"] == {
+        "kind": "frozen",
+        "dataset": str(small_path),
+        "limit": 2,
+        "sample_seed": 0,
+    }
     for file in ("a/run.toml", "a"):
         assert harness("eval", file, "--quiet", "--out", f"of-{Path(file).name}") == (0, "", "")
         assert same_decisions(Path("a"), Path(f"of-{Path(file).name}"))
@@ -105,34 +116,49 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     changed: Any = read_run(Path("b")).manifest
     assert (changed.world.limit, changed.prompt["version"], changed.tags) == (1, "v4", ("first",))
     assert [point["name"] for point in changed.conditions] == ["6g:tau=0.5"]
-    assert harness("eval", "a", "--model", "replay:a", "--ties", "first", "--quiet", "--out", "c")[0] == 0
-    assert harness("eval", "c", "--quiet", "--out", "of-c") == (0, "", ""), "it replays what that replayed"
+    assert (
+        harness("eval", "a", "--model", "replay:a", "--ties", "first", "--quiet", "--out", "c")[0]
+        == 0
+    )
+    assert harness("eval", "c", "--quiet", "--out", "of-c") == (0, "", ""), (
+        "it replays what that replayed"
+    )
     assert same_decisions(Path("c"), Path("of-c"))
     assert read_run(Path("of-c")).manifest.settings.ties == "first"
 
 
 HOSTILE = {
-    'model = "./theirs"': "./theirs is none of your cards, and a file opens no other model by itself; if "
+    'model = "./theirs"': "./theirs is none of your cards, and a file "
+    "opens no other model by itself; if "
     "you want it, type `harness eval stated.toml --model ./theirs`",
     'model = "http://theirs:1/v1"': "`harness eval stated.toml --model http://theirs:1/v1`",
-    'model = "./a b; rm"\nserver = ["http://theirs:1/v1"]': "`harness eval stated.toml --model './a b; rm' "
+    'model = "./a b; rm"\nserver = '
+    '["http://theirs:1/v1"]': "`harness eval stated.toml --model './a b; rm' "
     "--server http://theirs:1/v1`",
     'model = "replay:theirs"': "theirs is no finished run: it has no run.json",
     'model = "theirs/on-the-hub"': "theirs/on-the-hub is none of your cards",
-    '[helpers]\nmodel = "proxy, ./theirs"': "`harness eval stated.toml --helper-model 'proxy, ./theirs'`",
-    'server = ["http://theirs:1/v1"]': "http://theirs:1/v1 is a server, and a file asks none by itself; if "
+    '[helpers]\nmodel = "proxy, ./theirs"': "`harness eval stated.toml "
+    "--helper-model 'proxy, ./theirs'`",
+    'server = ["http://theirs:1/v1"]': "http://theirs:1/v1 is a server, and a "
+    "file asks none by itself; if "
     "you want it, type `harness eval stated.toml --server http://theirs:1/v1`",
     "model = 3": "model = 3; allowed: a text",
     'prompd = "v2"': "unknown key in settings stated.toml 'prompd'; did you mean 'prompt'?",
-    '[world]\nkind = "frozen"\nlimti = 1': "unknown key in settings stated.toml [world] 'limti'; did you "
+    '[world]\nkind = "frozen"\nlimti = 1': "unknown key in settings "
+    "stated.toml [world] 'limti'; did "
+    "you "
     "mean 'limit'?",
     '[world]\nkind = "closed-loop"': "are of `harness drive`; type that",
     '[world]\nkind = "dream"': "stated.toml",
     "model =": "stated.toml is no TOML",
-    "model = proxy": "stated.toml is no TOML: Invalid value (at line 1, column 9); put a text in quotes",
-    "limit = 2": "settings stated.toml: limit stands in a table; write limit below a line [world] instead",
-    "sample-seed = 2": "sample-seed stands in a table; write sample_seed below a line [world] instead",
-    'helper_model = "proxy"': "helper_model stands in a table; write model below a line [helpers] instead",
+    "model = proxy": "stated.toml is no TOML: Invalid value (at line "
+    "1, column 9); put a text in quotes",
+    "limit = 2": "settings stated.toml: limit stands in a table; "
+    "write limit below a line [world] instead",
+    "sample-seed = 2": "sample-seed stands in a table; write "
+    "sample_seed below a line [world] instead",
+    'helper_model = "proxy"': "helper_model stands in a table; write "
+    "model below a line [helpers] instead",
     'condition = "6g"': "condition = '6g'; allowed: a list",
     "world = 2": "world = 2; allowed: a table",
 }
@@ -168,7 +194,11 @@ def test_what_is_typed_beside_a_file_wins(tmp_path: Path) -> None:
     )
     typed = {"model": "proxy", "thinking": False, "server": ["http://mine:1/v1"], "episodes": 3}
     settings = read(file, DriveSettings, typed)
-    assert (settings.model, settings.thinking, settings.server) == ("proxy", False, ("http://mine:1/v1",))
+    assert (settings.model, settings.thinking, settings.server) == (
+        "proxy",
+        False,
+        ("http://mine:1/v1",),
+    )
     assert settings.world == DriveSettings(episodes=3)
     with pytest.raises(UserError, match="are of `harness drive`"):
         read(file, FrozenSettings, typed)
@@ -179,4 +209,9 @@ def test_help_shows_ten_options_first(harness: Callable[..., Said], command: str
     blocks = harness(command, "--help")[1].split("\n\n")
     [first] = [block for block in blocks if block.startswith("Options:")]
     assert sum(line.startswith("  --") for line in first.splitlines()) == 11  # with --help
-    assert len([block for block in blocks if block.startswith(("Helpers:", "Conditions:", "Latency:"))]) == 3
+    assert (
+        len(
+            [block for block in blocks if block.startswith(("Helpers:", "Conditions:", "Latency:"))]
+        )
+        == 3
+    )

@@ -1,4 +1,6 @@
-"""Shards: the bytes of a work that was not split, and what is refused; driven episodes and frozen layouts."""
+"""Shards: the bytes of a work that was not split, and what is refused;
+driven episodes and frozen layouts.
+"""
 
 import json
 import re
@@ -18,7 +20,18 @@ from harness.core.shards import Shard, shard_of
 from harness.runs.sources import read as read_sources
 
 Typed = Callable[..., tuple[int, str, str]]
-DRIVE = ("drive", "--model", "cruise", "--episodes", "6", "--seeds", "0", "--workers", "1", "--quiet")
+DRIVE = (
+    "drive",
+    "--model",
+    "cruise",
+    "--episodes",
+    "6",
+    "--seeds",
+    "0",
+    "--workers",
+    "1",
+    "--quiet",
+)
 BUILD = ("dataset", "build", "parking-exit", "--episodes", "2", "--seed", "100", "--workers", "1")
 TIMES = ("name", "created", "command")
 
@@ -107,7 +120,9 @@ def copied(split: Path, to: Path, *names: str) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Typed, tmp_path: Path) -> None:
+def test_merged_shards_are_the_run_that_was_not_split(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
     shards = copied(split, tmp_path, "2", "3", "1")
     assert harness("run", "merge", *shards, "--out", "merged", "--quiet") == (0, "", "")
     whole, merged = split / "whole", tmp_path / "merged"
@@ -128,7 +143,9 @@ def test_merged_shards_are_the_run_that_was_not_split(split: Path, harness: Type
     assert not (merged / ".work").exists()
 
 
-def test_a_shard_says_what_to_do_with_it_and_goes_on(split: Path, harness: Typed, tmp_path: Path) -> None:
+def test_a_shard_says_what_to_do_with_it_and_goes_on(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
     [shard] = copied(split, tmp_path, "2")
     code, out, _ = harness(*DRIVE[:-1], "--shard", "2/3", "--out", shard)
     assert code == 0
@@ -151,10 +168,14 @@ def refused(harness: Typed, shards: list[Path]) -> str:
 
 def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
-    assert "shards 2/3 are missing; give the folders of all 3" in refused(harness, [shards[0], shards[2]])
+    assert "shards 2/3 are missing; give the folders of all 3" in refused(
+        harness, [shards[0], shards[2]]
+    )
     shutil.rmtree(next((shards[1] / ".work").glob("episodes-*")))
     said = refused(harness, shards)
-    assert re.search(r"/2, shard 2/3, lacks episodes 2 to 3 and 0 parts more; type its command again", said)
+    assert re.search(
+        r"/2, shard 2/3, lacks episodes 2 to 3 and 0 parts more; type its command again", said
+    )
 
 
 @pytest.mark.slow
@@ -171,8 +192,12 @@ def test_the_same_shard_twice_is_taken_where_its_bytes_agree(
         refused(harness, [*shards, tmp_path / "again"]),
     )
     file.write_text(text)
-    assert harness("run", "merge", *shards, tmp_path / "again", "--out", "merged", "--quiet")[0] == 0
-    assert (tmp_path / "merged/answers.jsonl").read_bytes() == (split / "whole/answers.jsonl").read_bytes()
+    assert (
+        harness("run", "merge", *shards, tmp_path / "again", "--out", "merged", "--quiet")[0] == 0
+    )
+    assert (tmp_path / "merged/answers.jsonl").read_bytes() == (
+        split / "whole/answers.jsonl"
+    ).read_bytes()
 
 
 def test_shards_of_other_runs_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
@@ -184,7 +209,9 @@ def test_shards_of_other_runs_are_refused(split: Path, harness: Typed, tmp_path:
         config.write_text(json.dumps({**stated, **changed}))
         return refused(harness, shards)
 
-    assert "differ in seeds; give shards of one run" in said(settings={**stated["settings"], "seeds": [1]})
+    assert "differ in seeds; give shards of one run" in said(
+        settings={**stated["settings"], "seeds": [1]}
+    )
     assert "differ in model;" in said(identity={"engine": "another"})
     assert "differ in version of numpy;" in said(versions={**stated["versions"], "numpy": "1.0"})
     assert "shards of 3 and of 4" in said(shard="4/4")

@@ -1,4 +1,6 @@
-"""LTE Mode 4: its factors against the equations, its collisions against a simulation, and its limits."""
+"""LTE Mode 4: its factors against the equations, its collisions against a simulation,
+and its limits.
+"""
 
 from dataclasses import asdict, replace
 
@@ -62,7 +64,8 @@ def links(site, n, helpers, payload_bits=800.0):
 
 @pytest.mark.parametrize("distance_m", [50.0, 250.0, 300.0, 400.0])
 def test_without_others_it_is_half_duplex_sensing_and_noise(distance_m):
-    # (7), (10) and (13): 10 packets a second of 1 ms each; N(Pt - PL, 3 dB) above -90.5 dBm; block errors.
+    # (7), (10) and (13): 10 packets a second of 1 ms each; N(Pt - PL, 3 dB) above -90.5 dBm; block
+    # errors.
     mean = 23 - float(QUIET.path_loss_db(np.array(distance_m)))
     sensed = norm.sf(-90.5, mean, 3)
     power = np.arange(-90.5, -30, 1e-3)
@@ -101,21 +104,30 @@ def test_collisions_are_those_of_the_equations(distance_m):
     assert BUSY.reception(np.array([distance_m]))[0] == pytest.approx(expected, abs=0.01)
 
 
-@pytest.mark.parametrize("radio", [BUSY, replace(BUSY, transmissions=2), replace(BUSY, subchannels=2), NR])
+@pytest.mark.parametrize(
+    "radio", [BUSY, replace(BUSY, transmissions=2), replace(BUSY, subchannels=2), NR]
+)
 @pytest.mark.parametrize("sight", [CLEAR, VEHICLE, BUILDING])
 def test_loss_averaged_over_shadowing_is_the_curve(radio, sight):
     distances_m = np.array([20.0, 55, 100, 160, 250, 333, 450])
     shadows = norm.ppf((np.arange(4000) + 0.5) / 4000)
     site = links(place(distances_m, sight), len(shadows), len(distances_m)).where
     lost = radio.loss(site, np.tile(shadows[:, None], len(distances_m)), 1520.0)
-    np.testing.assert_allclose(np.mean(1 - lost, axis=0), radio.reception(distances_m, sight), atol=2e-3)
+    np.testing.assert_allclose(
+        np.mean(1 - lost, axis=0), radio.reception(distances_m, sight), atol=2e-3
+    )
 
 
 def test_what_stands_between_and_the_corner_cost_reception():
     far = np.array([150.0])
-    clear, vehicle, building = (BUSY.reception(far, sight)[0] for sight in (CLEAR, VEHICLE, BUILDING))
+    clear, vehicle, building = (
+        BUSY.reception(far, sight)[0] for sight in (CLEAR, VEHICLE, BUILDING)
+    )
     assert clear > vehicle > building
-    assert BUSY.reception(np.full(2, 150.0), np.array([CLEAR, BUILDING])).tolist() == [clear, building]
+    assert BUSY.reception(np.full(2, 150.0), np.array([CLEAR, BUILDING])).tolist() == [
+        clear,
+        building,
+    ]
     z = np.zeros(1)
     corner = BUSY.loss(place([80 * np.sqrt(2)], BUILDING, 80.0), z, 800.0)
     assert corner > BUSY.loss(place([80 * np.sqrt(2)], BUILDING), z, 800.0)
@@ -142,11 +154,14 @@ def test_twice_the_vehicles_never_help_and_distance_never_helps(radio):
 
 def no_help(density, more, rate, radio):
     distances_m = np.arange(20.0, 600, 40)
-    light, heavy = (replace(radio, density_per_km=d, rate_hz=rate) for d in (density, density + more))
+    light, heavy = (
+        replace(radio, density_per_km=d, rate_hz=rate) for d in (density, density + more)
+    )
     received = light.reception(distances_m)
     assert np.all(np.diff(received) <= 2e-3)
-    # The evenly spaced interferers of two densities stand elsewhere: ripples of a point. In a town the
-    # source's mixture of two ways to choose a resource lets more load help, by 3.3 points at most.
+    # The evenly spaced interferers of two densities stand elsewhere: ripples of a point. In a town
+    # the source's mixture of two ways to choose a resource lets more load help, by 3.3 points at
+    # most.
     most = 0.035 if radio.environment == "tr37885-urban" else 0.02
     assert np.all(heavy.reception(distances_m) <= received + most)
     assert heavy.busy_ratio() >= light.busy_ratio()
@@ -175,7 +190,9 @@ def test_a_message_waits_for_a_slot_and_takes_one_a_block():
 
 
 def test_a_larger_message_takes_several_blocks_that_must_all_cross():
-    one, three = (BUSY.deliver(links(place([100]), 50, 1, bits), draws(50, 1)) for bits in (1520, 3041))
+    one, three = (
+        BUSY.deliver(links(place([100]), 50, 1, bits), draws(50, 1)) for bits in (1520, 3041)
+    )
     np.testing.assert_allclose(three.loss, 1 - (1 - one.loss) ** 3)
     np.testing.assert_allclose(three.airtime_s, 0.003)
     np.testing.assert_allclose(three.delay_s - one.delay_s, 0.002)
@@ -234,7 +251,9 @@ def test_settings_that_are_no_radio_s_are_refused():
 # NR Mode 2.
 
 
-@pytest.mark.parametrize(("numerology", "wait_ms"), some([(1, 8.75)], exhaustive=[(0, 17.5), (2, 4.375)]))
+@pytest.mark.parametrize(
+    ("numerology", "wait_ms"), some([(1, 8.75)], exhaustive=[(0, 17.5), (2, 4.375)])
+)
 def test_a_message_in_nr_waits_17_5_slots_on_average(numerology, wait_ms):
     radio = replace(NR, numerology=numerology)
     asked = radio.request(400.0, draws(20_000, 1))
@@ -249,7 +268,8 @@ def test_half_duplex_is_a_slot_a_packet():
 
 
 def test_a_packet_takes_the_sub_channels_that_it_needs():
-    # At 15 kHz a block has 132 data symbols of 2 * 526 / 1024 bits, 135.6 bits: 1 520 bits need 11.2.
+    # At 15 kHz a block has 132 data symbols of 2 * 526 / 1024 bits, 135.6 bits: 1 520 bits need
+    # 11.2.
     radio = NrMode2(bandwidth_mhz=10, subchannel_blocks=10, mcs=7, packet_bytes=190)
     assert radio.block_bits == int(20 * 132 * 2 * 526 / 1024)
     assert radio.blocks_per_slot == 52 // 10 // 2
@@ -280,7 +300,9 @@ def test_the_selection_window_is_in_the_delay_alone():
     short = replace(NR, t2_slots=17)
     np.testing.assert_array_equal(NR.reception(distances_m), short.reception(distances_m))
     uniform = draws(1000, 1)
-    assert np.mean(short.request(400.0, uniform).heard_s) < np.mean(NR.request(400.0, uniform).heard_s)
+    assert np.mean(short.request(400.0, uniform).heard_s) < np.mean(
+        NR.request(400.0, uniform).heard_s
+    )
 
 
 def test_twice_the_bandwidth_in_half_as_long_slots_is_half_as_busy():
@@ -292,14 +314,18 @@ def test_twice_the_bandwidth_in_half_as_long_slots_is_half_as_busy():
 
 @pytest.mark.slow
 def test_where_a_real_radio_is_what_the_paper_declares():
-    """8 % and 25 ms: Mode 4 at 150 to 250 m beside 200 vehicles a km. 1.2 % and 5 ms: Mode 2 at 50 m."""
+    """8 % and 25 ms: Mode 4 at 150 to 250 m beside 200 vehicles a km. 1.2 % and 5 ms:
+    Mode 2 at 50 m.
+    """
     v2x = replace(BUSY, t2_slots=50)
     lost = 1 - v2x.reception(np.array([150.0, 200, 250]))
     assert lost[0] < 0.08 < lost[2]
     assert np.mean(v2x.request(400.0, draws(20_000, 1)).heard_s) == pytest.approx(0.0265, abs=3e-4)
     short = NrMode2(numerology=2, mcs=7, subchannel_blocks=10, packet_bytes=190)
     assert 1 - short.reception(np.array([50.0]))[0] == pytest.approx(0.012, abs=0.004)
-    assert np.mean(short.request(400.0, draws(20_000, 1)).heard_s) == pytest.approx(0.0046, abs=1e-4)
+    assert np.mean(short.request(400.0, draws(20_000, 1)).heard_s) == pytest.approx(
+        0.0046, abs=1e-4
+    )
 
 
 # Semi-persistent scheduling.
@@ -327,16 +353,21 @@ def test_who_knows_nothing_of_each_other_meets_by_chance(threshold):
     ],
 )
 def test_the_closed_forms_agree_with_many_slots_of_simulated_scheduling(spacing_m, vehicles, slots):
-    """A ring of vehicles that sense all within 300 m, 2 sub-channels, 10 Hz, counters of 5 to 15."""
+    """A ring of vehicles that sense all within 300 m, 2 sub-channels, 10 Hz,
+    counters of 5 to 15.
+    """
     reach_m = 300.0
     busy, same = simulated(vehicles, spacing_m, reach_m, subchannels=2, slots=slots)
-    model = Scheduling(1 / spacing_m, 200, 0.1, lambda metres, _: np.where(metres <= reach_m, 1.0, 0.0), 0.0)
+    model = Scheduling(
+        1 / spacing_m, 200, 0.1, lambda metres, _: np.where(metres <= reach_m, 1.0, 0.0), 0.0
+    )
     apart_m = spacing_m * np.arange(1, vehicles // 2 + 1)
     expected = model.same_by_exclusion(apart_m)
     assert model.busy_ratio == pytest.approx(busy, rel=0.03)
     hidden = apart_m > reach_m
     assert expected[hidden].mean() == pytest.approx(same[hidden].mean(), rel=0.08)
-    # In reach the equation lets a collision last as long as a choice; it ends with the first of two.
+    # In reach the equation lets a collision last as long as a choice; it ends with the first of
+    # two.
     assert 1.1 < expected[~hidden].mean() / same[~hidden].mean() < 1.5
 
 

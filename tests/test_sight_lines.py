@@ -10,7 +10,9 @@ from harness.world.sight_lines import corner, site
 from harness.world.state import Building, VehicleState, WorldState
 
 
-def vehicle(name: str, x_m: float, y_m: float, heading_rad: float = 0.0, kind: str = "car") -> VehicleState:
+def vehicle(
+    name: str, x_m: float, y_m: float, heading_rad: float = 0.0, kind: str = "car"
+) -> VehicleState:
     part = {"v1": "ego"}.get(name, "helper")
     return VehicleState(name, kind, part, x_m, y_m, heading_rad, 8.0, "west", "straight", False)  # type: ignore[arg-type]
 
@@ -69,7 +71,9 @@ def test_a_trips_draws_are_its_own_whoever_else_is_asked_for():
     for n in range(3):
         alone = many.take(n)
         assert np.array_equal(alone.shadow(xy[n], 10.0), many.shadow(xy, 10.0)[n])
-        assert np.array_equal(alone.shadow(xy[n, :3], 10.0), many.shadow(xy, 10.0)[n, :2]), "fewer helpers"
+        assert np.array_equal(alone.shadow(xy[n, :3], 10.0), many.shadow(xy, 10.0)[n, :2]), (
+            "fewer helpers"
+        )
         assert np.array_equal(alone.uniforms(2), many.uniforms(3)[n, :5])
     draws = Draws(np.zeros((3, 3, 2)), np.zeros((3, 3)), many)
     assert draws.packet.shape == (3, 3, 2)

@@ -1,4 +1,6 @@
-"""The fixed text of a constrained answer: what stands, what is chosen, and how it is walked in tokens."""
+"""The fixed text of a constrained answer:
+what stands, what is chosen, and how it is walked in tokens.
+"""
 
 import json
 import random
@@ -71,7 +73,9 @@ def finished(shape: Shape, chosen: list[int]) -> str:
     return "".join(p if isinstance(p, str) else p[next(places)] for p in parts(shape))
 
 
-def played(skeleton: Skeleton, choose: Callable[[Any], int]) -> tuple[list[int], list[list[int]], Filled]:
+def played(
+    skeleton: Skeleton, choose: Callable[[Any], int]
+) -> tuple[list[int], list[list[int]], Filled]:
     """A whole walk: the tokens before its last decision, what stood to choose, and the answer."""
     walk: Any = skeleton.walk()
     ids, choices = [], []
@@ -86,7 +90,8 @@ def played(skeleton: Skeleton, choose: Callable[[Any], int]) -> tuple[list[int],
             return ids, choices, end.value
 
 
-# -- the text -----------------------------------------------------------------------------------------
+# -- the text
+# -----------------------------------------------------------------------------------------
 
 
 def test_the_egos_text_is_a_distribution_with_two_digits_an_action() -> None:
@@ -123,7 +128,12 @@ def test_a_helper_says_its_risk_first_and_has_no_words_for_evidence() -> None:
             (1, 0, 0),
             ["renormalised"],
         ),  # 1.00 was meant
-        ([99, 99, 99], '"SLOWER":0.99,"IDLE":0.99,"FASTER":0.99', (1 / 3, 1 / 3, 1 / 3), ["divided"]),
+        (
+            [99, 99, 99],
+            '"SLOWER":0.99,"IDLE":0.99,"FASTER":0.99',
+            (1 / 3, 1 / 3, 1 / 3),
+            ["divided"],
+        ),
         ([1, 1, 0], '"SLOWER":0.01,"IDLE":0.01,"FASTER":0.00', (0.5, 0.5, 0), ["divided"]),
         ([0, 0, 0], '"SLOWER":0.00,"IDLE":0.00,"FASTER":0.00', None, []),  # nothing said
     ],
@@ -166,7 +176,8 @@ def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
         assert parsed.intent == pytest.approx(tuple(n / sum(digits) for n in digits))
 
 
-# -- the walk -----------------------------------------------------------------------------------------
+# -- the walk
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("actions", [THREE, FIVE], ids=["three", "five"])
@@ -184,7 +195,9 @@ def test_the_tokens_are_those_of_the_whole_text(
 
 
 def test_labels_that_begin_alike_are_decided_where_they_part() -> None:
-    skeleton = Skeleton(CHARACTERS, Shape("helper", ("LANE_LEFT", "LANE_RIGHT", "IDLE"), "recommendation"))
+    skeleton = Skeleton(
+        CHARACTERS, Shape("helper", ("LANE_LEFT", "LANE_RIGHT", "IDLE"), "recommendation")
+    )
     said = iter("hLR07")
     ids, choices, done = played(skeleton, lambda among: ord(next(said)))
     assert ["".join(map(chr, among)) for among in choices] == [
@@ -213,7 +226,9 @@ def test_in_qwens_vocabulary_the_lanes_share_two_tokens_and_are_one_decision() -
 
 
 @pytest.mark.parametrize(("said", "maneuver"), [('l"07', "SLOW"), ("lE07", "SLOWER")])
-def test_a_label_that_is_another_ones_beginning_ends_with_its_quote(said: str, maneuver: str) -> None:
+def test_a_label_that_is_another_ones_beginning_ends_with_its_quote(
+    said: str, maneuver: str
+) -> None:
     actions = ("SLOWER", "SLOW")
     skeleton = Skeleton(CHARACTERS, Shape("helper", actions, "recommendation"))
     tokens = iter(said)

@@ -51,7 +51,9 @@ def prompt(version: str, word: str) -> None:
 
 
 def _make(out: Path, scenes: Path) -> None:
-    """Make a project with a prompt, channels with tables, and a run of them on a dataset of its own."""
+    """Make a project with a prompt, channels with tables,
+    and a run of them on a dataset of its own.
+    """
     shutil.copytree(scenes, out / "own/scenes")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(out)
@@ -77,7 +79,11 @@ def project(once: Once, small_path: Path, harness: Typed, tmp_path: Path) -> Pat
 
 def kept(run: Path) -> dict[str, str]:
     root = run / "sources"
-    return {p.relative_to(root).as_posix(): p.read_text() for p in sorted(root.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(root).as_posix(): p.read_text()
+        for p in sorted(root.rglob("*"))
+        if p.is_file()
+    }
 
 
 def prompts_shown(page: Path) -> list[str]:
@@ -110,7 +116,10 @@ def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -
     typed = (*EVAL, "--dataset", "own/scenes", "--condition", "6g", "--out", "mixed")
     assert harness(*typed, "--prompt", "mine", "--helper-prompt", "theirs")[0] == 0
     files = kept(Path("mixed"))
-    assert {name.split("/")[1] for name in files if name.startswith("prompts/")} == {"mine", "theirs"}
+    assert {name.split("/")[1] for name in files if name.startswith("prompts/")} == {
+        "mine",
+        "theirs",
+    }
     run = read(Path("mixed"))
     shutil.rmtree("prompts")
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
@@ -120,7 +129,9 @@ def test_a_mixed_swarm_keeps_the_prompts_of_all(project: Path, harness: Typed) -
 
 
 @pytest.mark.parametrize("gone", some(["deleted"], exhaustive=["edited"]))
-def test_the_page_is_the_same_once_the_prompt_is_gone(gone: str, project: Path, harness: Typed) -> None:
+def test_the_page_is_the_same_once_the_prompt_is_gone(
+    gone: str, project: Path, harness: Typed
+) -> None:
     assert harness("report", "reports/run", "--full")[0] == 0
     page = Path("reports/run/report.html")
     before, shown = page.read_bytes(), prompts_shown(page)
@@ -283,12 +294,19 @@ def test_what_others_read_has_names_and_no_folders(value: object, shown: object)
 
 
 def test_a_command_line_has_names_and_no_folders() -> None:
-    line = "harness eval --model 'replay:/home/ada/my run/x' --out=/home/ada/r --server http://a:b@h/v1"
+    line = (
+        "harness eval --model 'replay:/home/ada/my run/x' --out=/home/ada/r --server "
+        "http://a:b@h/v1"
+    )
     shown = "harness eval --model replay:x --out=r --server http://h/v1"
     assert nameless({"command": f"{line} --seeds 0,1"}) == {"command": f"{shown} --seeds 0,1"}
 
 
-@pytest.mark.parametrize("piece", ["x", "~", "/", "\\", ".", ":", "a/", "http:", "../", "C:", " /a"])
+@pytest.mark.parametrize(
+    "piece", ["x", "~", "/", "\\", ".", ":", "a/", "http:", "../", "C:", " /a"]
+)
 def test_a_long_text_is_read_once(piece: str) -> None:
     """Were it read from each of its characters to its end, this would take many minutes."""
-    assert len(nameless(f"-{piece * (500_000 // len(piece))} at http://a:b@h/v1?k")) > len("- at http://h/v1")
+    assert len(nameless(f"-{piece * (500_000 // len(piece))} at http://a:b@h/v1?k")) > len(
+        "- at http://h/v1"
+    )

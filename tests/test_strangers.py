@@ -45,7 +45,9 @@ def leave(raised: BaseException) -> None:
         (typer.Exit(0), "Exit"), (GeneratorExit(), "GeneratorExit"),
     ],
 )  # fmt: skip
-def test_what_would_end_the_program_is_bad_input_and_says_where(raised: BaseException, words: str) -> None:
+def test_what_would_end_the_program_is_bad_input_and_says_where(
+    raised: BaseException, words: str
+) -> None:
     with pytest.raises(UserError) as error, strangers("rule mine"):
         leave(raised)
     assert str(error.value).startswith(f"rule mine ends the program ({words}")
@@ -62,7 +64,8 @@ def test_an_error_and_a_typed_ctrl_c_are_raised_as_they_are(raised: BaseExceptio
 
 
 def test_a_ctrl_c_that_nobody_typed_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("signal.getsignal", lambda number: None)  # as in a command, which raises `Stop`
+    # as in a command, which raises `Stop`
+    monkeypatch.setattr("signal.getsignal", lambda number: None)
     with pytest.raises(UserError, match=r"ends the program \(KeyboardInterrupt at "), strangers():
         leave(KeyboardInterrupt())
     with pytest.raises(Stop), strangers():
@@ -88,14 +91,18 @@ def test_the_working_folder_is_put_back(
     assert said == f"harness: rule mine changed the working folder; it is {tmp_path} again\n"
 
 
-@pytest.mark.parametrize("source", ["raise SystemExit(0)", "exit()", "class A(BaseException): ...\nraise A"])
+@pytest.mark.parametrize(
+    "source", ["raise SystemExit(0)", "exit()", "class A(BaseException): ...\nraise A"]
+)
 def test_a_package_that_ends_at_its_import_is_one_line(
     source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     register(tmp_path, "[swarmdrive.rules]\nmine = ends_at_import:RULE\n", ends_at_import=source)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(RULES, "_loaded", dict(RULES.built_in))
-    with pytest.raises(UserError, match=r"^plug-in 'mine' \(swarmdrive.rules\): .* ends the program \("):
+    with pytest.raises(
+        UserError, match=r"^plug-in 'mine' \(swarmdrive.rules\): .* ends the program \("
+    ):
         RULES["mine"]
     sys.modules.pop("ends_at_import", None)
 
@@ -163,11 +170,24 @@ def test_a_rule_that_ends_the_program_is_bad_input_of_the_run(
     ],
 )
 def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
-    pool: Callable[..., Any], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+    pool: Callable[..., Any],
+    says: str,
+    two_path: Path,
+    harness: Typed,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(RULES._loaded, "mine", Pool(pool))
     monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
-    typed = ("eval", "--dataset", two_path, "--condition", "6g:consensus=mine", "--limit", "1", "--quiet")
+    typed = (
+        "eval",
+        "--dataset",
+        two_path,
+        "--condition",
+        "6g:consensus=mine",
+        "--limit",
+        "1",
+        "--quiet",
+    )
     code, out, said = harness(*typed, "--out", "run")
     assert (code, out, said.count("\n")) == (2, "", 1)
     assert said.startswith(f"harness: {says}")
@@ -188,15 +208,31 @@ class Failing(Attack):
     ("worth", "says"),
     [
         (lambda known: 1 / 0, "schedule mine fails (ZeroDivisionError: division by zero at "),
-        (lambda known: known.may_ask[..., :2] * 1.0, "schedule mine fails (ValueError: worths of shape ("),
+        (
+            lambda known: known.may_ask[..., :2] * 1.0,
+            "schedule mine fails (ValueError: worths of shape (",
+        ),
     ],
 )
 def test_a_schedule_that_fails_is_one_line(
-    worth: Callable[..., Any], says: str, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+    worth: Callable[..., Any],
+    says: str,
+    two_path: Path,
+    harness: Typed,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(SCHEDULES._loaded, "mine", Formula(worth, 0.1))
     monkeypatch.setattr(type(SCHEDULES), "__iter__", lambda self: iter(self._loaded))
-    typed = ("eval", "--dataset", two_path, "--condition", "6g:schedule=mine", "--limit", "1", "--quiet")
+    typed = (
+        "eval",
+        "--dataset",
+        two_path,
+        "--condition",
+        "6g:schedule=mine",
+        "--limit",
+        "1",
+        "--quiet",
+    )
     code, out, said = harness(*typed, "--out", "run")
     assert (code, out, said.count("\n")) == (2, "", 1)
     assert said.startswith(f"harness: {says}")
@@ -217,7 +253,10 @@ def test_an_attack_that_fails_is_one_line(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "left",
-    ["threading.Thread(target=threading.Event().wait).start()", "atexit.register(threading.Event().wait)"],
+    [
+        "threading.Thread(target=threading.Event().wait).start()",
+        "atexit.register(threading.Event().wait)",
+    ],
 )
 def test_what_a_package_leaves_behind_does_not_keep_the_process(left: str) -> None:
     code = (
@@ -225,7 +264,12 @@ def test_what_a_package_leaves_behind_does_not_keep_the_process(left: str) -> No
         f"def program():\n    {left}\n    print('done')\n    sys.exit(3)\nprocess.run(program)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30, check=False
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
     )
     assert (done.returncode, done.stdout) == (3, "done\n")
     assert "took longer than 0.2 s; all is written, and it ends\n" in done.stderr

@@ -38,7 +38,10 @@ datasets = ["small", "exits"]
 
 @pytest.fixture(scope="session")
 def exits_path(once: Once) -> Path:
-    return once("exits", lambda out: build(scenarios.get("parking-exit"), out, 2, 5000, 1, lambda done: None))
+    return once(
+        "exits",
+        lambda out: build(scenarios.get("parking-exit"), out, 2, 5000, 1, lambda done: None),
+    )
 
 
 @pytest.fixture
@@ -75,7 +78,9 @@ def test_a_suite_is_a_run_of_each_dataset_their_means_and_a_page(evaluated: Harn
     assert lines[0] == "proxy · prompt v2 and v4 · json · suite two"
     assert lines[-1] == f"wrote {DONE / 'report.html'}"
     for name in ("occluded-intersection", "parking-exit", "mean over families"):
-        assert sum(line.startswith(name) for line in lines) == 3, "success, gains, reference drivers"
+        assert sum(line.startswith(name) for line in lines) == 3, (
+            "success, gains, reference drivers"
+        )
     assert {path.name for path in DONE.iterdir()} == {
         "small", "exits", "suite.json", "summary.csv", "report.html",
     }  # fmt: skip
@@ -99,7 +104,9 @@ def test_means_weight_families_alike_and_join_their_intervals(evaluated: Harness
         assert (found.value, found.low, found.high) == pytest.approx(
             (expected.value, expected.low, expected.high), nan_ok=True
         )
-        assert found.value == pytest.approx(sum(s.value for s in scores if s and s.value is not None) / 2)
+        assert found.value == pytest.approx(
+            sum(s.value for s in scores if s and s.value is not None) / 2
+        )
     assert found.n == 6, "four layouts and two"
 
 
@@ -107,7 +114,13 @@ def test_a_gain_takes_the_layouts_of_all_families_together(evaluated: Harness) -
     suite = read(DONE)
     differences = []
     for run in suite.runs.values():
-        by = dict(zip(run.conditions, of_ends(METRICS["success_rate"], run.grid, run.episodes), strict=True))
+        by = dict(
+            zip(
+                run.conditions,
+                of_ends(METRICS["success_rate"], run.grid, run.episodes),
+                strict=True,
+            )
+        )
         differences.append((by["6g"] - by["single-local"]).mean(axis=0))
     expected = paired_difference(differences)
     gain = suite.score("6g", "success_gain_over_single-local")
@@ -120,7 +133,10 @@ def test_a_gain_takes_the_layouts_of_all_families_together(evaluated: Harness) -
 def test_a_gain_that_no_run_can_have_is_no_traceback(evaluated: Harness, tmp_path: Path) -> None:
     copytree(DONE, tmp_path / "suite")
     for summary in tmp_path.glob("suite/*/summary.csv"):
-        stated = "proxy,v2,json,,nowhere,success_gain_over_single-local,0.5,0.1,0.6,4,0,paired episodes\n"
+        stated = (
+            "proxy,v2,json,,nowhere,success_gain_over_single-local,0.5,0.1,0.6,4,0,paired "
+            "episodes\n"
+        )
         summary.write_text(summary.read_text() + stated)
     suite = read(tmp_path / "suite")
     strange = suite.score("nowhere", "success_gain_over_single-local")
@@ -158,7 +174,8 @@ def test_the_same_command_goes_on_and_a_finished_suite_is_refused(evaluated: Har
     code, out, err = evaluated(*EVAL, "--out", DONE)
     assert (code, out) == (2, "")
     assert err == (
-        f"harness: --out {DONE} already holds a finished suite; choose another folder or delete it\n"
+        f"harness: --out {DONE} already holds a finished suite; choose another folder or delete "
+        "it\n"
     )
 
 
@@ -174,7 +191,10 @@ def test_other_settings_do_not_go_on(evaluated: Harness) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--dataset", "suite:tow"), "unknown suite 'tow'; did you mean 'two'? known: two, v2v-safety, v2v"),
+        (
+            ("--dataset", "suite:tow"),
+            "unknown suite 'tow'; did you mean 'two'? known: two, v2v-safety, v2v",
+        ),
         (("--prompt", "v2"), "--prompt v2 speaks of a crossing, which parking-exit is not; "),
         (("--latency", "measured"), "--latency measured: "),
         (("--only", "3"), "--only 3: give episodes from 0 to 1, "),
@@ -194,15 +214,24 @@ def test_bad_input_is_one_line_before_anything_is_asked(
     ("table", "said"),
     [
         ('two = "small"', "suite two in {file} is no table; give it a description and datasets"),
-        ("[two]\ndescription = ''\ndatasets = []", "suite two in {file}: datasets = []; allowed: a list of "
+        ("[two]\ndescription = ''\ndatasets = []", 
+            "suite two in {file}: datasets = "
+            "[]; allowed: a list of "
          "datasets' names, one or more"),
         ("[two]\ndescription = ''", "suite two in {file} has no datasets; add it"),
-        ("[two]\ndescription = ''\ndatasets = ['small', 'exits']\nweight = 1", "unknown key in suite two in "
+        (
+            "[two]\ndescription = ''\ndatasets = "
+            "['small', 'exits']\nweight = 1", "unknown key in suite two in "
          "{file} 'weight'; known: datasets, description"),
         ("[two]\ndescription = ''\ndatasets = ['none']", "unknown dataset 'none'; known: "),
-        ("[two]\ndescription = ''\ndatasets = ['small', 'small']", "suite two has occluded-intersection "
+        (
+            "[two]\ndescription = "
+            "''\ndatasets = ['small', "
+            "'small']", "suite two has occluded-intersection "
          "twice; give each family one dataset"),
-        ("[v2v-safety]\ndescription = ''\ndatasets = ['small']\n[two]", "suite two in {file} has no "
+        (
+            "[v2v-safety]\ndescription = "
+            "''\ndatasets = ['small']\n[two]", "suite two in {file} has no "
          "description; add it"),
     ],
 )  # fmt: skip
@@ -218,13 +247,18 @@ def test_a_suite_of_the_project_may_not_have_a_shipped_ones_name(project: Harnes
     Path("datasets/suites.toml").write_text(SUITES.replace("two", "v2v-safety"))
     code, _, err = project("eval", "--dataset", "suite:v2v-safety")
     assert code == 2
-    assert err.startswith("harness: suite v2v-safety is in this project and ships with the harness; ")
+    assert err.startswith(
+        "harness: suite v2v-safety is in this project and ships with the harness; "
+    )
 
 
 def test_a_dry_run_counts_every_dataset(project: Harness) -> None:
     code, out, err = project(*EVAL, "--dry-run")
     assert (code, err) == (0, "")
-    assert [line.split(":")[0] for line in out.splitlines() if "requests" in line] == ["small", "exits"]
+    assert [line.split(":")[0] for line in out.splitlines() if "requests" in line] == [
+        "small",
+        "exits",
+    ]
     assert not Path("reports").exists()
 
 
@@ -233,7 +267,9 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     for family, folder in (("occluded-intersection", "small"), ("parking-exit", "exits")):
         assert f'<a href="{folder}/report.html">{family}</a>' in page
         assert (DONE / folder / "report.html").is_file()
-    for score in (read(DONE).score(c, "balanced_success_rate") for c in ("single-local", "v2x", "6g")):
+    for score in (
+        read(DONE).score(c, "balanced_success_rate") for c in ("single-local", "v2x", "6g")
+    ):
         assert f"<dd>{100 * score.value:.1f} %" in page
     code, out, err = evaluated("report", DONE, "--out", "again.html")
     assert (code, err, out) == (0, "", "wrote again.html\n")
@@ -243,7 +279,9 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
 def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     code, _, err = project(*EVAL, "--control", "shuffled-messages")
     assert (code, err) == (0, "")
-    gains = [s.value for s in read(DONE).scores if s.metric == "balanced_success_gain_over_single-local"]
+    gains = [
+        s.value for s in read(DONE).scores if s.metric == "balanced_success_gain_over_single-local"
+    ]
     assert min(gains) < 0, "messages of other layouts lose episodes"
     page = (DONE / "report.html").read_text()
     shown = re.findall(r'<span class="gain \w*">(?:[✓✗] )?([^<]*)<', page)
@@ -253,9 +291,13 @@ def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
 def test_what_bounds_a_suites_numbers_stands_above_them(evaluated: Harness) -> None:
     page = unescape((DONE / "report.html").read_text())
     assert (
-        page.index("reads no prompt") < page.index("episodes: the interval of a rate") < page.index("Under ")
+        page.index("reads no prompt")
+        < page.index("episodes: the interval of a rate")
+        < page.index("Under ")
     )
-    assert page.index("</table>") < page.index("latency: ego ") < page.index("as means over families.")
+    assert (
+        page.index("</table>") < page.index("latency: ego ") < page.index("as means over families.")
+    )
 
 
 def test_an_exported_suite_leads_to_the_pages_of_its_runs(evaluated: Harness) -> None:
@@ -268,16 +310,22 @@ def test_an_exported_suite_leads_to_the_pages_of_its_runs(evaluated: Harness) ->
 
 
 def test_suites_are_reported_side_by_side_and_not_with_runs(evaluated: Harness) -> None:
-    code, _, err = evaluated(*EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1")
+    code, _, err = evaluated(
+        *EVAL, "--model", "local-view", "--condition", "single-local", "--limit", "1"
+    )
     assert (code, err) == (0, "")
     other = Path("reports/local-view-v2-v4-two")
     code, out, err = evaluated("report", DONE, other, "--out", "both.html")
     assert (code, out, err) == (0, "wrote both.html\n", "")
     page = Path("both.html").read_text()
-    assert page.index("proxy · v2 and v4 · json on two") < page.index("local-view · v2 and v4 · json on two")
+    assert page.index("proxy · v2 and v4 · json on two") < page.index(
+        "local-view · v2 and v4 · json on two"
+    )
     code, out, err = evaluated("report", DONE, other / "small", "--out", "both.html")
     assert (code, out) == (2, "")
-    assert err == f"harness: {other / 'small'} is no suite, but others are; write separate reports\n"
+    assert (
+        err == f"harness: {other / 'small'} is no suite, but others are; write separate reports\n"
+    )
 
 
 def test_a_command_on_one_run_says_that_a_suite_has_several(evaluated: Harness) -> None:
@@ -291,17 +339,24 @@ def test_ls_lists_a_suite_above_its_runs_with_its_mean(evaluated: Harness) -> No
     assert list(found) == [DONE.name, f"{DONE.name}/exits", f"{DONE.name}/small"]
     suite, best = found[DONE.name], read(DONE).score(found[DONE.name].condition, BALANCED)
     assert suite.condition == compared(read(DONE))[0]
-    assert (suite.kind, suite.state, suite.model, suite.prompt) == ("suite", "finished", "proxy", "v2 and v4")
+    assert (suite.kind, suite.state, suite.model, suite.prompt) == (
+        "suite",
+        "finished",
+        "proxy",
+        "v2 and v4",
+    )
     assert (suite.success, suite.low, suite.high) == (best.value, best.low, best.high)
     assert "  suite proxy · v2 and v4 · json" in evaluated("run", "ls")[1]
 
 
 @pytest.mark.parametrize(
-    "families", ["{}", '{"a": ".."}', '{"a": "/etc"}', '{"a": "none"}', '{"a": 1}', "[]", '{"a": "."}']
+    "families",
+    ["{}", '{"a": ".."}', '{"a": "/etc"}', '{"a": "none"}', '{"a": 1}', "[]", '{"a": "."}'],
 )
 def test_a_broken_suite_is_one_line(evaluated: Harness, families: str) -> None:
     (DONE / "suite.json").write_text(
-        f'{{"format": "swarmdrive-suite/1", "name": "two", "description": "", "families": {families}}}'
+        f'{{"format": "swarmdrive-suite/1", "name": "two", "description": "", "families": '
+        f"{families}}}"
     )
     [suite] = [one for one in runs(Path("reports")) if one.kind == "suite"]
     assert (suite.state, suite.why) == ("broken", "suite.json")
@@ -309,8 +364,12 @@ def test_a_broken_suite_is_one_line(evaluated: Harness, families: str) -> None:
     assert (code, out, err.count("\n")) == (2, "", 1)
 
 
-def test_view_opens_a_suite_with_links_to_its_runs_and_none_whose_files_lead_out(evaluated: Harness) -> None:
-    view, access = (pytest.importorskip(f"harness.extensions.view.{name}") for name in ("app", "access"))
+def test_view_opens_a_suite_with_links_to_its_runs_and_none_whose_files_lead_out(
+    evaluated: Harness,
+) -> None:
+    view, access = (
+        pytest.importorskip(f"harness.extensions.view.{name}") for name in ("app", "access")
+    )
     shown = view.app(Path("reports").absolute(), "token")
     browser = TestClient(shown, base_url="http://127.0.0.1", cookies={access.cookie(80): "token"})
     page = browser.get("/run", params={"path": DONE.name})
@@ -344,7 +403,9 @@ def test_a_suites_own_table_is_held_against_its_runs(change: str, evaluated: Har
     best = next(one for one in runs(Path("reports")) if one.kind == "suite")
     table = DONE / "summary.csv"
     [row] = [
-        line for line in table.read_text().splitlines() if ",6g,success_rate," in line and "episodes" in line
+        line
+        for line in table.read_text().splitlines()
+        if ",6g,success_rate," in line and "episodes" in line
     ]
     if change == "a mean":
         edited(table, row, flattered(row))
@@ -366,7 +427,9 @@ def test_a_suites_own_table_is_held_against_its_runs(change: str, evaluated: Har
         assert (code, out, error.count("\n")) == (2, "", 1)
         assert f"{DONE} contradicts itself: " in error
     if change != "a family twice":
-        assert best == next(one for one in runs(Path("reports")) if one.kind == "suite"), "ls reads its runs"
+        assert best == next(one for one in runs(Path("reports")) if one.kind == "suite"), (
+            "ls reads its runs"
+        )
 
 
 def test_a_run_counts_for_the_family_whose_scenes_it_has(evaluated: Harness) -> None:

@@ -69,7 +69,9 @@ def test_only_a_sum_that_is_off_is_divided_and_only_where_that_was_declared(
 
 
 def test_where_sums_need_no_declaration_it_is_refused() -> None:
-    with pytest.raises(UserError, match="--sums divide: swarm-tiny answers in constrained, whose sums"):
+    with pytest.raises(
+        UserError, match="--sums divide: swarm-tiny answers in constrained, whose sums"
+    ):
         Agent(cards.resolve("swarm-tiny"), versions.load("v2"), "constrained", sums="divide")
     with pytest.raises(UserError, match="unknown sums 'halve'; known: divide, refuse"):
         Agent(cards.resolve("proxy"), versions.load("v2"), sums="halve")  # type: ignore[arg-type]
@@ -92,8 +94,9 @@ def test_a_run_says_how_many_were_divided_and_is_no_run_that_refuses_them(
         n = sum(answer.role == "ego" for answer in run.answers)
         assert f"ego answers divided by their sum: 100.0 % of {n}" in out
         assert run.score("all", "divided_rate_ego").value == 1
-        assert f"{n} of the ego's {n} answers did not sum to 1 and were divided by their sum" in "".join(
-            divided(run)
+        assert (
+            f"{n} of the ego's {n} answers did not sum to 1 and were divided by their sum"
+            in "".join(divided(run))
         )
         assert run.manifest.sums == run.manifest.agent(0)["sums"] == "divide"
         assert "--sums divide" in run.manifest.command

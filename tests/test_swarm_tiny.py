@@ -1,4 +1,5 @@
-"""The model that ships is a model: what its documents say of it holds on part of the shipped dataset.
+"""The model that ships is a model: what its documents say of it holds on part of the shipped
+dataset.
 
 The bars are those of the whole dataset, where the README's table has the intervals.
 """
@@ -28,7 +29,9 @@ def shipped() -> Dataset:
 
 @pytest.fixture(scope="module")
 def done(shipped: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
-    return run(spec_of(shipped, "swarm-tiny", seeds=(0, 1, 2, 3, 4)), tmp_path_factory.mktemp("r") / "run")
+    return run(
+        spec_of(shipped, "swarm-tiny", seeds=(0, 1, 2, 3, 4)), tmp_path_factory.mktemp("r") / "run"
+    )
 
 
 @pytest.mark.exhaustive
@@ -41,7 +44,8 @@ def test_its_answers_are_valid_as_they_come(done: Evaluated) -> None:
 @pytest.mark.exhaustive
 def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset) -> None:
     """Hidden: the ego does not see the danger, and a sector of its view is occluded."""
-    said = [d for d in decisions(done.out, "single-local") if d.seed == 0]  # nothing of it depends on luck
+    # nothing of it depends on luck
+    said = [d for d in decisions(done.out, "single-local") if d.seed == 0]
     hidden = []
     for scene, decision in zip(shipped.scenes([d.scene for d in said]), said, strict=True):
         graph, danger = scene.graphs[scene.state.ego.id], scene.record.danger.vehicle

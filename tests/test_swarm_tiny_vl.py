@@ -34,7 +34,9 @@ def shipped() -> Dataset:
 
 
 def asked(shipped: Dataset, image: str) -> list[Request]:
-    """What every viewer is asked at the first decision point of each layout, by the picture alone."""
+    """What every viewer is asked at the first decision point of each layout,
+    by the picture alone.
+    """
     spec = with_ego(spec_of(shipped, MODEL, "v8", answer="readout"), image=image)
     steps = shipped.forest.step
     first = [name for name, at in shipped.forest.place.items() if steps[at] == 0]
@@ -49,18 +51,24 @@ def intents(engine: str, questions: list[Request]) -> Floats:
 
 
 def test_its_picture_tokens_see(shipped: Dataset) -> None:
-    """What each token of a picture is read as, on report layouts; its decisions make no use of it yet."""
+    """What each token of a picture is read as, on report layouts;
+    its decisions make no use of it yet.
+    """
     backend: Any = open_backend(cards.resolve(MODEL, "transformers"), device="cpu")
     model, tokenizer = backend.engine.model, backend.chat.tokenizer.hub
     filled = model.config.image_token_id
-    digits = model.get_input_embeddings().weight[tokenizer.convert_tokens_to_ids(list("0123456789"))]
+    digits = model.get_input_embeddings().weight[
+        tokenizer.convert_tokens_to_ids(list("0123456789"))
+    ]
     answers, train = (
         pytest.importorskip(f"harness.extensions.learn.training.{n}") for n in ("answers", "train")
     )
     read, shown = [], []
     for question in asked(shipped, "own"):
         assert isinstance(question.image, Sight)
-        ids = np.array([filled if token < 0 else token for token in backend.tokens(question)], dtype=np.int32)
+        ids = np.array(
+            [filled if token < 0 else token for token in backend.tokens(question)], dtype=np.int32
+        )
         sample = train.Sample(ids, 1, "", len(ids), None, image=question.image)
         with torch.inference_mode():
             [hidden] = train.hidden_states(model, [sample])

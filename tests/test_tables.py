@@ -23,7 +23,9 @@ ACTIONS = ("SLOWER", "IDLE", "FASTER")
 
 @pytest.fixture(scope="module")
 def frozen(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose answers fail in many ways, by a model whose name pandas takes for a missing value."""
+    """A run whose answers fail in many ways,
+    by a model whose name pandas takes for a missing value.
+    """
     spec = spec_of(small, "proxy-faulty", points=(POINTS["single-local"], POINTS["6g"]))
     spec = with_ego(spec, card=replace(spec.ego.card, name="null"))
     return run(spec, tmp_path_factory.mktemp("tables") / "frozen").out
@@ -36,7 +38,9 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["frozen", "live"])
-def test_every_decision_and_answer_is_in_the_tables(kind: str, request: pytest.FixtureRequest) -> None:
+def test_every_decision_and_answer_is_in_the_tables(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
     path: Path = request.getfixturevalue(kind)
     made, said = harness.load(path), answers_of(path)
     told = made.answers
@@ -59,7 +63,9 @@ def test_every_decision_and_answer_is_in_the_tables(kind: str, request: pytest.F
         assert on_time
 
 
-def test_what_each_action_leads_to_is_known_of_frozen_scenes_alone(frozen: Path, live: Path) -> None:
+def test_what_each_action_leads_to_is_known_of_frozen_scenes_alone(
+    frozen: Path, live: Path
+) -> None:
     table, driven = harness.load(frozen).decisions, harness.load(live).decisions
     for action in ACTIONS:
         assert table[f"safe_{action}"].notna().all()
@@ -104,7 +110,8 @@ def test_fusion_calls_have_a_row_each(tmp_path: Path) -> None:
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = (
-        "import sys, harness; print([m for m in ('numpy', 'pandas', 'typer', 'jinja2') if m in sys.modules])"
+        "import sys, harness; print([m for m in ('numpy', 'pandas', 'typer', 'jinja2') if m in "
+        "sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
 

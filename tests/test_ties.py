@@ -47,7 +47,9 @@ ACTIONS = ("SLOWER", "IDLE", "FASTER")
 
 
 def taken(policies: Any, draws: Any = None) -> list[int]:
-    """The actions of an ego alone with these policies, where `draws` has what decides each that is tied."""
+    """The actions of an ego alone with these policies,
+    where `draws` has what decides each that is tied.
+    """
     own = np.array(policies, dtype=float)
     n = len(own)
     none = np.zeros((n, 0))
@@ -66,10 +68,14 @@ def test_a_tie_among_some_actions_is_drawn_among_these_alone() -> None:
 
 def test_rounding_makes_no_difference_and_a_real_one_is_none_to_draw() -> None:
     third = 1 / 3
-    assert taken([[third - TIE / 2, third, third], [third - 1e-6, third + 1e-6, third]], [0.1, 0.9]) == [0, 1]
+    assert taken(
+        [[third - TIE / 2, third, third], [third - 1e-6, third + 1e-6, third]], [0.1, 0.9]
+    ) == [0, 1]
 
 
-@given(st.lists(st.floats(0, 1), min_size=2, max_size=6).filter(sum), st.floats(0, 1, exclude_max=True))
+@given(
+    st.lists(st.floats(0, 1), min_size=2, max_size=6).filter(sum), st.floats(0, 1, exclude_max=True)
+)
 def test_without_a_tie_the_draw_changes_nothing(weights: list[float], draw: float) -> None:
     p = np.array(weights) / sum(weights)
     best, next_best = sorted(p)[::-1][:2]
@@ -91,7 +97,9 @@ def test_an_ego_that_says_all_alike_takes_each_action_a_third_of_the_time(small:
     first = Counter(d.action for d in found if d.step == 0)
     every = Counter(d.action for d in found)
     for shares in (first, every):
-        assert [shares[action] / shares.total() for action in ACTIONS] == pytest.approx([1 / 3] * 3, abs=0.05)
+        assert [shares[action] / shares.total() for action in ACTIONS] == pytest.approx(
+            [1 / 3] * 3, abs=0.05
+        )
 
 
 def test_the_steps_and_the_layouts_of_a_seed_draw_apart(small: Dataset) -> None:
@@ -143,7 +151,9 @@ TIED = replace(cards.resolve("proxy"), name="tied", engine="tied")
 def tied(monkeypatch: pytest.MonkeyPatch) -> Card:
     """Card of a model that says that all actions are alike."""
     opens = f"{__name__}:open_tied"
-    monkeypatch.setitem(registry.ENGINES._loaded, "tied", replace(registry.BUILT_IN["proxy"], opens=opens))
+    monkeypatch.setitem(
+        registry.ENGINES._loaded, "tied", replace(registry.BUILT_IN["proxy"], opens=opens)
+    )
     return TIED
 
 
@@ -157,11 +167,14 @@ def test_a_frozen_episode_is_the_driven_one(tied: Card, small: Dataset, tmp_path
     frozen = run(with_ego(spec_of(small, **how), card=tied), tmp_path / "frozen").out
     live = live_spec_of("proxy", len(small.episodes), small.manifest.seed, **how)
     driven = run(with_ego(live, card=tied), tmp_path / "driven").out
-    ways = [[(d.scene, d.seed, d.step, d.action) for d in decisions(out)] for out in (frozen, driven)]
+    ways = [
+        [(d.scene, d.seed, d.step, d.action) for d in decisions(out)] for out in (frozen, driven)
+    ]
     assert len({action for *_, action in ways[0]}) == 3
     assert sorted(ways[0]) == sorted(ways[1])
     ends = [
-        [(e.episode, e.seed, e.success, e.time_s) for e in read(out).episodes] for out in (frozen, driven)
+        [(e.episode, e.seed, e.success, e.time_s) for e in read(out).episodes]
+        for out in (frozen, driven)
     ]
     assert ends[0] == ends[1]
 
@@ -174,7 +187,9 @@ def test_a_study_of_a_run_draws_as_the_run_did(tied: Card, small: Dataset, tmp_p
         ).out
         stored = ReplayedRun(out)
         settings = [Setting(point.name, point, stored.vehicles) for point in (ALONE, OVER_6G)]
-        for point, [walked] in zip((ALONE, OVER_6G), stored.walked(settings, stored.seeds), strict=True):
+        for point, [walked] in zip(
+            (ALONE, OVER_6G), stored.walked(settings, stored.seeds), strict=True
+        ):
             ends = [e.success for e in stored.run.episodes if e.condition == point.name]
             assert walked.ends["success_rate"].ravel().tolist() == ends
 
@@ -195,7 +210,16 @@ def test_a_run_without_the_setting_took_the_first(
     with pytest.raises(UserError, match="ties"):
         finished(spec.changed(ties="drawn"), old)
     again = tmp_path / "again"
-    options = ("--dataset", small.path, "--prompt", "v2", "--condition", ALONE.name, "--seeds", "0:2")
+    options = (
+        "--dataset",
+        small.path,
+        "--prompt",
+        "v2",
+        "--condition",
+        ALONE.name,
+        "--seeds",
+        "0:2",
+    )
     assert harness("eval", "--model", f"replay:{old}", *options, "--quiet", "--out", again)[0] == 0
     assert same_decisions(old, again)
     assert read(again).manifest.settings.ties == "first"
@@ -203,7 +227,9 @@ def test_a_run_without_the_setting_took_the_first(
 
 @pytest.mark.parametrize("ties", ["drawn", "first"])
 def test_the_command_that_repeats_a_run_falls_alike(ties: str, small: Dataset) -> None:
-    assert ("--ties first" in " ".join(words(spec_of(small, ties=ties).settings))) == (ties == "first")
+    assert ("--ties first" in " ".join(words(spec_of(small, ties=ties).settings))) == (
+        ties == "first"
+    )
 
 
 def test_another_word_is_refused_in_one_line(

@@ -37,7 +37,9 @@ def test_a_folder_without_one_is_one_line(tmp_path: Path) -> None:
     "content", [b"", b"{}", b"[1", b"\xff\x00", b"GGUF", b"GGUF\x03\x00\x00\x00" + b"\xff" * 64]
 )
 @pytest.mark.parametrize("name", ["t.gguf", "tokenizer.json"])
-def test_a_file_that_is_something_else_is_one_line(name: str, content: bytes, tmp_path: Path) -> None:
+def test_a_file_that_is_something_else_is_one_line(
+    name: str, content: bytes, tmp_path: Path
+) -> None:
     (tmp_path / name).write_bytes(content)
     assert "is no readable tokenizer: " in refused(tmp_path / name)
 
@@ -73,7 +75,10 @@ def test_a_gguf_file_is_read_as_its_model_reads_it(tmp_path: Path) -> None:
 def test_a_gguf_file_that_nobody_knows_or_without_merges_is_one_line(tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="needs the transformers extra")
     message = refused(gguf(tmp_path / "odd.gguf", pre="of-my-own"))
-    assert "has the pre-tokeniser of-my-own, which is not known here; give the model's tokenizer" in message
+    assert (
+        "has the pre-tokeniser of-my-own, which is not known here; give the model's tokenizer"
+        in message
+    )
     assert "is no readable tokenizer" in refused(gguf(tmp_path / "bare.gguf", merges=True))
 
 
@@ -131,7 +136,9 @@ BOS = "<|endoftext|>"
 def saved(folder: Path, **changes: Any) -> Path:
     """The tokenizer that ships, saved with other settings."""
     folder.mkdir(exist_ok=True)
-    (folder / "tokenizer.json").write_text(json.dumps({**json.loads(SHIPPED.read_text()), **changes}))
+    (folder / "tokenizer.json").write_text(
+        json.dumps({**json.loads(SHIPPED.read_text()), **changes})
+    )
     return folder
 
 

@@ -28,7 +28,9 @@ def table(tmp_path: Path, text: str = PLAIN) -> Path:
 
 
 def load(path: Path, **settings: object) -> Trace:
-    return from_profile({"file": path.name, **settings}, path.parent, "channel file mine.toml [parameters]")
+    return from_profile(
+        {"file": path.name, **settings}, path.parent, "channel file mine.toml [parameters]"
+    )
 
 
 def sites(distances_m: list[float], sight: list[int]) -> Site:
@@ -52,9 +54,13 @@ def test_what_never_arrives_needs_no_latency(nothing: str, tmp_path: Path) -> No
     """Half of the messages at 75 m arrive; they take as long as those at 50 m."""
     rows = f"0,0,{nothing}\n10,1,3\n50,1,5\n100,0,{nothing}\n"
     trace = load(table(tmp_path, f"distance_m,reception,latency_ms\n{rows}"))
-    assert [p.latency_s for p in trace.receptions.points] == pytest.approx([0.003, 0.003, 0.005, 0.005])
+    assert [p.latency_s for p in trace.receptions.points] == pytest.approx(
+        [0.003, 0.003, 0.005, 0.005]
+    )
     sight = "clear,vehicle,building"
-    rows = "".join(f"{d},{r},{w},{t}\n" for w in sight.split(",") for d, r, t in ((0, w != "building", 7),))
+    rows = "".join(
+        f"{d},{r},{w},{t}\n" for w in sight.split(",") for d, r, t in ((0, w != "building", 7),)
+    )
     rows = rows.replace("0,True,", "0,1,").replace("0,False,building,7", f"0,0,building,{nothing}")
     walled = load(table(tmp_path, f"distance_m,reception,sight,latency_ms\n{rows}"))
     assert [p.latency_s for p in walled.receptions.points] == [0.007] * 3
@@ -64,7 +70,9 @@ def test_what_never_arrives_needs_no_latency(nothing: str, tmp_path: Path) -> No
 
 def test_what_stands_between_has_a_curve_of_its_own_and_an_unknown_place_none(tmp_path):
     trace = load(table(tmp_path, SIGHTED))
-    assert trace.reception(np.array([100.0])).tolist() == pytest.approx([0.95]), "clear, if nothing is said"
+    assert trace.reception(np.array([100.0])).tolist() == pytest.approx([0.95]), (
+        "clear, if nothing is said"
+    )
     site = sites([100.0, 100.0, 25.0, np.nan], [CLEAR, VEHICLE, BUILDING, CLEAR])
     loss = trace.loss(site, np.zeros(4), 800.0)
     assert loss[:3].tolist() == pytest.approx([0.05, 0.4, 0.75])
@@ -72,7 +80,9 @@ def test_what_stands_between_has_a_curve_of_its_own_and_an_unknown_place_none(tm
 
 
 def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(tmp_path):
-    """At 100 m .95 cross in 6 ms. Draws are probabilities of loss that are just passed and just not."""
+    """At 100 m .95 cross in 6 ms. Draws are probabilities of loss that are just passed and just
+    not.
+    """
     trace = load(table(tmp_path, SIGHTED))
     assert isinstance(trace, Channel)
     asked = np.array([True, True, False])
@@ -80,9 +90,13 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
         asked, np.array([0.15, 0.2, np.nan]), np.full(3, np.nan), np.full(3, 800.0), asked, asked, 400.0,
         sites([100.0, 100.0, np.nan], [CLEAR] * 3),
     )  # fmt: skip
-    draws = Draws(np.full((3, 2), 0.5), np.full(3, 0.5), Trips(np.array(0), np.array(0), np.array(0), 1))
+    draws = Draws(
+        np.full((3, 2), 0.5), np.full(3, 0.5), Trips(np.array(0), np.array(0), np.array(0), 1)
+    )
     object.__setattr__(draws, "packet", np.array([[0.06, 0.06], [0.06, 0.04], [0.9, 0.9]]))
-    assert heard_s(trace, trace.request(400.0, draws), links, draws)[:2] == pytest.approx([0.006, 0.006])
+    assert heard_s(trace, trace.request(400.0, draws), links, draws)[:2] == pytest.approx(
+        [0.006, 0.006]
+    )
     up, delay_s, loss, airtime_s = trace.deliver(links, draws)
     assert up[:2].tolist() == [True, False]
     assert delay_s.tolist() == pytest.approx([0.156, 0.206, np.inf])
@@ -94,10 +108,19 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
     ("text", "says"),
     [
         ("distance_m\n1\n", "run.csv: has no column reception"),
-        ("distance_m,reception,loss\n1,1,0\n", "'loss'; known: distance_m, latency_ms, latency_p50_ms"),
+        (
+            "distance_m,reception,loss\n1,1,0\n",
+            "'loss'; known: distance_m, latency_ms, latency_p50_ms",
+        ),
         ("distance_m,reception\n", "has no rows; give reception at one distance at least"),
-        ("distance_m,reception\n1,1\n2,1.2\n", "line 3: reception is '1.2'; it must be a share from 0 to 1"),
-        ("distance_m,reception\nfar,1\n", "line 2: distance_m is 'far'; it must be metres, 0 to 1000000"),
+        (
+            "distance_m,reception\n1,1\n2,1.2\n",
+            "line 3: reception is '1.2'; it must be a share from 0 to 1",
+        ),
+        (
+            "distance_m,reception\nfar,1\n",
+            "line 2: distance_m is 'far'; it must be metres, 0 to 1000000",
+        ),
         ("distance_m,reception\n1,nan\n", "line 2: reception is 'nan'"),
         ("distance_m,reception\n1\n", "line 2: has other columns than the first line"),
         ("distance_m,reception\n1,1,1\n", "line 2: has other columns than the first line"),
@@ -116,7 +139,10 @@ def test_a_reply_comes_after_the_latency_of_its_distance_if_both_messages_cross(
         ),
         ("distance_m,reception,latency_ms\n1,0.1,nan\n", "it may be blank where reception is 0"),
         ("distance_m,reception,latency_ms\n1,0,soon\n", "line 2: latency_ms is 'soon'"),
-        ("distance_m,reception,latency_ms\n1,1,-4\n", "line 2: latency_ms is '-4'; it must be milliseconds"),
+        (
+            "distance_m,reception,latency_ms\n1,1,-4\n",
+            "line 2: latency_ms is '-4'; it must be milliseconds",
+        ),
     ],
 )
 def test_a_bad_table_is_refused_in_one_line(tmp_path, text, says):
@@ -190,4 +216,8 @@ def test_a_bad_row_of_somebody_elses_curve_is_named(tmp_path: Path, row: str, sa
         curves_of(table(tmp_path, f"distance_m,reception\n{row}\n"))
     assert says in str(refused.value)
     [curve] = curves_of(table(tmp_path, "distance_m,reception,configuration\n10,.9,rate_hz=10\n"))
-    assert (curve.configuration, curve.source, curve.reception.tolist()) == ("rate_hz=10", "run.csv", [0.9])
+    assert (curve.configuration, curve.source, curve.reception.tolist()) == (
+        "rate_hz=10",
+        "run.csv",
+        [0.9],
+    )

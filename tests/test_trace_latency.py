@@ -1,7 +1,7 @@
 """Latencies of a table, by hand: each link has its own row's, and percentiles are drawn.
 
-Without a word to the contrary the ego is at 0, the helpers at 50 and 100 m, everything is received, and all
-vehicles have inferred by 100 ms.
+Without a word to the contrary the ego is at 0, the helpers at 50 and 100 m,
+everything is received, and all vehicles have inferred by 100 ms.
 """
 
 from collections.abc import Iterator
@@ -79,8 +79,12 @@ def same(one: Exchange, other: Exchange) -> None:
 
 
 @pytest.mark.parametrize(("on_demand", "more_s"), [(False, 0.0), (True, 0.1)])
-def test_each_helper_hears_and_answers_after_the_latency_of_its_own_row(patch, tmp_path, on_demand, more_s):
-    """At 50 m 10 ms there and 10 back; at 100 m 30 and 30; an inference of 100 ms between, on demand."""
+def test_each_helper_hears_and_answers_after_the_latency_of_its_own_row(
+    patch, tmp_path, on_demand, more_s
+):
+    """At 50 m 10 ms there and 10 back; at 100 m 30 and 30;
+    an inference of 100 ms between, on demand.
+    """
     heard = play(patch, load(tmp_path, MEAN + NEAR), scene(), luck(1).take(0), on_demand=on_demand)
     assert heard.arrival_s == pytest.approx([0.12 + more_s, 0.16 + more_s])
     assert heard.exchange_s == pytest.approx(0.16 + more_s)
@@ -106,7 +110,9 @@ def test_rows_beyond_every_link_change_no_number(patch, tmp_path, edge, blank):
 def test_rows_beyond_the_radius_change_no_decision_even_if_somebody_is_there(patch, tmp_path):
     """The second helper, 100 m away, is not asked."""
     near, far = (load(tmp_path, MEAN + f"0,1,2\n50,1,10\n100,1,{ms}\n") for ms in (30, 1000000))
-    one, other = (play(patch, each, scene(), luck(1).take(0), radius_m=60.0) for each in (near, far))
+    one, other = (
+        play(patch, each, scene(), luck(1).take(0), radius_m=60.0) for each in (near, far)
+    )
     same(one, other)
     assert one.exchange_s == pytest.approx(0.12)
 
@@ -114,8 +120,8 @@ def test_rows_beyond_the_radius_change_no_decision_even_if_somebody_is_there(pat
 def test_a_unit_that_fuses_has_a_latency_for_each_of_its_links(patch, tmp_path):
     """The ego is 50 m from it (10 ms), one helper at it (2 ms), the other 50 m away.
 
-    It has the request at 110 ms, the helpers have its own at 112 and 120, and replies end at 114 and 130.
-    The policy is with the ego at 140.
+    It has the request at 110 ms, the helpers have its own at 112 and 120,
+    and replies end at 114 and 130. The policy is with the ego at 140.
     """
     heard = play(patch, load(tmp_path, MEAN + NEAR), scene(), luck(1).take(0), edge="fusion")
     assert heard.arrival_s == pytest.approx([0.114, 0.130])
@@ -123,7 +129,9 @@ def test_a_unit_that_fuses_has_a_latency_for_each_of_its_links(patch, tmp_path):
 
 
 def test_a_relayed_reply_comes_over_the_links_that_it_takes(patch, tmp_path):
-    """Directly the far reply ends at 160 ms; over the unit, 50 m from both, at 130 + 10 + 10 = 150."""
+    """Directly the far reply ends at 160 ms;
+    over the unit, 50 m from both, at 130 + 10 + 10 = 150.
+    """
     heard = play(patch, load(tmp_path, MEAN + NEAR), scene(), luck(1).take(0), edge="relay")
     assert heard.arrival_s == pytest.approx([0.12, 0.15]), "the near one is heard directly"
     assert heard.exchange_s == pytest.approx(0.15)
@@ -160,7 +168,9 @@ def test_a_decision_of_a_batch_draws_what_it_draws_alone(patch, tmp_path, edge):
 
 
 def test_conditions_share_the_luck_of_latencies(patch, tmp_path):
-    """Asked alone, or with another, or by another rule, the near helper is heard at the same moment."""
+    """Asked alone, or with another, or by another rule,
+    the near helper is heard at the same moment.
+    """
     trace = load(tmp_path, SPREAD + "0,1,2,5\n50,1,10,20\n100,1,30,300\n")
     both, near, ruled = (
         play(patch, trace, batch(12), luck(12), **settings)
@@ -193,13 +203,23 @@ def test_percentiles_are_blank_only_together_and_then_those_before(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("distance_m,reception,latency_p50_ms\n1,1,1\n", "has latency_p50_ms without latency_p95_ms; add"),
-        ("distance_m,reception,latency_p95_ms\n1,1,1\n", "without latency_p50_ms; add latency_p50_ms, or"),
+        (
+            "distance_m,reception,latency_p50_ms\n1,1,1\n",
+            "has latency_p50_ms without latency_p95_ms; add",
+        ),
+        (
+            "distance_m,reception,latency_p95_ms\n1,1,1\n",
+            "without latency_p50_ms; add latency_p50_ms, or",
+        ),
         (
             "distance_m,reception,latency_ms,latency_p50_ms,latency_p95_ms\n1,1,1,1,1\n",
-            "has both latency_ms and latency_p50_ms; give latency_ms, or latency_p50_ms and latency_p95_ms",
+            "has both latency_ms and latency_p50_ms; give latency_ms, or latency_p50_ms and "
+            "latency_p95_ms",
         ),
-        (SPREAD + "1,1,9,8\n", "latency_p95_ms is 8; it must be latency_p50_ms of its row, 9, or more"),
+        (
+            SPREAD + "1,1,9,8\n",
+            "latency_p95_ms is 8; it must be latency_p50_ms of its row, 9, or more",
+        ),
         (
             SPREAD + "1,1,-9,8\n",
             "latency_p50_ms is '-9'; it must be milliseconds, 0.001 to 1000000; both may",
@@ -207,7 +227,10 @@ def test_percentiles_are_blank_only_together_and_then_those_before(tmp_path):
         (SPREAD + "1,1,0,8\n", "latency_p50_ms is '0'; it must be milliseconds, 0.001 to 1000000"),
         (SPREAD + "1,1,2,inf\n", "latency_p95_ms is 'inf'; it must be milliseconds"),
         (SPREAD + "1,1,nan,8\n", "latency_p50_ms is 'nan'; it must be milliseconds"),
-        (SPREAD + "1,0,,8\n", "latency_p50_ms is ''; it must be milliseconds, 0.001 to 1000000; both may be"),
+        (
+            SPREAD + "1,0,,8\n",
+            "latency_p50_ms is ''; it must be milliseconds, 0.001 to 1000000; both may be",
+        ),
         (MEAN + "1,1,inf\n", "latency_ms is 'inf'; it must be milliseconds, 0 to 1000000"),
     ],
 )

@@ -55,7 +55,9 @@ def ask(i: int, *, max_tokens: int = 24, thinking: bool = False, text: str = "")
         {"role": "system", "content": "You drive."},
         {"role": "user", "content": text or f"Scene {i * 'x'}: truck {i * 7} m"},
     )
-    return Request(f"s{i}/ego", "ego", messages, ("SLOWER", "IDLE", "FASTER"), max_tokens, thinking=thinking)
+    return Request(
+        f"s{i}/ego", "ego", messages, ("SLOWER", "IDLE", "FASTER"), max_tokens, thinking=thinking
+    )
 
 
 REQUESTS = [ask(i) for i in (9, 0, 5, 15, 3, 11, 1, 12, 7)]
@@ -63,17 +65,21 @@ REQUESTS = [ask(i) for i in (9, 0, 5, 15, 3, 11, 1, 12, 7)]
 
 def said(completions: list[Completion]) -> list[tuple[object, ...]]:
     return [
-        (c.request_id, c.text, c.prompt_tokens, c.completion_tokens, c.finish_reason) for c in completions
+        (c.request_id, c.text, c.prompt_tokens, c.completion_tokens, c.finish_reason)
+        for c in completions
     ]
 
 
-# -- answers ------------------------------------------------------------------------------------------
+# -- answers
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "batch_size", [3, *(pytest.param(size, marks=pytest.mark.exhaustive) for size in (1, 8))]
 )
-def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(tiny: Path, batch_size: int) -> None:
+def test_a_batch_says_what_each_request_alone_would_in_the_order_asked(
+    tiny: Path, batch_size: int
+) -> None:
     one = open_tiny(tiny, batch_size=1)
     alone = [one.complete([request])[0] for request in REQUESTS]
     together = open_tiny(tiny, batch_size=batch_size).complete(REQUESTS)
@@ -100,7 +106,9 @@ def test_an_answer_ends_with_its_stop_token_or_is_cut_off(backend: LanguageModel
         assert tiny_qwen3.IM_END not in c.text
 
 
-def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(backend: LanguageModel) -> None:
+def test_one_token_less_than_a_stopped_answer_needs_is_a_cut_off_answer(
+    backend: LanguageModel,
+) -> None:
     [whole] = backend.complete([ask(0)])
     assert whole.finish_reason == "stop"
     assert whole.completion_tokens is not None
@@ -138,7 +146,9 @@ def test_the_thinking_switch_alters_the_prompt(backend: LanguageModel) -> None:
 
 
 def test_a_template_without_the_switch_is_rendered_as_it_is(tmp_path: Path) -> None:
-    bare = tiny_qwen3.build(tmp_path / "bare", template="{{ messages | map(attribute='content') | join }}>")
+    bare = tiny_qwen3.build(
+        tmp_path / "bare", template="{{ messages | map(attribute='content') | join }}>"
+    )
     opened = open_tiny(bare)
     assert opened.chat.thinking == "none"
     said = "".join(message["content"] for message in ask(0).messages)
@@ -162,7 +172,8 @@ def test_no_requests_no_completions(backend: LanguageModel) -> None:
     assert backend.complete([]) == []
 
 
-# -- failures that are data ---------------------------------------------------------------------------
+# -- failures that are data
+# ---------------------------------------------------------------------------
 
 
 def test_a_prompt_that_leaves_no_room_is_an_error_and_its_neighbours_are_answered(
@@ -190,7 +201,9 @@ def test_a_context_is_full_at_its_last_token_and_the_cards_bound_comes_first(tin
 
 
 def test_a_request_that_breaks_the_engine_takes_nobody_with_it(tiny: Path) -> None:
-    """A token past the last embedding row fails the batch; asked again alone, only its owner fails."""
+    """A token past the last embedding row fails the batch;
+    asked again alone, only its owner fails.
+    """
     opened = open_tiny(tiny)
     assert isinstance(opened.chat.tokenizer, HubTokenizer)
     opened.chat.tokenizer.hub.add_tokens(["<boom>"])
@@ -212,7 +225,8 @@ def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
         opened.complete([ask(0)])
 
 
-# -- what a user can get wrong ------------------------------------------------------------------------
+# -- what a user can get wrong
+# ------------------------------------------------------------------------
 
 
 def remove(pattern: str) -> Callable[[Path], None]:
@@ -273,7 +287,9 @@ def own_config(folder: Path) -> None:
 
 
 def own_model(folder: Path) -> None:
-    change(folder / "config.json", auto_map={"AutoModelForCausalLM": "own.Own"}, architectures=["Own"])
+    change(
+        folder / "config.json", auto_map={"AutoModelForCausalLM": "own.Own"}, architectures=["Own"]
+    )
 
 
 def own_tokenizer(folder: Path) -> None:
@@ -303,7 +319,10 @@ def change(file: Path, **values: object) -> None:
             kernel_of_the_hub,
             "names code of the hub, which is never run",
         ),
-        (thousand_million_layers, "num_hidden_layers in its config.json is 1000000000, and at most 10000"),
+        (
+            thousand_million_layers,
+            "num_hidden_layers in its config.json is 1000000000, and at most 10000",
+        ),
     ],
 )
 def test_no_code_of_a_checkpoint_is_run(
@@ -311,7 +330,9 @@ def test_no_code_of_a_checkpoint_is_run(
 ) -> None:
     folder = shutil.copytree(tiny, tmp_path / "with-code")
     changed(folder)
-    (folder / "own.py").write_text(f"import os\nos.mkdir({str(tmp_path / 'caught')!r})\nclass Own: pass\n")
+    (folder / "own.py").write_text(
+        f"import os\nos.mkdir({str(tmp_path / 'caught')!r})\nclass Own: pass\n"
+    )
     if said:
         with pytest.raises(UserError, match=said):
             open_tiny(folder)
@@ -330,7 +351,10 @@ def test_no_code_of_a_checkpoint_is_run(
         (lose_a_layer, ["lacks 1 of its weights", "layers.1.mlp.up_proj"]),
         (grow_the_vocabulary, ["its tokenizer has", "one checkpoint"]),
         (remove("chat_template.jinja"), ["has no chat template", "instruct version"]),
-        (lambda folder: (folder / "config.json").write_text("{"), ["does not load", "not a valid JSON"]),
+        (
+            lambda folder: (folder / "config.json").write_text("{"),
+            ["does not load", "not a valid JSON"],
+        ),
     ],
 )
 def test_a_spoilt_checkpoint_is_one_line_with_what_and_where(
@@ -361,7 +385,9 @@ def test_weights_that_are_nowhere_say_where_they_were_looked_for_and_how_to_get_
 
 
 def test_a_directory_that_has_gone_is_said_so(tmp_path: Path) -> None:
-    card = Card("gone", "transformers", "d", Latency("paper", None, "b"), weights=str(tmp_path / "gone"))
+    card = Card(
+        "gone", "transformers", "d", Latency("paper", None, "b"), weights=str(tmp_path / "gone")
+    )
     with pytest.raises(UserError, match=r"no directory .*gone'.*give another directory"):
         open_backend(card)
 
@@ -374,7 +400,9 @@ def test_a_directory_that_has_gone_is_said_so(tmp_path: Path) -> None:
         ({"batch_size": 0}, "batch size 0; allowed: 1 or more"),
     ],
 )
-def test_an_option_that_cannot_be_names_what_can(tiny: Path, options: dict[str, str], message: str) -> None:
+def test_an_option_that_cannot_be_names_what_can(
+    tiny: Path, options: dict[str, str], message: str
+) -> None:
     with pytest.raises(UserError, match=message):
         open_backend(resolve(str(tiny)), **options)  # type: ignore[arg-type]
 
@@ -385,7 +413,8 @@ def test_a_template_that_refuses_the_messages_is_the_users_to_know(tmp_path: Pat
         open_tiny(tiny_qwen3.build(tmp_path / "gruff", template=template)).complete([ask(0)])
 
 
-# -- identity, place, quiet ---------------------------------------------------------------------------
+# -- identity, place, quiet
+# ---------------------------------------------------------------------------
 
 
 def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them(

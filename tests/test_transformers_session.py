@@ -33,7 +33,8 @@ few = settings(max_examples=20)
 
 
 def full_attention() -> Any:
-    from transformers import Qwen3Config, Qwen3ForCausalLM  # two seconds, which collecting need not take
+    # two seconds, which collecting need not take
+    from transformers import Qwen3Config, Qwen3ForCausalLM
 
     torch.manual_seed(0)
     return Qwen3ForCausalLM(Qwen3Config(**SHAPE)).eval()
@@ -79,7 +80,8 @@ def widths(model: Any) -> Iterator[list[tuple[int, int]]]:
         hook.remove()
 
 
-# -- a session ----------------------------------------------------------------------------------------
+# -- a session
+# ----------------------------------------------------------------------------------------
 
 
 shared_beginnings = st.lists(tokens, max_size=20)
@@ -93,7 +95,9 @@ def any_way_ends_where_one_forward_does(
     with closing(Reader(model).begin(sequences)) as session:
         for _ in range(data.draw(st.integers(0, 3))):
             if data.draw(st.booleans()):
-                places = data.draw(st.lists(st.sampled_from(range(len(sequences))), min_size=1, unique=True))
+                places = data.draw(
+                    st.lists(st.sampled_from(range(len(sequences))), min_size=1, unique=True)
+                )
                 session.keep(places)
                 sequences = [sequences[place] for place in places]
             chunks = [data.draw(st.lists(tokens, max_size=4)) for _ in sequences]
@@ -131,7 +135,9 @@ def test_an_empty_chunk_leaves_a_sequence_to_the_last_bit(model: Any) -> None:
         assert (session.log_probs(EVERY) == after).all()
 
 
-def test_the_likeliest_is_looked_for_among_what_is_listed_and_the_lowest_wins_a_tie(model: Any) -> None:
+def test_the_likeliest_is_looked_for_among_what_is_listed_and_the_lowest_wins_a_tie(
+    model: Any,
+) -> None:
     with closing(Reader(model).begin([[1, 2], [1, 2], [1, 2]])) as session:
         order = session.log_probs(EVERY)[0].argsort()[::-1].tolist()
         assert session.argmax([None, order[3:6], [order[9]]]) == [order[0], order[3], order[9]]
@@ -151,8 +157,12 @@ def test_log_probabilities_are_of_the_whole_vocabulary(model: Any) -> None:
 
 
 def what_is_right_of_a_guess_stays(model: Any, data: st.DataObject) -> None:
-    """Sequences go forward by right, wrong and empty guesses, and end where one forward of each does."""
-    sequences = data.draw(st.lists(st.lists(tokens, min_size=1, max_size=9), min_size=1, max_size=4))
+    """Sequences go forward by right, wrong and empty guesses,
+    and end where one forward of each does.
+    """
+    sequences = data.draw(
+        st.lists(st.lists(tokens, min_size=1, max_size=9), min_size=1, max_size=4)
+    )
     reader = Reader(model)
     with closing(reader.begin(sequences)) as session:
         for _ in range(data.draw(st.integers(1, 3))):
@@ -171,7 +181,8 @@ def what_is_right_of_a_guess_stays(model: Any, data: st.DataObject) -> None:
             counts = session.follow(chunks, guesses)
             assert counts == (right if reader.together else [0] * len(guesses))
             sequences = [
-                [*ids, *guess[:count]] for ids, guess, count in zip(sequences, guesses, counts, strict=True)
+                [*ids, *guess[:count]]
+                for ids, guess, count in zip(sequences, guesses, counts, strict=True)
             ]
             if len(sequences) > 1 and data.draw(st.booleans()):
                 session.keep(range(1, len(sequences)))
@@ -181,13 +192,17 @@ def what_is_right_of_a_guess_stays(model: Any, data: st.DataObject) -> None:
 
 @few
 @given(st.data())
-def test_of_a_guess_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+def test_of_a_guess_stays_what_the_model_would_have_written(
+    model: Any, data: st.DataObject
+) -> None:
     what_is_right_of_a_guess_stays(model, data)
 
 
 @pytest.mark.exhaustive
 @given(st.data())
-def test_of_many_guesses_stays_what_the_model_would_have_written(model: Any, data: st.DataObject) -> None:
+def test_of_many_guesses_stays_what_the_model_would_have_written(
+    model: Any, data: st.DataObject
+) -> None:
     what_is_right_of_a_guess_stays(model, data)
 
 
@@ -198,7 +213,10 @@ def test_each_way_to_go_on_ends_where_one_forward_does(
 ) -> None:
     """Longer sequences than the window, and ways of different lengths."""
     ways = data.draw(st.integers(1, 3))
-    chunks = [[data.draw(st.lists(tokens, min_size=1, max_size=8)) for _ in range(ways)] for _ in sequences]
+    chunks = [
+        [data.draw(st.lists(tokens, min_size=1, max_size=8)) for _ in range(ways)]
+        for _ in sequences
+    ]
     with closing(Reader(model).begin(sequences)) as session:
         found = session.ends(chunks, EVERY)
     whole = [[*ids, *way] for ids, of in zip(sequences, chunks, strict=True) for way in of]
@@ -221,7 +239,9 @@ def test_exact_logits_of_16_bit_weights_are_float32s_until_the_next_call(make: A
 
 
 def test_only_full_attention_is_padded() -> None:
-    """A window that counts tokens would count the pads: such a model reads its prompts one by one."""
+    """A window that counts tokens would count the pads:
+    such a model reads its prompts one by one.
+    """
     for make, together in ((full_attention, True), (sliding_window, False)):
         reader = Reader(make())
         assert reader.together == together
@@ -233,11 +253,14 @@ def test_bfloat16_goes_forward_too(qwen: Any) -> None:
         session.advance([[5], [6, 7]])
         # Eight bits of a mantissa, through two layers of large random weights.
         np.testing.assert_allclose(
-            np.exp(session.log_probs(EVERY)), np.exp(naive(qwen, [[1, 2, 3, 5], [4, 6, 7]])), atol=0.1
+            np.exp(session.log_probs(EVERY)),
+            np.exp(naive(qwen, [[1, 2, 3, 5], [4, 6, 7]])),
+            atol=0.1,
         )
 
 
-# -- what prompts begin with in common ----------------------------------------------------------------
+# -- what prompts begin with in common
+# ----------------------------------------------------------------
 
 SYSTEM = [(7 * i) % 64 for i in range(40)]
 
@@ -272,7 +295,9 @@ def test_a_batch_with_two_beginnings_reads_each_once(qwen: Any) -> None:
 def test_short_prompts_are_not_padded_to_the_longest_of_all(
     qwen: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is read together is bounded on a CPU; what goes forward afterwards is one batch again."""
+    """What is read together is bounded on a CPU;
+    what goes forward afterwards is one batch again.
+    """
     monkeypatch.setattr(reading, "CPU_TOKENS", 24)
     prompts = [[i] * n for i, n in enumerate((3, 30, 8, 5, 12, 7), start=1)]
     ends = ([9], [], [8, 7], [1], [2], [3, 4, 5])
@@ -307,7 +332,9 @@ def test_a_prompt_alone_reads_on_where_the_last_ones_part_from_it(qwen: Any) -> 
     assert seen == [(1, 43), (1, 1), (1, 1)]
 
 
-def test_a_prompt_that_is_asked_again_is_read_again_since_its_seconds_are_an_answers(qwen: Any) -> None:
+def test_a_prompt_that_is_asked_again_is_read_again_since_its_seconds_are_an_answers(
+    qwen: Any,
+) -> None:
     reader = Reader(qwen)
     with widths(qwen) as seen:
         for end in (1, 1, 2, 1):
@@ -329,7 +356,9 @@ def test_a_prompt_that_is_another_ones_beginning_still_has_a_token_of_its_own(qw
     for reader in (Reader(qwen), Reader(qwen)):
         for _ in range(2):
             with closing(reader.begin(sequences)) as session:
-                np.testing.assert_allclose(session.log_probs(EVERY), naive(qwen, sequences), atol=1e-4)
+                np.testing.assert_allclose(
+                    session.log_probs(EVERY), naive(qwen, sequences), atol=1e-4
+                )
 
 
 calls = st.lists(

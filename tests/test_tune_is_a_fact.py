@@ -32,7 +32,10 @@ def splice(source: Path, dataset: Path, number: int) -> None:
         with ZipFile(each / "layouts.zip") as file:
             layouts.append({name: file.read(name) for name in file.namelist()})
         manifests.append(json.loads((each / "manifest.json").read_text()))
-    ours, theirs = layouts[1], {name: data for name, data in layouts[0].items() if name.startswith(folder)}
+    ours, theirs = (
+        layouts[1],
+        {name: data for name, data in layouts[0].items() if name.startswith(folder)},
+    )
     points = [json.loads(of[f"{folder}tree.json"])["levels"] for of in (theirs, ours)]
     more, fewer = (sum(map(len, levels)) for levels in points)
     manifests[1]["trees_sha256"][number] = manifests[0]["trees_sha256"][number]
@@ -70,7 +73,9 @@ def test_one_layout_under_another_seed_is_found_whichever_are_built_whole(
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Any]]:
-    """A dataset of a tune layout, which is what its seed gives; and what that gives, as it takes a second."""
+    """A dataset of a tune layout, which is what its seed gives;
+    and what that gives, as it takes a second.
+    """
     out = tmp_path_factory.mktemp("built") / "tune"
     build(scenarios.get(NAME), out, 1, 1, 1, lambda done: None)
     assert list(rebuilt.differences(load(out))) == []
@@ -120,7 +125,9 @@ def test_whatever_a_tree_says_is_held_against_its_seed(
     shutil.copytree(path, tmp_path / "tune")
     monkeypatch.setattr("harness.dataset.freeze.freeze", lambda scenario, seeds: frozen)
     relabel(tmp_path / "tune", {0: 1}, of_tree, of_scenes)
-    assert list(rebuilt.differences(load(tmp_path / "tune"))) == ["layout 0 is not what layout seed 1 gives"]
+    assert list(rebuilt.differences(load(tmp_path / "tune"))) == [
+        "layout 0 is not what layout seed 1 gives"
+    ]
 
 
 @pytest.mark.slow
@@ -146,7 +153,9 @@ def test_typing_a_command_again_draws_no_other_layouts(
 def test_nothing_fits_or_learns_there(
     typed: str, relabelled: Path, run_of_it: Path, proxy_run: Path, harness: Harness, tmp_path: Path
 ) -> None:
-    run, other = (shutil.copytree(each, tmp_path / each.parent.name) for each in (run_of_it, proxy_run))
+    run, other = (
+        shutil.copytree(each, tmp_path / each.parent.name) for each in (run_of_it, proxy_run)
+    )
     code, out, error = harness(*typed.format(run=run, other=other, data=relabelled).split())
     assert (code, error.count("\n")) == (2, 1), (out, error)
     assert "is not what layout seed" in error
@@ -170,7 +179,9 @@ def test_released_layouts_under_other_seeds_are_known(tmp_path: Path) -> None:
     shipped = load(find("occluded-intersection-v3"), 2)
     build(shipped.scenario, tmp_path / "mine", 2, 200_000, 1, lambda done: None)
     relabel(tmp_path / "mine", {0: 0, 1: 1})
-    with pytest.raises(UserError, match="of occluded-intersection-v3, and numbers are reported of that"):
+    with pytest.raises(
+        UserError, match="of occluded-intersection-v3, and numbers are reported of that"
+    ):
         rebuilt.refuse(load(tmp_path / "mine"))
 
 

@@ -1,4 +1,6 @@
-"""What could not be asked is no answer: exit code 3, the server's words, and the same command asks again."""
+"""What could not be asked is no answer:
+exit code 3, the server's words, and the same command asks again.
+"""
 
 import json
 import re
@@ -94,7 +96,9 @@ def there(play: Play) -> Iterator[Server]:
 
 @pytest.fixture
 def ask(harness: Typed, play: Play, there: Server, small_path: Path, tmp_path: Path) -> Typed:
-    """The command as typed in a project whose card `mine` names the server; it has a cache of its own."""
+    """The command as typed in a project whose card `mine` names the server;
+    it has a cache of its own.
+    """
     (tmp_path / resources.MARKER).touch()
     (tmp_path / "models").mkdir()
     (tmp_path / "models/mine.toml").write_text(CARD.format(there.url))
@@ -107,7 +111,17 @@ def ask(harness: Typed, play: Play, there: Server, small_path: Path, tmp_path: P
     return typed
 
 
-EVAL = ("--limit", "2", "--condition", "single-local", "--condition", "6g", "--seeds", "0:1", "--no-cache")
+EVAL = (
+    "--limit",
+    "2",
+    "--condition",
+    "single-local",
+    "--condition",
+    "6g",
+    "--seeds",
+    "0:1",
+    "--no-cache",
+)
 
 
 @pytest.mark.slow
@@ -115,9 +129,13 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(lambda asked: True)
-    code, out, err = ask("eval", *EVAL, "--ask", "all", "--out", "run")  # more questions than that at once
+    # more questions than that at once
+    code, out, err = ask("eval", *EVAL, "--ask", "all", "--out", "run")
     assert (code, out) == (3, "")
-    said = rf"harness: HTTP 404: {re.escape(WORDS)} \({FIRST} times\): no answer to \d+ of \d+ questions to "
+    said = (
+        rf"harness: HTTP 404: {re.escape(WORDS)} \({FIRST} times\): no answer to \d+ of \d+ "
+        rf"questions to "
+    )
     assert re.match(said, err)
     assert "type the same command to continue: harness eval --model mine" in err
     assert err.count("\n") == 1
@@ -126,7 +144,11 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
 
     assert harness("run", "export", "run", "--junit", "run.xml")[0] == 0
     suite = ElementTree.parse(tmp_path / "run.xml").getroot()
-    assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("1", "0", "1")
+    assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == (
+        "1",
+        "0",
+        "1",
+    )
     [error] = suite.iter("error")
     assert error.attrib["message"].startswith(f"HTTP 404: {WORDS}")
 
@@ -220,7 +242,10 @@ def rows_in(file: Path) -> list[Row]:
 
 def without_batches(run: Path) -> list[Row]:
     rows = rows_in(run / "answers.jsonl")
-    return [{k: v for k, v in row.items() if k not in ("batch_size", "seconds", "token_s")} for row in rows]
+    return [
+        {k: v for k, v in row.items() if k not in ("batch_size", "seconds", "token_s")}
+        for row in rows
+    ]
 
 
 @pytest.mark.slow
@@ -240,7 +265,9 @@ def test_a_few_helpers_without_an_answer_are_lost_messages_that_are_counted_and_
     lost = f"{len(errors)} of {len(helpers)} questions to helpers: each counts as a lost message"
     assert lost in " ".join(out.split())
     assert lost in (tmp_path / "run/report.html").read_text()
-    assert harness("compare", "run", "run", "--fail-if", "success_rate < 0")[0] == 0, "a gate may judge it"
+    assert harness("compare", "run", "run", "--fail-if", "success_rate < 0")[0] == 0, (
+        "a gate may judge it"
+    )
 
 
 def test_a_server_that_breaks_in_the_middle_is_soon_asked_no_more(ask: Typed, play: Play) -> None:
@@ -251,7 +278,15 @@ def test_a_server_that_breaks_in_the_middle_is_soon_asked_no_more(ask: Typed, pl
 
 @pytest.mark.slow
 def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) -> None:
-    fusion = ("--condition", "6g:consensus=ego-prompt", "--seeds", "0:1", "--limit", "1", "--no-cache")
+    fusion = (
+        "--condition",
+        "6g:consensus=ego-prompt",
+        "--seeds",
+        "0:1",
+        "--limit",
+        "1",
+        "--no-cache",
+    )
     play.again(of_fusion)
     code, _, err = ask("eval", *fusion, "--out", "run")
     assert code == 3
@@ -262,8 +297,20 @@ def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("role", some(["helpers"], exhaustive=["ego"]))
-def test_a_driven_run_asks_only_the_errors_again(role: str, ask: Typed, play: Play, tmp_path: Path) -> None:
-    options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--no-cache", "--workers", "1")
+def test_a_driven_run_asks_only_the_errors_again(
+    role: str, ask: Typed, play: Play, tmp_path: Path
+) -> None:
+    options = (
+        "--episodes",
+        "2",
+        "--condition",
+        "6g",
+        "--seeds",
+        "0:1",
+        "--no-cache",
+        "--workers",
+        "1",
+    )
     play.again(one_of(of_helper, 5) if role == "helpers" else one_of(of_ego, 2))
     code, out, err = ask("drive", *options, "--out", "run")
     assert (code, out) == (3, "")
@@ -279,7 +326,18 @@ def test_a_driven_run_asks_only_the_errors_again(role: str, ask: Typed, play: Pl
 def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     ask: Typed, harness: Typed, play: Play
 ) -> None:
-    options = ("--episodes", "2", "--condition", "6g", "--seeds", "0:1", "--workers", "1", "--shard", "1/1")
+    options = (
+        "--episodes",
+        "2",
+        "--condition",
+        "6g",
+        "--seeds",
+        "0:1",
+        "--workers",
+        "1",
+        "--shard",
+        "1/1",
+    )
     play.again(one_of(of_helper, 5))
     assert ask("drive", *options, "--out", "shard")[0] == 3
     code, _, err = harness("run", "merge", "shard", "--out", "run")
@@ -293,7 +351,12 @@ def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
 @pytest.mark.parametrize(
     ("command", "options"),
     some(
-        [("study grid", ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g"))],
+        [
+            (
+                "study grid",
+                ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g"),
+            )
+        ],
         exhaustive=[
             ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
             ("study twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
@@ -332,14 +395,18 @@ def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
     assert set(play.bodies) == refused(refuses, before)
 
 
-# -- runs of older versions, which hold errors of the ego -------------------------------------------------
+# -- runs of older versions, which hold errors of the ego
+# -------------------------------------------------
 
 
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
     def refuse(row: Row) -> None:
         row |= {
-            "error": f"HTTP 404: {WORDS}", "raw": "", "finish_reason": "error", "status": "engine_error",
+            "error": 
+                "HTTP "
+                "404: "
+                f"{WORDS}", "raw": "", "finish_reason": "error", "status": "engine_error",
             "verdict": "failed", "intent": None, "mass": None, "message": None,
         }  # fmt: skip
 
@@ -353,7 +420,9 @@ def old(tmp_path: Path) -> Path:
 def test_gates_refuse_a_finished_run_that_is_full_of_errors(
     old: Path, harness: Typed, tmp_path: Path
 ) -> None:
-    code, out, err = harness("compare", old, old, "--fail-if", "success_rate < -0.01", "--junit", "gates.xml")
+    code, out, err = harness(
+        "compare", old, old, "--fail-if", "success_rate < -0.01", "--junit", "gates.xml"
+    )
     assert (code, out) == (2, "")
     assert err.startswith(f"harness: HTTP 404: {WORDS}")
     assert [e.tag for e in ElementTree.parse(tmp_path / "gates.xml").getroot()[0]] == ["error"]
@@ -379,7 +448,8 @@ def test_it_is_not_replayed(old: Path, harness: Typed) -> None:
     assert "lacks answers, so nothing replays it: HTTP 404" in err
 
 
-# -- the rule, and what a check of a model ends with ------------------------------------------------------
+# -- the rule, and what a check of a model ends with
+# ------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -400,7 +470,8 @@ def test_one_of_the_egos_or_five_percent_of_the_helpers(
 
 
 @pytest.mark.parametrize(
-    ("said", "code"), [(None, 3), ("I would rather not say", 1), ('{"SLOWER": 0.2, "IDLE": 0.8}', 1)]
+    ("said", "code"),
+    [(None, 3), ("I would rather not say", 1), ('{"SLOWER": 0.2, "IDLE": 0.8}', 1)],
 )
 def test_a_check_tells_a_model_that_cannot_be_asked_from_one_that_cannot_be_read(
     said: str | None, code: int, ask: Typed, harness: Typed, there: Server, tmp_path: Path
@@ -419,7 +490,9 @@ def test_a_check_tells_a_model_that_cannot_be_asked_from_one_that_cannot_be_read
     assert harness("model", "check", "mine")[0] == 0
 
 
-def test_a_server_that_does_not_listen_could_not_be_asked(ask: Typed, harness: Typed, tmp_path: Path) -> None:
+def test_a_server_that_does_not_listen_could_not_be_asked(
+    ask: Typed, harness: Typed, tmp_path: Path
+) -> None:
     (tmp_path / "models/mine.toml").write_text(CARD.format("http://127.0.0.1:9/v1"))
     code, _, err = harness("model", "check", "mine")
     assert (code, err.count("\n")) == (3, 1)

@@ -54,9 +54,13 @@ def test_both_engines_read_the_same_file(kind: str, tmp_path: Path, cache: Path)
     )
     questions = [asked(n) for n in range(6)]
     assert here.rendered(questions) == there.rendered(questions)
-    assert [here.tokens(q) for q in questions] == [there.chat.encode(p) for p in there.rendered(questions)]
+    assert [here.tokens(q) for q in questions] == [
+        there.chat.encode(p) for p in there.rendered(questions)
+    ]
     rows = len(here.chat.tokenizer.hub)
-    ours, theirs = (np.concatenate([b.next_log_probs([q], rows) for q in questions]) for b in (here, there))
+    ours, theirs = (
+        np.concatenate([b.next_log_probs([q], rows) for q in questions]) for b in (here, there)
+    )
     # llama.cpp rounds what a quantised matrix is multiplied with.
     assert np.abs(ours - theirs).max() < {"F32": 1e-3, "Q8_0": 0.1}[kind]
     assert here.engine.stops == [2]
@@ -115,10 +119,16 @@ def test_the_digest_is_the_gguf_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "spoil", "said"),
     [
-        ({"template": None}, None, "has no chat template; give the GGUF file of its instruct version"),
+        ({"template": None}, None, 
+            "has no chat template; give the GGUF "
+            "file of its instruct version"),
         ({"pre": "of-my-own"}, None, "has the pre-tokeniser of-my-own, which is not known here"),
-        ({"architecture": "odd"}, None, "does not load with transformers: .*odd.*; run it on llama-cpp"),
-        ({}, lambda data: data[:200], "does not load: a text is longer than the file; copy or download"),
+        ({"architecture": "odd"}, None, 
+            "does not load with transformers: "
+            ".*odd.*; run it on llama-cpp"),
+        ({}, lambda data: data[:200], 
+            "does not load: a text is longer than "
+            "the file; copy or download"),
         ({}, lambda data: b"", "does not load: it ends before"),
         ({}, lambda data: data[:-4000], "does not load with transformers: "),
         (
@@ -128,7 +138,11 @@ def test_the_digest_is_the_gguf_files(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_what_cannot_be_unpacked_is_one_line_and_leaves_nothing(
-    settings: dict[str, Any], spoil: Callable[[bytes], bytes] | None, said: str, tmp_path: Path, cache: Path
+    settings: dict[str, Any],
+    spoil: Callable[[bytes], bytes] | None,
+    said: str,
+    tmp_path: Path,
+    cache: Path,
 ) -> None:
     file = tiny_llama.build(tmp_path / "tiny.gguf", **settings)
     if spoil:

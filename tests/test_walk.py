@@ -4,7 +4,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from evaluating import A_TENTH, Scripted, Walked, all_scenes, asker_of, course, says, spec_of, sure, walked
+from evaluating import (
+    A_TENTH,
+    Scripted,
+    Walked,
+    all_scenes,
+    asker_of,
+    course,
+    says,
+    spec_of,
+    sure,
+    walked,
+)
 
 from harness.coordination.consensus import Fused, linear_pool
 from harness.coordination.operating_point import OperatingPoint
@@ -51,16 +62,21 @@ def lossy() -> OperatingPoint:
 
 @pytest.fixture
 def played(small: Dataset) -> Dataset:
-    """Episode 1 ends a step before its neighbours. Every vehicle is as far from the zone as any other."""
+    """Episode 1 ends a step before its neighbours.
+    Every vehicle is as far from the zone as any other.
+    """
     data = course(small, 3, OUTCOMES)
     scenes = [
-        scene.changed(distance_m=dict.fromkeys(scene.record.distance_m, 10.0)) for scene in all_scenes(data)
+        scene.changed(distance_m=dict.fromkeys(scene.record.distance_m, 10.0))
+        for scene in all_scenes(data)
     ]
     return replace(data, _scenes={scene.id: scene for scene in scenes})
 
 
 def script(data: Dataset) -> Scripted:
-    """Helpers are sure of SLOWER at the first step, of IDLE at the second and of FASTER at the third."""
+    """Helpers are sure of SLOWER at the first step,
+    of IDLE at the second and of FASTER at the third.
+    """
     lines = {}
     for scene in all_scenes(data):
         action = data.actions[scene.record.step]
@@ -78,16 +94,20 @@ def fused(told: Walked, point: OperatingPoint, episode: int, seed: int = 0) -> l
 def test_a_rule_with_memory_carries_its_state_from_step_to_step(
     played: Dataset, halves: OperatingPoint
 ) -> None:
-    """Four equal weights: the pool is (.875, .075, .05), (.125, .825, .05), (.125, .075, .8) at three steps.
+    """Four equal weights: the pool is (.875, .075, .05), (.125, .825, .05),
+    (.125, .075, .8) at three steps.
 
-    Half of each and half of what was before: (.875, .075, .05), (.5, .45, .05), (.3125, .2625, .425). So the
-    first two steps brake and the third, whose memory is not enough, goes faster into a collision.
+    Half of each and half of what was before: (.875, .075, .05), (.5, .45, .05), (.3125, .2625,
+    .425). So the first two steps brake and the third, whose memory is not enough, goes faster into
+    a collision.
     """
     told = walked(spec_of(played, points=(halves, POOLED), seeds=(0, 1)), script(played))
     expected = [[0.875, 0.075, 0.05], [0.5, 0.45, 0.05], [0.3125, 0.2625, 0.425]]
     for seed in (0, 1):
         for episode, steps in ((0, 3), (1, 2), (2, 3)):
-            assert fused(told, halves, episode, seed) == [pytest.approx(p) for p in expected[:steps]]
+            assert fused(told, halves, episode, seed) == [
+                pytest.approx(p) for p in expected[:steps]
+            ]
         pool = [[0.875, 0.075, 0.05], [0.125, 0.825, 0.05], [0.125, 0.075, 0.8]]
         assert fused(told, POOLED, 0, seed) == [pytest.approx(p) for p in pool]
     assert [d.action for d in told.records("halves") if d.episode == 0 and d.seed == 0] == [
@@ -100,7 +120,9 @@ def test_a_rule_with_memory_carries_its_state_from_step_to_step(
 def test_memory_goes_with_the_episode_and_the_seed(
     played: Dataset, halves: OperatingPoint, lossy: OperatingPoint
 ) -> None:
-    """Links that are up or down by seed give each seed a course of its own; alone it is the same."""
+    """Links that are up or down by seed give each seed a course of its own;
+    alone it is the same.
+    """
     seeds = (0, 1, 2, 3, 4)
     together = walked(spec_of(played, points=(halves, lossy), seeds=seeds), script(played))
     courses = set()
@@ -119,10 +141,11 @@ def test_memory_goes_with_the_episode_and_the_seed(
 
 
 def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dataset) -> None:
-    """Helpers of episode e are sure of action e, so an episode that goes FASTER into a collision is over.
+    """Helpers of episode e are sure of action e,
+    so an episode that goes FASTER into a collision is over.
 
-    First 0 hears IDLE of 1, 1 hears FASTER of 2 and 2 SLOWER of 0; then 2 and 0 are left, and hear each
-    other: 0 collides. Whoever is alone keeps its own (.5, .3, .2).
+    First 0 hears IDLE of 1, 1 hears FASTER of 2 and 2 SLOWER of 0; then 2 and 0 are left, and hear
+    each other: 0 collides. Whoever is alone keeps its own (.5, .3, .2).
     """
     lines = {f"{scene.id}/{scene.viewers[0]}": EGO for scene in all_scenes(played)}
     for scene in all_scenes(played):
@@ -142,7 +165,9 @@ def test_shuffled_messages_are_those_of_the_next_layout_that_decides(played: Dat
 
 
 def by_hand(heard: list[int]) -> list[np.ndarray]:
-    """The policies where so many helpers are heard at each step; an ego that hears nobody keeps its own."""
+    """The policies where so many helpers are heard at each step;
+    an ego that hears nobody keeps its own.
+    """
     own, memory, policies = np.array([0.5, 0.3, 0.2]), None, []
     for step, n in enumerate(heard):
         pool = (own + n * np.eye(3)[step]) / (1 + n)

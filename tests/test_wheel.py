@@ -1,4 +1,6 @@
-"""The wheel works where there is no checkout and no extra: it carries prompts, cards and the dataset."""
+"""The wheel works where there is no checkout and no extra:
+it carries prompts, cards and the dataset.
+"""
 
 import json
 import os
@@ -30,7 +32,16 @@ pytestmark = pytest.mark.exhaustive
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """An environment with the wheel and what it requires, and nothing else."""
     folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    build = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(folder),
+        str(ROOT),
+    ]
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     bare = folder / "bare"
@@ -49,7 +60,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     shutil.rmtree(bare)  # half a gigabyte
 
 
-def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, tmp_path: Path) -> None:
+def test_a_bare_install_evaluates_and_reports_outside_the_checkout(
+    site: Path, tmp_path: Path
+) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def typed(*words: str) -> "subprocess.CompletedProcess[str]":
@@ -78,7 +91,14 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     told = json.loads(harness("eval", "--model", "proxy", "--limit", "2", "--json"))
     assert str(site) in told["manifest"]["world"]["path"]
     run = tmp_path / told["run"]
-    files = {"run.json", "answers.jsonl", "decisions.parquet", "episodes.csv", "summary.csv", "report.html"}
+    files = {
+        "run.json",
+        "answers.jsonl",
+        "decisions.parquet",
+        "episodes.csv",
+        "summary.csv",
+        "report.html",
+    }
     assert {p.name for p in run.iterdir()} == {*files, "run.toml", "sources"}
     assert harness("--help").startswith("Usage: harness [OPTIONS] COMMAND")
     swept = typed("study", "sweep", str(run), "--over", "loss", "--grid", "0,0.4", "--out", "swept")
@@ -86,7 +106,9 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(site: Path, t
     assert re.search(r"^0\.4 +\d", swept.stdout, re.MULTILINE)
     assert (tmp_path / "swept/conditions.csv").read_text().startswith("source,panel,")
     python = [str(site / "bin/python"), "-c", FROM_PYTHON, str(run)]
-    done = subprocess.run(python, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        python, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (0, "2 1 Comparison\n"), done.stderr
     simulated = typed("drive", "--model", "proxy")
     assert (simulated.returncode, simulated.stderr.count("\n")) == (2, 1)

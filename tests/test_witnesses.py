@@ -32,17 +32,23 @@ EACH = "occluded-intersection:witnesses=each,radio_share=0.5"
 @pytest.fixture(scope="module")
 def done(small: Dataset, once: Callable[..., Path]) -> Run:
     """Twenty-four layouts: six with each number of witnesses."""
-    return read(once("witnesses", lambda out: driven(small, out, EACH, "single-local", episodes=24)))
+    return read(
+        once("witnesses", lambda out: driven(small, out, EACH, "single-local", episodes=24))
+    )
 
 
 @pytest.mark.slow
 def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
     assert [e.witnesses for e in done.episodes] == [0, 1, 2, 3] * 6
-    assert [e.danger_radio is None for e in done.episodes] == [e.danger == "none" for e in done.episodes]
+    assert [e.danger_radio is None for e in done.episodes] == [
+        e.danger == "none" for e in done.episodes
+    ]
     scenario = LiveSource(0, 1, EACH).scenario
     for e in done.episodes:
         made = scenario.layout(e.layout_seed, scenario.parameters)
-        assert e.danger_radio == next((s.radio for s in made.spawns if s.id == made.danger_id), None)
+        assert e.danger_radio == next(
+            (s.radio for s in made.spawns if s.id == made.danger_id), None
+        )
     for k, metric in enumerate(NAMES):
         own = [e.success for e in done.episodes if e.witnesses == k]
         score = done.score("single-local", metric)
@@ -56,7 +62,8 @@ def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
 ) -> None:
     dangers = [e for e in done.episodes if e.danger != "none"]
     groups = {
-        f"seen by {k}": [e for e in dangers if e.witnesses == k and not e.danger_radio] for k in range(4)
+        f"seen by {k}": [e for e in dangers if e.witnesses == k and not e.danger_radio]
+        for k in range(4)
     }
     groups["with a radio"] = [e for e in dangers if e.danger_radio]
     assert sum(map(len, groups.values())) == len(dangers) < 24
@@ -70,7 +77,9 @@ def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
     assert max(map(len, lines)) <= 80
 
 
-def test_the_table_of_three_conditions_fits_into_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_of_three_conditions_fits_into_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     names = ["single-local", "v2x", "6g:content=objects,encoding=etsi", "6g"]
     figures = {
         (name, metric): Score(name, metric, 1.0, 0.956, 1.0, 100, 0, "episodes")
@@ -97,7 +106,12 @@ def test_where_none_are_declared_nothing_is_said(
 @pytest.mark.slow
 def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Path) -> None:
     done = driven(
-        small, tmp_path / "run", "occluded-intersection:witnesses=0", "single-local", "6g", episodes=8
+        small,
+        tmp_path / "run",
+        "occluded-intersection:witnesses=0",
+        "single-local",
+        "6g",
+        episodes=8,
     )
     [gain] = [s for s in done.scores if (s.metric, s.interval) == (GAIN, PAIRED)]
     assert gain.low is not None
@@ -109,6 +123,8 @@ def test_frozen_says_what_driven_says(small: Dataset, tmp_path: Path) -> None:
     parameters = {**small.manifest.parameters, "witnesses": "each"}
     dataset = replace(small, manifest=structs.replace(small.manifest, parameters=parameters))
     done = read(
-        run(spec_of(dataset, "cruise", points=(POINTS["single-local"],), seeds=(0,)), tmp_path / "r").out
+        run(
+            spec_of(dataset, "cruise", points=(POINTS["single-local"],), seeds=(0,)), tmp_path / "r"
+        ).out
     )
     assert [e.witnesses for e in done.episodes] == [e.layout_seed % 4 for e in done.episodes]

@@ -40,13 +40,17 @@ def spec(dataset: Dataset, *points: OperatingPoint, **options: Any) -> Spec:
 
 
 def told(words: object, action: str = "SLOWER") -> str:
-    return json.dumps({"evidence": words, "risk": "high", "recommended_maneuver": action, "confidence": 0.9})
+    return json.dumps(
+        {"evidence": words, "risk": "high", "recommended_maneuver": action, "confidence": 0.9}
+    )
 
 
 class Talkative(Scripted):
     """Helpers say what `words` has for them; an ego brakes if its prompt tells of a danger."""
 
-    def __init__(self, words: Mapping[str, str], speak: Callable[[str], str] = lambda scene: "") -> None:
+    def __init__(
+        self, words: Mapping[str, str], speak: Callable[[str], str] = lambda scene: ""
+    ) -> None:
         super().__init__({})
         self.words, self.speak, self.requests = words, speak, list[Request]()
 
@@ -77,12 +81,16 @@ def asked(
 
 def test_the_ego_reads_the_words_and_not_what_the_helper_would_do(few: Dataset) -> None:
     texts = asked(few, {"v2": "A danger comes from the left.", "v4": "Nothing is near."})
-    assert {*texts} <= {"v2!text", "v4!text", "v2!text+v4!text"}, "v3 has no words and sends nothing"
+    assert {*texts} <= {"v2!text", "v4!text", "v2!text+v4!text"}, (
+        "v3 has no words and sends nothing"
+    )
     text = texts["v2!text+v4!text"]
     *_, first, second, _ = text.splitlines()
     assert first == 'v2 tells you: "A danger comes from the left."'
     assert second == 'v4 tells you: "Nothing is near."'
-    assert not re.search("risk|percent|SLOWER", text.partition("v2 tells")[2].partition("Answer in")[0])
+    assert not re.search(
+        "risk|percent|SLOWER", text.partition("v2 tells")[2].partition("Answer in")[0]
+    )
 
 
 def test_it_acts_on_what_it_then_answers(few: Dataset) -> None:
@@ -103,7 +111,9 @@ def test_it_acts_on_what_it_then_answers(few: Dataset) -> None:
         ("ab " * 60, f'v2 tells you: "{"ab " * 40}"'),
     ],
 )
-def test_words_of_strangers_stay_in_their_quotation_marks(few: Dataset, words: str, shown: str) -> None:
+def test_words_of_strangers_stay_in_their_quotation_marks(
+    few: Dataset, words: str, shown: str
+) -> None:
     [text] = asked(few.of_episodes([0]), {"v2": words}).values()
     assert text.splitlines().count(shown) == 1
 
@@ -128,13 +138,17 @@ def test_a_text_has_its_bytes_and_what_is_around_them(few: Dataset, encoding: st
 def test_a_helper_that_sees_nothing_speaks_of_nothing(few: Dataset) -> None:
     backend = Talkative({"v2": "danger"})
     walked(spec(few, TEXT.changed(messages="blind")), backend)
-    assert {r.id.partition("/")[2] for r in backend.requests if "/v1+" in r.id} == {"v1+v2~blind!text"}
+    assert {r.id.partition("/")[2] for r in backend.requests if "/v1+" in r.id} == {
+        "v1+v2~blind!text"
+    }
     assert [r for r in backend.requests if r.id.endswith("/v2~blind")]
 
 
 def test_shuffled_words_are_those_of_another_layout(few: Dataset) -> None:
     """A helper speaks of its own scene; the ego hears of one that is not its own."""
-    texts = asked(few, {}, TEXT.changed(messages="shuffled"), speak=lambda scene: f"This is {scene}.")
+    texts = asked(
+        few, {}, TEXT.changed(messages="shuffled"), speak=lambda scene: f"This is {scene}."
+    )
     assert texts
     for senders, text in texts.items():
         source = source_of("", senders.split("+"))
@@ -169,7 +183,10 @@ def test_a_run_is_read_as_it_was_asked(few: Dataset, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("point", "wrong"),
     [
-        ("attack=liar", "some of injection and absent where content is text, which holds no intents"),
+        (
+            "attack=liar",
+            "some of injection and absent where content is text, which holds no intents",
+        ),
         ("defence=schema,consensus=ego-prompt", "quoted or left out where content is text"),
         ("edge=fusion", "none or relay where content is text: a unit sends a policy"),
     ],
@@ -186,7 +203,12 @@ def test_what_words_alone_cannot_do_is_one_line(point: str, wrong: str) -> None:
     [
         ("proxy", "v11", "json", "proxy is no language model and cannot fuse messages"),
         (MODEL, "v11", "readout", "a readout gives no messages to fuse"),
-        (MODEL, "v10", "json", "prompt v10 cannot show words without an intent; use --prompt v11 or v12"),
+        (
+            MODEL,
+            "v10",
+            "json",
+            "prompt v10 cannot show words without an intent; use --prompt v11 or v12",
+        ),
     ],
 )
 def test_who_has_no_words_or_cannot_show_them_is_refused(

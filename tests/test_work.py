@@ -1,4 +1,6 @@
-"""Files that take another's place, and working folders: one process at a time, no link, no remains."""
+"""Files that take another's place, and working folders:
+one process at a time, no link, no remains.
+"""
 
 import os
 import subprocess
@@ -17,7 +19,9 @@ from harness.core.files import alone, making, replacing, write_whole
 BEGUN = work.WorkStart(settings={"seed": 1})
 
 
-def test_what_a_killed_process_left_half_written_goes_and_what_another_writes_stays(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_half_written_goes_and_what_another_writes_stays(
+    tmp_path: Path,
+) -> None:
     left, written = (tmp_path / f".table.csv.{pid}.part" for pid in (99998, 99999))
     left.write_text("half")
     written.write_text("half")
@@ -71,7 +75,9 @@ def fail(kept: Path | None) -> None:
     raise UserError("the engine died")
 
 
-def test_an_error_before_anything_is_done_leaves_nothing_and_one_after_keeps_it(tmp_path: Path) -> None:
+def test_an_error_before_anything_is_done_leaves_nothing_and_one_after_keeps_it(
+    tmp_path: Path,
+) -> None:
     for done in (False, True):
         out = tmp_path / "reports" / "run"
         with pytest.raises(UserError, match="the engine died"), work.working(out, BEGUN) as place:
@@ -85,7 +91,10 @@ def test_an_error_before_anything_is_done_leaves_nothing_and_one_after_keeps_it(
 def test_what_another_process_began_since_is_not_touched(tmp_path: Path) -> None:
     with work.working(tmp_path, work.WorkStart(settings={"seed": 2})):
         pass
-    with pytest.raises(UserError, match="being written by another process"), work.working(tmp_path, BEGUN):
+    with (
+        pytest.raises(UserError, match="being written by another process"),
+        work.working(tmp_path, BEGUN),
+    ):
         pass
 
 
@@ -109,19 +118,24 @@ def test_tidying_up_leaves_what_another_process_writes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "3", '{"settings": 3}', "{}", '{"settings": {"a": ' + "[" * 100_000, "\xff"]
+    "text",
+    ["", "{", "[]", "3", '{"settings": 3}', "{}", '{"settings": {"a": ' + "[" * 100_000, "\xff"],
 )
 def test_a_damaged_beginning_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / ".work").mkdir()
     (tmp_path / ".work" / "config.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(UserError, match=r"config\.json is damaged .*; delete .* and start again") as raised:
+    with pytest.raises(
+        UserError, match=r"config\.json is damaged .*; delete .* and start again"
+    ) as raised:
         work.begun(tmp_path, work.WorkStart)
     assert str(raised.value).isprintable()
 
 
 def test_settings_that_differ_are_named(tmp_path: Path) -> None:
     work.same(tmp_path, {"seed": (1, 2)}, {"seed": [1, 2]})
-    with pytest.raises(UserError, match="was begun with another seed, limit; repeat its settings") as raised:
+    with pytest.raises(
+        UserError, match="was begun with another seed, limit; repeat its settings"
+    ) as raised:
         work.same(tmp_path, {"seed": 1, "limit": 3}, {"seed": 2})
     assert "repeat its settings (seed 2), delete it" in str(raised.value)
     stated = {"ask": "all", "ties": "fir\nst", "identity": "f" * 64, "dtype": None, "tags": []}
@@ -166,7 +180,10 @@ def test_a_table_may_lie_in_a_folder_whose_name_looks_like_an_address(
 ) -> None:
     """Such as `6g:loss=0/decisions.parquet`, relative, as it is typed."""
     monkeypatch.chdir(tmp_path)
-    with replacing(Path("6g:loss=0/table.csv")) as part, pacsv.CSVWriter(part, pa.schema({"n": pa.int64()})):
+    with (
+        replacing(Path("6g:loss=0/table.csv")) as part,
+        pacsv.CSVWriter(part, pa.schema({"n": pa.int64()})),
+    ):
         pass
     assert Path("6g:loss=0/table.csv").read_text() == '"n"\n'
 

@@ -10,7 +10,9 @@ QUICK = settings.default.max_examples < settings.get_profile("harness").max_exam
 
 
 def some(slow: Sequence[Any], *, exhaustive: Sequence[Any]) -> list[Any]:
-    """Return the cases of a test of which `make test` tries some, and the rest prove the same of others."""
+    """Return the cases of a test of which `make test` tries some,
+    and the rest prove the same of others.
+    """
     return [_case(each, pytest.mark.slow) for each in slow] + [
         _case(each, pytest.mark.exhaustive) for each in exhaustive
     ]

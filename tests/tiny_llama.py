@@ -1,4 +1,6 @@
-"""A real Llama small enough for a test, as a GGUF file alone: random weights; it splits text as SmolLM2."""
+"""A real Llama small enough for a test, as a GGUF file alone: random weights;
+it splits text as SmolLM2.
+"""
 
 from pathlib import Path
 
@@ -22,7 +24,9 @@ def build(
     tokens = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", *sorted(ByteLevel.alphabet())]
     tokens += ["Ġt", "he", "in", "ĠĠ", "er"]
     writer = GGUFWriter(file, architecture)
-    writer.add_file_type(LlamaFileType.ALL_F32 if kind == "F32" else LlamaFileType[f"MOSTLY_{kind}"])
+    writer.add_file_type(
+        LlamaFileType.ALL_F32 if kind == "F32" else LlamaFileType[f"MOSTLY_{kind}"]
+    )
     writer.add_name("Tiny Llama")
     writer.add_license("mit")
     writer.add_context_length(context)

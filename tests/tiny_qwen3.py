@@ -1,4 +1,5 @@
-"""A real Qwen3 small enough for a test: random weights, a BPE that splits as Qwen2's, a thinking switch.
+"""A real Qwen3 small enough for a test:
+random weights, a BPE that splits as Qwen2's, a thinking switch.
 
 Nothing is downloaded. The weights are random, so tests speak of plumbing, never of what is said.
 """
@@ -8,7 +9,8 @@ from pathlib import Path
 
 IM_END, THINK = "<|im_end|>", "<think>"
 
-# ChatML with the semantics of Qwen3's own template: `enable_thinking=False` closes an empty think block.
+# ChatML with the semantics of Qwen3's own template: `enable_thinking=False` closes an empty think
+# block.
 TEMPLATE = """\
 {%- for message in messages %}
 {{- '<|im_start|>' + message.role + '\\n' + message.content + '<|im_end|>' + '\\n' }}
@@ -28,7 +30,9 @@ _LINES = [
 
 
 def build(folder: Path, *, template: str | None = TEMPLATE, context_tokens: int = 512) -> Path:
-    """Write checkpoint and tokenizer to `folder` (200 kB); `template=None` leaves the chat template out."""
+    """Write checkpoint and tokenizer to `folder` (200 kB);
+    `template=None` leaves the chat template out.
+    """
     import torch
     from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast, Qwen3Config, Qwen3ForCausalLM
@@ -73,7 +77,8 @@ def build(folder: Path, *, template: str | None = TEMPLATE, context_tokens: int 
         dtype="float32",
     )
     model = Qwen3ForCausalLM(config)
-    with torch.no_grad():  # longer rows win the argmax more often, so that some answers end and some think
+    # longer rows win the argmax more often, so that some answers end and some think
+    with torch.no_grad():
         for token, factor in ((IM_END, 2.0), (THINK, 2.0)):
             model.lm_head.weight[tokenizer.convert_tokens_to_ids(token)] *= factor
     # As published: sampling defaults that greedy decoding has to leave behind, without a warning.

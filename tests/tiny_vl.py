@@ -1,4 +1,5 @@
-"""Models that see, small enough for a test: random weights in the shapes of Qwen3-VL, Qwen2.5-VL and SmolVLM.
+"""Models that see, small enough for a test:
+random weights in the shapes of Qwen3-VL, Qwen2.5-VL and SmolVLM.
 
 Nothing is downloaded. The weights are random, so tests speak of plumbing, never of what is seen.
 """
@@ -40,7 +41,10 @@ IDEFICS_TEMPLATE = """\
 {%- if add_generation_prompt %}
 {{- 'Assistant:' }}
 {%- endif %}"""
-_LINES = ["You drive the ego vehicle.", '{"action_distribution":{"SLOWER":0.70,"IDLE":0.20,"FASTER":0.10}}']
+_LINES = [
+    "You drive the ego vehicle.",
+    '{"action_distribution":{"SLOWER":0.70,"IDLE":0.20,"FASTER":0.10}}',
+]
 TEXT = {
     "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4,
     "num_key_value_heads": 2, "max_position_embeddings": 1024, "initializer_range": 0.3,
@@ -54,7 +58,8 @@ def build(folder: Path, family: str = "qwen3-vl", deepstack: Sequence[int] = (0,
     Args:
         folder: where to.
         family: one of `FAMILIES`.
-        deepstack: layers of Qwen3-VL's vision encoder whose features go into the first layers of its texts.
+        deepstack: layers of Qwen3-VL's vision encoder whose features go into the first layers of
+            its texts.
     """
     import torch
     from tokenizers import models, pre_tokenizers, trainers
@@ -78,7 +83,8 @@ def build(folder: Path, family: str = "qwen3-vl", deepstack: Sequence[int] = (0,
     tokenizer.save_pretrained(folder)
     torch.manual_seed(2)
     model, processor = (_idefics if family == "smolvlm" else _qwen)(tokenizer, family, deepstack)
-    with torch.no_grad():  # biases begin as zeros and norms as ones, which would hide one in another's place
+    # biases begin as zeros and norms as ones, which would hide one in another's place
+    with torch.no_grad():
         for parameter in model.parameters():
             if parameter.ndim == 1:
                 parameter += 0.2 * torch.randn_like(parameter)
@@ -110,14 +116,20 @@ def _qwen(tokenizer: Any, family: str, deepstack: Sequence[int]) -> tuple[Any, A
         model = transformers.Qwen3VLForConditionalGeneration(config)
         limits = {"shortest_edge": 65536, "longest_edge": 16777216}
         return model, Qwen2VLImageProcessorPil(patch_size=16, size=limits)
-    text["rope_parameters"] = {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": [2, 1, 1]}
+    text["rope_parameters"] = {
+        "rope_type": "default",
+        "rope_theta": 10000.0,
+        "mrope_section": [2, 1, 1],
+    }
     vision = {
         "depth": 2, "hidden_size": 32, "intermediate_size": 64, "num_heads": 2, "out_hidden_size": 32,
         "patch_size": 14, "window_size": 112, "fullatt_block_indexes": [1], "initializer_range": 0.3,
     }  # fmt: skip
     config = transformers.Qwen2_5_VLConfig(text_config=text, vision_config=vision, **ids)
     limits = {"shortest_edge": 3136, "longest_edge": 12845056}
-    return transformers.Qwen2_5_VLForConditionalGeneration(config), Qwen2VLImageProcessorPil(size=limits)
+    return transformers.Qwen2_5_VLForConditionalGeneration(config), Qwen2VLImageProcessorPil(
+        size=limits
+    )
 
 
 def _idefics(tokenizer: Any, family: str, deepstack: Sequence[int]) -> tuple[Any, Any]:

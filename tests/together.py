@@ -1,4 +1,5 @@
-"""Worlds of one scenario take their turns together: the same to the last bit, for a fraction of the work.
+"""Worlds of one scenario take their turns together:
+the same to the last bit, for a fraction of the work.
 
 That it is the same is proven in `sim/test_lockstep.py`.
 """
@@ -22,7 +23,9 @@ def act_together(worlds: Sequence[World], actions: Sequence[str]) -> None:
 
 
 def go_on_together(worlds: Sequence[World], action: str) -> None:
-    """Take one action at once, and hold it until each world's time is over or its episode decided."""
+    """Take one action at once, and hold it until each world's time is over or its episode
+    decided.
+    """
     p = worlds[0].scenario.parameters
     for world in worlds:
         world.take(action)

@@ -2,8 +2,9 @@
 
     python benchmarks/campaigns/damaged.py [--count 150] [--seed 0]
 
-Each case damages one thing, drawn with the damage, and types a command that reads it: bytes cut, changed or
-replaced, a file that is gone, a folder or a link in its place, a value of another kind anywhere in its JSON.
+Each case damages one thing, drawn with the damage, and types a command that reads it: bytes cut,
+changed or replaced, a file that is gone, a folder or a link in its place, a value of another kind
+anywhere in its JSON.
 """
 
 import json
@@ -17,9 +18,22 @@ from typing import Any
 from judging import Running, Tally, counted, dataset, typed, workshop
 
 VALUES: tuple[Any, ...] = (
-    None, True, -1, 0, 10**9, 1e308, "", "x" * 300, "\x1b[31m\u202e", "../../..", [], {}, [None], {"a": 1},
+    None,
+    True,
+    -1,
+    0,
+    10**9,
+    1e308,
+    "",
+    "x" * 300,
+    "\x1b[31m\u202e",
+    "../../..",
+    [],
+    {},
+    [None],
+    {"a": 1},
     "9" * 5000,
-)  # fmt: skip
+)
 
 
 def main() -> None:
@@ -31,23 +45,31 @@ def main() -> None:
         made(here)
         commands: dict[str, list[tuple[object, ...]]] = {
             "run": [
-                ("report", "it"), ("compare", "it", here / "run"), ("run", "ls", "."),
+                ("report", "it"),
+                ("compare", "it", here / "run"),
+                ("run", "ls", "."),
                 ("run", "export", "it", "--csv"),
                 ("study", "sweep", "it", "--over", "tau", "--no-model"),
                 ("study", "fidelity", "it", here / "driven"),
                 ("eval", "--model", "replay:it", "--dataset", here / "small", "--out", "again"),
             ],
             "driven": [
-                ("report", "it"), ("run", "video", "it", 0), ("study", "fidelity", here / "run", "it"),
+                ("report", "it"),
+                ("run", "video", "it", 0),
+                ("study", "fidelity", here / "run", "it"),
                 ("run", "ls", "."),
             ],
             "begun": [
-                ("eval", "--dataset", here / "small", "--seeds", "0", "--out", "it"), ("run", "ls", "."),
+                ("eval", "--dataset", here / "small", "--seeds", "0", "--out", "it"),
+                ("run", "ls", "."),
             ],
             "small": [("dataset", "check", "it"), ("eval", "--dataset", "it", "--seeds", "0")],
-            "prompts": [("prompt", "check", "mine"), ("eval", "--prompt", "mine", "--limit", 1, "--dry-run")],
+            "prompts": [
+                ("prompt", "check", "mine"),
+                ("eval", "--prompt", "mine", "--limit", 1, "--dry-run"),
+            ],
             "models": [("model", "list"), ("eval", "--model", "mine", "--limit", 1, "--dry-run")],
-        }  # fmt: skip
+        }
         for n in range(given.count):
             kind = list(commands)[n % len(commands)]
             case = here.parent / f"case-{n}"
@@ -55,7 +77,9 @@ def main() -> None:
             os.chdir(case)
             project = kind in ("prompts", "models")
             shutil.copytree(
-                here / ("project" if project else kind), case if project else case / "it", dirs_exist_ok=True
+                here / ("project" if project else kind),
+                case if project else case / "it",
+                dirs_exist_ok=True,
             )
             inside = case / kind if project else case / "it"
             files = sorted(p for p in inside.rglob("*") if p.is_file() and p.suffix != ".md")
@@ -66,7 +90,9 @@ def main() -> None:
             ended = running.ended()
             faults = ended.faults + [f"{len(left)} left" for left in [running.left()] if left]
             tally.add(
-                kind, f"case {n}, {how} in {file.relative_to(case)}, {' '.join(map(str, command))}", faults
+                kind,
+                f"case {n}, {how} in {file.relative_to(case)}, {' '.join(map(str, command))}",
+                faults,
             )
             os.chdir(here)
             shutil.rmtree(case)

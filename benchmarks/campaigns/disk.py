@@ -1,8 +1,10 @@
-"""A disk that is full, and one that is read-only: one line, and after room is made the same command goes on.
+"""A disk that is full, and one that is read-only:
+one line, and after room is made the same command goes on.
 
     python benchmarks/campaigns/disk.py [--count 22] [--seed 0]
 
-Each case writes to a disk in memory, which takes root: of a size that is drawn, or mounted read-only.
+Each case writes to a disk in memory, which takes root:
+of a size that is drawn, or mounted read-only.
 """
 
 import random
@@ -19,7 +21,14 @@ def main() -> None:
     tally = Tally()
     with workshop() as here:
         commands = writing(here, Path("locked/it"))
-        commands["dataset show"] = ("dataset", "show", here / "small", "00000-0", "--out", "locked/it.svg")
+        commands["dataset show"] = (
+            "dataset",
+            "show",
+            here / "small",
+            "00000-0",
+            "--out",
+            "locked/it.svg",
+        )
         locked = here / "locked"
         locked.mkdir()
         for n in range(given.count):

@@ -2,8 +2,8 @@
 
     python benchmarks/campaigns/fuzz.py [--count 1000000] [--seed 0]
 
-A completion is one of `tests/completions`, or two spliced, with some of its characters changed for others,
-for pieces that mean something to the parser, or for nothing.
+A completion is one of `tests/completions`, or two spliced, with some of its characters changed for
+others, for pieces that mean something to the parser, or for nothing.
 """
 
 import random
@@ -20,11 +20,50 @@ sys.path.insert(0, str(TESTS))
 import corpus
 
 PIECES = (
-    '{"', '"}', "{", "}", "[", "]", ":", ",", '"', "'", "\\", '\\"', "```json", "```", "<think>", "</think>",
-    "%", "1e999", "-0", "NaN", "0.333", ".5", "1/3", "null", "\u202e", "\x00", "\ud800", "｛", "，", "//",
-    "/*", "*/", '"SLOWER":', '"IDLE":', '"FASTER":', '"action_distribution":', '"risk":"high"', "&quot;",
-    "\n", "<|im_end|>", "9" * 5000, "[" * 200, '{"a":' * 200,
-)  # fmt: skip
+    '{"',
+    '"}',
+    "{",
+    "}",
+    "[",
+    "]",
+    ":",
+    ",",
+    '"',
+    "'",
+    "\\",
+    '\\"',
+    "```json",
+    "```",
+    "<think>",
+    "</think>",
+    "%",
+    "1e999",
+    "-0",
+    "NaN",
+    "0.333",
+    ".5",
+    "1/3",
+    "null",
+    "\u202e",
+    "\x00",
+    "\ud800",
+    "｛",
+    "，",
+    "//",
+    "/*",
+    "*/",
+    '"SLOWER":',
+    '"IDLE":',
+    '"FASTER":',
+    '"action_distribution":',
+    '"risk":"high"',
+    "&quot;",
+    "\n",
+    "<|im_end|>",
+    "9" * 5000,
+    "[" * 200,
+    '{"a":' * 200,
+)
 
 
 def main() -> None:
@@ -42,13 +81,19 @@ def main() -> None:
         thinking, cut = rng.random() < 0.2, rng.choice(("stop", "length"))
         try:
             read = parse(
-                text, role=role, actions=corpus.ACTIONS, thinking=thinking, finish_reason=cut,
+                text,
+                role=role,
+                actions=corpus.ACTIONS,
+                thinking=thinking,
+                finish_reason=cut,
                 reasons_first=rng.random() < 0.2,
-            )  # fmt: skip
+            )
             statuses[read.status] += 1
             sound = (read.intent is None) == (read.verdict == "failed")
             if read.intent is not None:
-                sound &= isclose(sum(read.intent), 1.0, abs_tol=1e-9) and all(p >= 0 for p in read.intent)
+                sound &= isclose(sum(read.intent), 1.0, abs_tol=1e-9) and all(
+                    p >= 0 for p in read.intent
+                )
             said = repr(read)
         except Exception as error:
             sound, said = False, repr(error)

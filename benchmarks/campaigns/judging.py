@@ -1,7 +1,8 @@
 """The command in a process of its own, and what is wrong with how it ended.
 
-It must end with exit code 0, 1 (where that is its verdict) or 2 with one line on stderr, without a traceback,
-and leave no process behind. The process is forked from one that has loaded the harness, which saves a second.
+It must end with exit code 0, 1 (where that is its verdict) or 2 with one line on stderr, without a
+traceback, and leave no process behind. The process is forked from one that has loaded the harness,
+which saves a second.
 """
 
 import argparse
@@ -29,7 +30,9 @@ TESTS = Path(__file__).parents[2] / "tests"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code or negative signal, what it said, and the most memory, in bytes."""
+    """How a command ended: its exit code or negative signal, what it said,
+    and the most memory, in bytes.
+    """
 
     command: Sequence[str]
     code: int
@@ -52,7 +55,9 @@ class Ended:
 class Running:
     """A command that runs, in a session of its own."""
 
-    def __init__(self, command: Sequence[object], prepare: Callable[[], object] = lambda: None) -> None:
+    def __init__(
+        self, command: Sequence[object], prepare: Callable[[], object] = lambda: None
+    ) -> None:
         self.command = [str(part) for part in command]
         self._said = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
         sys.stdout.flush()
@@ -94,10 +99,14 @@ class Running:
             file.seek(0)
             said.append(file.read().decode("utf-8", "replace"))
         output, error = said
-        return Ended(self.command, os.waitstatus_to_exitcode(done[1]), output, error, done[2].ru_maxrss << 10)
+        return Ended(
+            self.command, os.waitstatus_to_exitcode(done[1]), output, error, done[2].ru_maxrss << 10
+        )
 
     def left(self, within_s: float = 5.0) -> list[int]:
-        """Processes of its session that are still there so long after it ended; they are then killed."""
+        """Processes of its session that are still there so long after it ended;
+        they are then killed.
+        """
         return of_session(self.pid, within_s)
 
 
@@ -180,10 +189,24 @@ def dataset(out: Path, episodes: int = 2) -> Path:
 
 
 def writing(here: Path, out: Path) -> dict[str, tuple[object, ...]]:
-    """The commands that write, to `out` or a file of that name, of a dataset and runs made first."""
+    """The commands that write, to `out` or a file of that name,
+    of a dataset and runs made first.
+    """
     small, run, driven = dataset(here / "small", 1), here / "run", here / "driven"
     one = ("--dataset", small, "--seeds", "0")
-    drive = ("drive", "--episodes", 2, "--first-seed", 0, "--condition", "6g", "--seeds", "0", "--workers", 2)
+    drive = (
+        "drive",
+        "--episodes",
+        2,
+        "--first-seed",
+        0,
+        "--condition",
+        "6g",
+        "--seeds",
+        "0",
+        "--workers",
+        2,
+    )
     for ended in (typed("eval", *one, "--out", run), typed(*drive, "--out", driven)):
         if ended.code:
             sys.exit(ended.err)
@@ -197,7 +220,16 @@ def writing(here: Path, out: Path) -> dict[str, tuple[object, ...]]:
         "fidelity": ("study", "fidelity", run, driven, "--out", out),
         "video": ("run", "video", driven, 0, "--out", out.with_suffix(".gif")),
         "study paper": (
-            "study", "paper", "--episodes", 10, "--sweep-episodes", 10, "--seeds", "0:2", "--out", out,
+            "study",
+            "paper",
+            "--episodes",
+            10,
+            "--sweep-episodes",
+            10,
+            "--seeds",
+            "0:2",
+            "--out",
+            out,
         ),
         "init": ("init", out),
-    }  # fmt: skip
+    }

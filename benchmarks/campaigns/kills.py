@@ -1,10 +1,11 @@
-"""Commands killed at any moment, and typed again until they are done: the same files, and nobody left.
+"""Commands killed at any moment, and typed again until they are done:
+the same files, and nobody left.
 
     python benchmarks/campaigns/kills.py [--count 200] [--seed 0]
 
-In turn `eval` (asking and writing), `drive` (driving) and `dataset build`, both with two workers; in turn by
-SIGKILL of the main process alone, by SIGKILL of all of them, and by SIGTERM. When is drawn from the time that
-the command takes undisturbed. A third of them are killed twice.
+In turn `eval` (asking and writing), `drive` (driving) and `dataset build`, both with two workers;
+in turn by SIGKILL of the main process alone, by SIGKILL of all of them, and by SIGTERM. When is
+drawn from the time that the command takes undisturbed. A third of them are killed twice.
 """
 
 import os
@@ -32,12 +33,28 @@ def main() -> None:
         commands = {
             "eval": ("eval", "--dataset", here / "small", "--seeds", "0:2", "--out"),
             "drive": (
-                "drive", "--episodes", 16, "--seeds", "0", "--condition", "6g", "--workers", 2, "--out",
+                "drive",
+                "--episodes",
+                16,
+                "--seeds",
+                "0",
+                "--condition",
+                "6g",
+                "--workers",
+                2,
+                "--out",
             ),
             "dataset build": (
-                "dataset", "build", "occluded-intersection", "--episodes", 2, "--workers", 2, "--out",
+                "dataset",
+                "build",
+                "occluded-intersection",
+                "--episodes",
+                2,
+                "--workers",
+                2,
+                "--out",
             ),
-        }  # fmt: skip
+        }
         whole, took_s = {}, {}
         for name, command in commands.items():
             whole[name] = here / "whole" / "set"
@@ -91,7 +108,9 @@ def differences(name: str, whole: Path, out: Path) -> list[str]:
     names, others = ({p.name for p in where.iterdir()} for where in (whole, out))
     wrong = sorted(names ^ others)
     same = names if name == "dataset build" else {*TEXTS}
-    wrong += [file for file in same & others if (whole / file).read_bytes() != (out / file).read_bytes()]
+    wrong += [
+        file for file in same & others if (whole / file).read_bytes() != (out / file).read_bytes()
+    ]
     if name != "dataset build":
         tables = [folder.read(run).decisions.table for run in (whole, out)]
         wrong += [] if tables[0].equals(tables[1]) else ["decisions.parquet"]

@@ -1,13 +1,14 @@
-"""Single changed leaves in all that the program reads: one line, never a traceback, a hang or a gigabyte.
+"""Single changed leaves in all that the program reads:
+one line, never a traceback, a hang or a gigabyte.
 
     python benchmarks/campaigns/leaves.py [--count 5000] [--seed 0] [--kind run] [--memory 1]
 
-A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a run, frozen
-or driven, whole or begun; of a suite's; of a project's prompts, cards, channels, devices, networks, schedules
-and suites. It becomes another type, sign, size or name, is removed or stands twice. Then a command is typed
-that reads it. Files are
-drawn with equal odds, and so are the leaves of a file and its commands. A dataset's digests are made anew, so
-that what is read is the leaf and not the digest.
+A leaf is a value in a JSON, TOML, CSV or Parquet file: of a dataset, its trees and scenes; of a
+run, frozen or driven, whole or begun; of a suite's; of a project's prompts, cards, channels,
+devices, networks, schedules and suites. It becomes another type, sign, size or name, is removed or
+stands twice. Then a command is typed that reads it. Files are drawn with equal odds, and so are the
+leaves of a file and its commands. A dataset's digests are made anew, so that what is read is the
+leaf and not the digest.
 """
 
 import argparse
@@ -41,15 +42,52 @@ import harness
 from harness.core.resources import folder
 
 LIMIT_S = 120.0
-SKIPPED = ("training", "llama_cpp", "transformers", "__main__")  # what takes long to import, or runs
+# what takes long to import, or runs
+SKIPPED = ("training", "llama_cpp", "transformers", "__main__")
 GONE, TWICE = object(), object()
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, -0.5, 2, 10**9, 2**31, 2**63, 10**30, 10**400, 1e9, 1e18, 1e308, -1e308,
-    5e-324, 1e-12, math.nan, math.inf, -math.inf, "", " ", "x", "nan", "nobody-of-this-name", "x" * 300,
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    -0.5,
+    2,
+    10**9,
+    2**31,
+    2**63,
+    10**30,
+    10**400,
+    1e9,
+    1e18,
+    1e308,
+    -1e308,
+    5e-324,
+    1e-12,
+    math.nan,
+    math.inf,
+    -math.inf,
+    "",
+    " ",
+    "x",
+    "nan",
+    "nobody-of-this-name",
+    "x" * 300,
     "x" * 2_000_000,
-    "\x1b[31m\u202e", "../../..", "/dev/zero", "a\x00b", "\ud800", "9" * 5000, [], {}, [None], [[]], {"a": 1},
+    "\x1b[31m\u202e",
+    "../../..",
+    "/dev/zero",
+    "a\x00b",
+    "\ud800",
+    "9" * 5000,
+    [],
+    {},
+    [None],
+    [[]],
+    {"a": 1},
     ["x"] * 1000,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +115,9 @@ def main() -> None:
     arguments.add_argument("--count", type=int, default=5000)
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--kind", action="append", help="only subjects of this kind; repeatable")
-    arguments.add_argument("--memory", type=float, default=1.0, help="gigabytes that a command may take")
+    arguments.add_argument(
+        "--memory", type=float, default=1.0, help="gigabytes that a command may take"
+    )
     given = arguments.parse_args()
     rng, tally, most = random.Random(given.seed), Tally(), 0
     with workshop() as here:
@@ -143,7 +183,8 @@ def made(here: Path, kinds: list[str] | None) -> list[Subject]:
         subjects += _suite(here / "suite")
     found = [subject for subject in subjects if not kinds or subject.kind in kinds]
     typed_in = {(subject.where, command) for subject in found for command in subject.commands}
-    for where, command in sorted(typed_in, key=str):  # a sound one ends well, or a fault could hide another
+    # a sound one ends well, or a fault could hide another
+    for where, command in sorted(typed_in, key=str):
         os.chdir(where)
         ended = typed(*command)
         assert ended.code in (0, 1), (command, ended.err)
@@ -153,13 +194,20 @@ def made(here: Path, kinds: list[str] | None) -> list[Subject]:
 
 
 CHANNELS = {
-    "my-6g": "6g", "my-mode4": "mode4", "my-mode2": "mode2", "my-its": "its-g5", 
+    "my-6g": "6g",
+    "my-mode4": "mode4",
+    "my-mode2": "mode2",
+    "my-its": "its-g5",
     "my-coupled": "density-coupled",
-}  # fmt: skip
+}
 TRACE = "distance_m,reception,sight,latency_ms\n" + "".join(
-    f"{d},{1 - d / 1000},{sight},5\n" for d in (10, 200, 400) for sight in ("clear", "vehicle", "building")
+    f"{d},{1 - d / 1000},{sight},5\n"
+    for d in (10, 200, 400)
+    for sight in ("clear", "vehicle", "building")
 )
-CURVES = "distance_m,reception,configuration,source\n10,0.9,density_per_km=60,b\n200,0.5,rate_hz=10,b\n"
+CURVES = (
+    "distance_m,reception,configuration,source\n10,0.9,density_per_km=60,b\n200,0.5,rate_hz=10,b\n"
+)
 
 
 def _project(project: Path) -> Iterator[Subject]:
@@ -171,9 +219,22 @@ def _project(project: Path) -> Iterator[Subject]:
     (project / "swarmdrive.toml").write_text("")
     for name, shipped in CHANNELS.items():
         shutil.copy(folder("channels") / f"{shipped}.toml", project / f"channels/{name}.toml")
-        drive = ("eval", "--limit", 1, "--seeds", "0", "--model", "cruise", "--condition", name, "--out",
-                 "out")  # fmt: skip
-        yield of("channel", f"channels/{name}.toml", ("radio", "list"), ("radio", "show", name), drive)
+        drive = (
+            "eval",
+            "--limit",
+            1,
+            "--seeds",
+            "0",
+            "--model",
+            "cruise",
+            "--condition",
+            name,
+            "--out",
+            "out",
+        )
+        yield of(
+            "channel", f"channels/{name}.toml", ("radio", "list"), ("radio", "show", name), drive
+        )
     (project / "channels/trace.toml").write_text(
         'model = "trace"\ndescription = "d"\nsource = "s"\nstatus = "measured"\n'
         '[parameters]\nfile = "trace.csv"\n'
@@ -188,20 +249,39 @@ def _project(project: Path) -> Iterator[Subject]:
     quick = ("eval", "--limit", 1, "--seeds", "0", "--dry-run")
     yield of("network", "networks/mine.toml", (*quick, "--condition", "cloud:round_trip=mine"))
     shutil.copy(folder("devices") / "agx-orin.toml", project / "devices/mine.toml")
-    yield of("device", "devices/mine.toml", ("model", "device", "list"), ("model", "device", "show", "mine"))
+    yield of(
+        "device",
+        "devices/mine.toml",
+        ("model", "device", "list"),
+        ("model", "device", "show", "mine"),
+    )
     shutil.copy(folder("schedules") / "learnt.toml", project / "schedules/mine.toml")
     yield of(
-        "schedule", "schedules/mine.toml", (*quick, "--condition", "6g:schedule=mine"),
+        "schedule",
+        "schedules/mine.toml",
+        (*quick, "--condition", "6g:schedule=mine"),
         ("eval", "--limit", 1, "--seeds", "0", "--condition", "6g:schedule=mine", "--out", "out"),
-    )  # fmt: skip
-    for name, shipped in {"faulty": "proxy-faulty", "weights": "qwen3-4b", "served": "openai-example",
-                          "eyes": "swarm-tiny-vl"}.items():  # fmt: skip
+    )
+    for name, shipped in {
+        "faulty": "proxy-faulty",
+        "weights": "qwen3-4b",
+        "served": "openai-example",
+        "eyes": "swarm-tiny-vl",
+    }.items():
         shutil.copy(folder("models") / f"{shipped}.toml", project / f"models/{name}.toml")
         yield of("card", f"models/{name}.toml", ("model", "list"), ("model", "list", "--json"))
     yield of("card", "models/faulty.toml", (*quick, "--model", "faulty"))
     for name, shipped in {"shots": "v6", "eyes": "v8"}.items():
         shutil.copytree(folder("prompts") / shipped, project / f"prompts/{name}")
-        show = ("prompt", "show", name, "--scene", "00003-0", "--dataset", "occluded-intersection-v2")
+        show = (
+            "prompt",
+            "show",
+            name,
+            "--scene",
+            "00003-0",
+            "--dataset",
+            "occluded-intersection-v2",
+        )
         for file in sorted((project / f"prompts/{name}").iterdir()):
             if file.suffix in (".toml", ".json"):
                 yield of("prompt", f"prompts/{name}/{file.name}", ("prompt", "list"), show)
@@ -217,16 +297,45 @@ def _project(project: Path) -> Iterator[Subject]:
     yield of(
         "env-config",
         "config.json",
-        ("drive", "--env", "merge-v0", "--env-config", "config.json", "--episodes", 1, "--seeds", "0",
-         "--model", "cruise", "--condition", "6g", "--out", "out"),
-    )  # fmt: skip
+        (
+            "drive",
+            "--env",
+            "merge-v0",
+            "--env-config",
+            "config.json",
+            "--episodes",
+            1,
+            "--seeds",
+            "0",
+            "--model",
+            "cruise",
+            "--condition",
+            "6g",
+            "--out",
+            "out",
+        ),
+    )
 
 
 def _dataset(where: Path) -> Iterator[Subject]:
     dataset(where / "small", 1)
     # The answers of a model that reads no prompt take the least time.
-    check, run = ("dataset", "check", "small"), ("eval", "--dataset", "small", "--seeds", "0", "--out", "out",
-                                                 "--model", "cruise", "--condition", "6g")  # fmt: skip
+    check, run = (
+        ("dataset", "check", "small"),
+        (
+            "eval",
+            "--dataset",
+            "small",
+            "--seeds",
+            "0",
+            "--out",
+            "out",
+            "--model",
+            "cruise",
+            "--condition",
+            "6g",
+        ),
+    )
     yield Subject("dataset", where / "small/manifest.json", (check, run), where)
     with ZipFile(where / "small/layouts.zip") as file:
         names = sorted(file.namelist())
@@ -260,15 +369,34 @@ def _suite(where: Path) -> Iterator[Subject]:
     (where / "datasets/suites.toml").write_text(
         '[mine]\ndescription = "d"\ndatasets = ["occluded-intersection-v2", "do-not-pass-v1"]\n'
     )
-    ended = typed("eval", "--dataset", "suite:mine", "--limit", 1, "--model", "cruise", "--seeds", "0",
-                  "--condition", "6g", "--out", "all/suite")  # fmt: skip
+    ended = typed(
+        "eval",
+        "--dataset",
+        "suite:mine",
+        "--limit",
+        1,
+        "--model",
+        "cruise",
+        "--seeds",
+        "0",
+        "--condition",
+        "6g",
+        "--out",
+        "all/suite",
+    )
     assert ended.code == 0, ended.err
     shutil.copytree(where / "all/suite", where / "all/other")
     yield Subject(
-        "suite", where / "all/suite/suite.json",
-        (("run", "ls", "all"), ("run", "history", "all"), ("report", "all/suite", "--out", "out.html"),
-         ("compare", "all/suite/do-not-pass-v1", "all/other/do-not-pass-v1")), where,
-    )  # fmt: skip
+        "suite",
+        where / "all/suite/suite.json",
+        (
+            ("run", "ls", "all"),
+            ("run", "history", "all"),
+            ("report", "all/suite", "--out", "out.html"),
+            ("compare", "all/suite/do-not-pass-v1", "all/other/do-not-pass-v1"),
+        ),
+        where,
+    )
 
 
 def _runs(here: Path) -> Iterator[Subject]:
@@ -276,9 +404,18 @@ def _runs(here: Path) -> Iterator[Subject]:
     (where / "all").mkdir(parents=True)
     os.chdir(where)
     small, seeds = dataset(where / "small", 1), ("--seeds", "0")
-    conditions = ("--condition", "single-local", "--condition", "6g:attack=liar", "--condition",
-                  "mode4:density_per_km=90", "--condition", "cloud:round_trip=5g-city",
-                  "--condition", "v2x:schedule=learnt")  # fmt: skip
+    conditions = (
+        "--condition",
+        "single-local",
+        "--condition",
+        "6g:attack=liar",
+        "--condition",
+        "mode4:density_per_km=90",
+        "--condition",
+        "cloud:round_trip=5g-city",
+        "--condition",
+        "v2x:schedule=learnt",
+    )
     fused = ("study", "sweep", "all/words", "--over", "consensus", "--grid", "ego-prompt")
     for command in (
         ("eval", "--dataset", small, *seeds, *conditions, "--out", "all/it"),
@@ -296,7 +433,17 @@ def _runs(here: Path) -> Iterator[Subject]:
         ),
         ("study", "attribute", "all/it", "--sample", 2),
         (*fused, "--out", "all/words/fused"),
-        ("drive", "--episodes", 1, "--first-seed", 0, *conditions[:6], *seeds, "--out", "all/driven"),
+        (
+            "drive",
+            "--episodes",
+            1,
+            "--first-seed",
+            0,
+            *conditions[:6],
+            *seeds,
+            "--out",
+            "all/driven",
+        ),
     ):
         ended = typed(*command)
         assert ended.code == 0, (command, ended.err)
@@ -310,25 +457,58 @@ def _runs(here: Path) -> Iterator[Subject]:
         ("run", "export", "all/it", "--csv", "--out", "out"),
         ("run", "export", "all/it", "--junit", "out.html"),
         ("study", "sweep", "all/it", *grid),
-        ("study", "trust", "all/it", "--no-model", "--share", "1/3", "--attacks", "liar",
-                                     "--rules", "linear", "--out", "out"),
+        (
+            "study",
+            "trust",
+            "all/it",
+            "--no-model",
+            "--share",
+            "1/3",
+            "--attacks",
+            "liar",
+            "--rules",
+            "linear",
+            "--out",
+            "out",
+        ),
         ("study", "fidelity", "all/it", "sound/driven", "--out", "out"),
         ("study", "schedule", "compare", "all/it", "--out", "out"),
-        ("eval", "--model", "replay:all/it", "--dataset", "small", *seeds, "--condition", "6g",
-         "--out", "out"),
-    )  # fmt: skip
-    files = ("run.json", "run.json", "run.json", "answers.jsonl", "episodes.csv", "summary.csv",
-             "decisions.parquet", "attribution.json")  # fmt: skip
+        (
+            "eval",
+            "--model",
+            "replay:all/it",
+            "--dataset",
+            "small",
+            *seeds,
+            "--condition",
+            "6g",
+            "--out",
+            "out",
+        ),
+    )
+    files = (
+        "run.json",
+        "run.json",
+        "run.json",
+        "answers.jsonl",
+        "episodes.csv",
+        "summary.csv",
+        "decisions.parquet",
+        "attribution.json",
+    )
     for name in files:
         yield Subject("run", where / "all/it" / name, (*every, *reads), where)
     told = ("report", "all/words", "--out", "out.html")
     for name in ("more-answers.jsonl", "fused/sweep.json"):
-        yield Subject("run", where / "all/words" / name, (*every, told, (*fused, "--out", "out")), where)
+        yield Subject(
+            "run", where / "all/words" / name, (*every, told, (*fused, "--out", "out")), where
+        )
     drives = (
-        ("report", "all/driven", "--out", "out.html"), ("compare", "all/driven", "sound/driven"),
+        ("report", "all/driven", "--out", "out.html"),
+        ("compare", "all/driven", "sound/driven"),
         ("study", "fidelity", "sound/it", "all/driven", "--out", "out"),
         ("run", "export", "all/driven", "--csv", "--out", "out"),
-    )  # fmt: skip
+    )
     for name in ("run.json", "decisions.parquet", "episodes.csv"):
         yield Subject("driven", where / "all/driven" / name, (*every, *drives), where)
 
@@ -347,7 +527,11 @@ def changed(rng: random.Random, subject: Subject) -> str:
         root, shown = leaf(rng, root)
         file.write_bytes(toml_text(root).encode("utf-8", "replace"))
         return shown
-    lines = file.read_text(encoding="utf-8").splitlines() if file.suffix == ".jsonl" else [file.read_text()]
+    lines = (
+        file.read_text(encoding="utf-8").splitlines()
+        if file.suffix == ".jsonl"
+        else [file.read_text()]
+    )
     at = rng.randrange(len(lines))
     root, shown = leaf(rng, json.loads(lines[at]))
     lines[at] = json_text(root)
@@ -359,7 +543,9 @@ def leaf(rng: random.Random, root: Any) -> tuple[Any, str]:
     """Change one leaf of a value in place; of the many in a list one counts."""
     shapes: dict[tuple[str, ...], list[list[Any]]] = {}
     for path in _paths(root, []):
-        shapes.setdefault(tuple("*" if isinstance(step, int) else step for step in path), []).append(path)
+        shapes.setdefault(
+            tuple("*" if isinstance(step, int) else step for step in path), []
+        ).append(path)
     if not shapes:
         return rng.choice(VALUES), "everything"
     *way, key = rng.choice(rng.choice(list(shapes.values())))
@@ -409,8 +595,9 @@ def json_text(value: Any) -> str:
     if isinstance(value, dict):
         pairs = [
             f"{json.dumps(key)}: {json_text(inner.value if isinstance(inner, _Twice) else inner)}"
-            for key, inner in value.items() for _ in range(1 + isinstance(inner, _Twice))
-        ]  # fmt: skip
+            for key, inner in value.items()
+            for _ in range(1 + isinstance(inner, _Twice))
+        ]
         return "{" + ", ".join(pairs) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(json_text, value)) + "]"
@@ -424,7 +611,9 @@ def toml_text(table: Any) -> str:
     lines = []
     for key, value in table.items():
         for _ in range(1 + isinstance(value, _Twice)):
-            lines.append(f"{_key(key)} = {_toml_value(value.value if isinstance(value, _Twice) else value)}")
+            lines.append(
+                f"{_key(key)} = {_toml_value(value.value if isinstance(value, _Twice) else value)}"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -432,7 +621,11 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, _Twice):
         value = value.value
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_toml_value(each)}" for key, each in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{_key(key)} = {_toml_value(each)}" for key, each in value.items())
+            + "}"
+        )
     if isinstance(value, list):
         return "[" + ", ".join(map(_toml_value, value)) + "]"
     if value is None:
@@ -469,7 +662,9 @@ def _column(rng: random.Random, file: Path) -> str:
     name = rng.choice(table.column_names)
     at, values = table.column_names.index(name), table[name].to_pylist()
     how = rng.choice(("gone", "twice", "one", "one", "one", "other type", "rows"))
-    value = rng.choice([each for each in VALUES if isinstance(each, str | int | float | bool | None)])
+    value = rng.choice(
+        [each for each in VALUES if isinstance(each, str | int | float | bool | None)]
+    )
     if how == "gone":
         table = table.drop_columns([name])
     elif how == "twice":
@@ -508,7 +703,9 @@ def _archived(rng: random.Random, file: Path, name: str) -> str:
         tree = json.loads(contents[tree_name])
         tree["scenes_sha256"][int(Path(name).stem)] = hashlib.sha256(contents[name]).hexdigest()
         contents[tree_name] = json.dumps(tree).encode()
-    manifest["trees_sha256"][int(name.split("/")[0])] = hashlib.sha256(contents[tree_name]).hexdigest()
+    manifest["trees_sha256"][int(name.split("/")[0])] = hashlib.sha256(
+        contents[tree_name]
+    ).hexdigest()
     pin.write_text(json.dumps(manifest))
     with ZipFile(file, "w") as archive:
         for each, data in contents.items():

@@ -1,11 +1,13 @@
-"""Commands in real processes, stopped by SIGTERM or SIGINT at any moment from their start to their end.
+"""Commands in real processes, stopped by SIGTERM or SIGINT at any moment from their start to their
+end.
 
     python benchmarks/campaigns/signals.py [--count 200] [--seed 0]
 
-A third of the signals come while the interpreter and the command start, a third anywhere, and a third around
-the end. SIGTERM must end with exit code 143 and SIGINT with 130, or by the signal itself, with one line or
-none; a command that has ended already, with 0. SIGINT before the program's first line is Python's own, and
-counted apart. `kills.py` forks its commands from a process that has loaded the harness: it sees no start.
+A third of the signals come while the interpreter and the command start, a third anywhere, and a
+third around the end. SIGTERM must end with exit code 143 and SIGINT with 130, or by the signal
+itself, with one line or none; a command that has ended already, with 0. SIGINT before the program's
+first line is Python's own, and counted apart. `kills.py` forks its commands from a process that has
+loaded the harness: it sees no start.
 """
 
 import os
@@ -38,13 +40,18 @@ class Ended:
 def stopped(
     command: Sequence[object], number: signal.Signals | None, after_s: float
 ) -> tuple[Ended, list[int]]:
-    """Run a command and send it a signal after some time; also the processes that it leaves behind."""
+    """Run a command and send it a signal after some time;
+    also the processes that it leaves behind.
+    """
     with tempfile.TemporaryFile() as err:
         begun_s = time.monotonic()
         process = subprocess.Popen(
-            [*ENTRY, *map(str, command)], stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
+            [*ENTRY, *map(str, command)],
+            stdout=subprocess.DEVNULL,
+            stderr=err,
+            start_new_session=True,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        )  # fmt: skip
+        )
         if number:
             try:
                 process.wait(after_s)
@@ -81,15 +88,35 @@ def main() -> None:
             "model list": ("model", "list"),
             "radio show": ("radio", "show", "mode4"),
             "eval": ("eval", "--dataset", small, "--seeds", "0:2"),
-            "drive": ("drive", "--episodes", 16, "--seeds", "0", "--condition", "6g", "--workers", 2),
+            "drive": (
+                "drive",
+                "--episodes",
+                16,
+                "--seeds",
+                "0",
+                "--condition",
+                "6g",
+                "--workers",
+                2,
+            ),
             "report": ("report", run),
             "sweep": ("study", "sweep", run, "--over", "tau", "--grid", "0.2,0.7"),
-            "dataset build": ("dataset", "build", "occluded-intersection", "--episodes", 2, "--workers", 2),
-        }  # fmt: skip
+            "dataset build": (
+                "dataset",
+                "build",
+                "occluded-intersection",
+                "--episodes",
+                2,
+                "--workers",
+                2,
+            ),
+        }
         writes = {"eval", "drive", "sweep", "dataset build"}
         took_s = {}
         for name, command in commands.items():
-            out = ("--out", here / "whole" / name.replace(" ", "-") / "set") if name in writes else ()
+            out = (
+                ("--out", here / "whole" / name.replace(" ", "-") / "set") if name in writes else ()
+            )
             ended, _ = stopped((*command, *out), None, 0.0)
             assert ended.code == 0, ended
             took_s[name] = ended.took_s
@@ -98,10 +125,13 @@ def main() -> None:
             name = list(commands)[n % len(commands)]
             number = list(SIGNALS)[n // len(commands) % 2]
             whole_s = took_s[name]
-            after_s = rng.choice([
-                rng.uniform(0.0, min(START_S, whole_s)), rng.uniform(0.0, whole_s),
-                rng.uniform(0.85 * whole_s, 1.1 * whole_s),
-            ])  # fmt: skip
+            after_s = rng.choice(
+                [
+                    rng.uniform(0.0, min(START_S, whole_s)),
+                    rng.uniform(0.0, whole_s),
+                    rng.uniform(0.85 * whole_s, 1.1 * whole_s),
+                ]
+            )
             out = ("--out", here / str(n) / "set") if name in writes else ()
             ended, left = stopped((*commands[name], *out), number, after_s)
             early = number == signal.SIGINT and "Traceback" in ended.err and BEGUN not in ended.err

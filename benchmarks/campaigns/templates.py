@@ -1,4 +1,5 @@
-"""Templates that would fill memory or never end, each rendered in a process of its own with all its steps.
+"""Templates that would fill memory or never end,
+each rendered in a process of its own with all its steps.
 
     python benchmarks/campaigns/templates.py [--count 0] [--seed 0]
 

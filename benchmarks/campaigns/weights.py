@@ -1,4 +1,5 @@
-"""A model whose weights are no numbers: every answer an error of the engine, in every mode, on each engine.
+"""A model whose weights are no numbers: every answer an error of the engine, in every mode,
+on each engine.
 
     python benchmarks/campaigns/weights.py
 
@@ -33,13 +34,32 @@ def main() -> None:
         for engine, model in models.items():
             for mode in ("json", "constrained", "readout"):
                 out = here / f"{engine}-{mode}"
-                command = ("eval", "--model", model, "--answer", mode, "--dataset", small, "--seeds", "0")
+                command = (
+                    "eval",
+                    "--model",
+                    model,
+                    "--answer",
+                    mode,
+                    "--dataset",
+                    small,
+                    "--seeds",
+                    "0",
+                )
                 ended = typed(*command, "--condition", "6g", "--out", out)
                 faults = ended.faults
                 if not ended.code:
-                    answers = [json.loads(line) for line in (out / "answers.jsonl").read_text().splitlines()]
-                    said = [answer for answer in answers if "no numbers" not in str(answer["error"])]
-                    faults += [f"{len(said)} of {len(answers)} are no such error: {said[:1]}"] if said else []
+                    answers = [
+                        json.loads(line)
+                        for line in (out / "answers.jsonl").read_text().splitlines()
+                    ]
+                    said = [
+                        answer for answer in answers if "no numbers" not in str(answer["error"])
+                    ]
+                    faults += (
+                        [f"{len(said)} of {len(answers)} are no such error: {said[:1]}"]
+                        if said
+                        else []
+                    )
                 else:
                     faults.append(ended.err)
                 tally.add(f"{engine}, {mode}", mode, faults)
@@ -51,7 +71,9 @@ def gguf(here: Path) -> Path:
     folder = tiny_qwen3.spoil(tiny_qwen3.build(here / "marked", context_tokens=4096), MARK)
     file = here / "tiny.gguf"
     export(folder, file, "F32")
-    file.write_bytes(file.read_bytes().replace(struct.pack("<f", MARK), struct.pack("<f", float("nan"))))
+    file.write_bytes(
+        file.read_bytes().replace(struct.pack("<f", MARK), struct.pack("<f", float("nan")))
+    )
     return file
 
 

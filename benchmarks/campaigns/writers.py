@@ -37,7 +37,9 @@ def main() -> None:
                 faults.append("no decisions")
             if name == "dataset build":
                 faults += verify.check(here / "it")
-            faults += [f"left: {path}" for left in (".*.part", ".work") for path in here.rglob(left)]
+            faults += [
+                f"left: {path}" for left in (".*.part", ".work") for path in here.rglob(left)
+            ]
             tally.add(name, f"case {n}", faults)
             for left in ("it", "reports"):
                 shutil.rmtree(here / left, ignore_errors=True)

@@ -15,7 +15,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests/browser"))
 from opening import FLAGS, wait
 
 HERE = Path(__file__).parent
-DECISION, CAMERAS = "#scene=00003-3-86ea843fc7e0&condition=v2x", "#scene=00156-2-c2bfbec56419&condition=6g"
+DECISION, CAMERAS = (
+    "#scene=00003-3-86ea843fc7e0&condition=v2x",
+    "#scene=00156-2-c2bfbec56419&condition=6g",
+)
 
 with sync_playwright() as playwright:
     browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)

@@ -1,7 +1,8 @@
 """LoRA adapters beside a card's weights: a folder in the format of the package peft.
 
-It holds `adapter_config.json` and `adapter_model.safetensors`, by which a checkpoint's weights are changed
-when they are loaded; for llama.cpp the same numbers become a GGUF file (`llama_cpp.adapter`).
+It holds `adapter_config.json` and `adapter_model.safetensors`, by which a checkpoint's weights are
+changed when they are loaded; for llama.cpp the same numbers become a GGUF file
+(`llama_cpp.adapter`).
 """
 
 import json
@@ -18,8 +19,15 @@ CONFIG, TENSORS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."  # of a tensor's name, before that of the module which it changes
 A, B = ".lora_A.weight", ".lora_B.weight"
 # Kinds of adapter that are more than W + alpha / r * B A, by their key in the config.
-_MORE = ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern", "modules_to_save", "fan_in_fan_out",
-         "alora_invocation_tokens")  # fmt: skip
+_MORE = (
+    "use_dora",
+    "use_rslora",
+    "rank_pattern",
+    "alpha_pattern",
+    "modules_to_save",
+    "fan_in_fan_out",
+    "alora_invocation_tokens",
+)
 
 
 def read_config(folder: Path, shown: str) -> dict[str, Any]:
@@ -31,7 +39,8 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
             raise ValueError(f"lora_alpha is {config['lora_alpha']}")
     except BROKEN as error:
         raise UserError(
-            f"{shown}: {printable(folder / CONFIG)} cannot be read ({printable(repr(error), 120)}); give the "
+            f"{shown}: {printable(folder / CONFIG)} cannot be read "
+            f"({printable(repr(error), 120)}); give the "
             "folder of a LoRA adapter in peft's format"
         ) from None
     more = [key for key in _MORE if config.get(key)]
@@ -48,7 +57,8 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
 
 
 def find_adapter(card: Card) -> Path | None:
-    """Return the folder of a card's adapter, absolute or beside the cards; None if the card names none.
+    """Return the folder of a card's adapter, absolute or beside the cards;
+    None if the card names none.
 
     Raises UserError if there is no such folder.
     """
@@ -57,7 +67,8 @@ def find_adapter(card: Card) -> Path | None:
     folder = find("models", card.adapter)
     if not (folder / CONFIG).is_file():
         raise UserError(
-            f"{card.shown}: no adapter in {printable(folder)} ({CONFIG}); put its folder beside the card, or "
+            f"{card.shown}: no adapter in {printable(folder)} ({CONFIG}); put its folder beside "
+            "the card, or "
             "leave adapter out"
         )
     return folder
@@ -73,7 +84,8 @@ def find_tensors(folder: Path, shown: str) -> Path:
 def foreign(shown: str, file: Path, reason: str) -> UserError:
     """Return the refusal of an adapter that does not fit its model."""
     return UserError(
-        f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that was "
+        f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that "
+        "was "
         "trained on it"
     )
 
@@ -107,7 +119,9 @@ def merge(card: Card, model: Any) -> None:
                 raise ValueError(f"{name} has rank {len(tensors[name + A])}, and r is {rank}")
             weight, change = module.weight, tensors[name + B].float() @ tensors[name + A].float()
             if change.shape != weight.shape:
-                raise ValueError(f"{name} is {tuple(change.shape)}, and {tuple(weight.shape)} in the model")
+                raise ValueError(
+                    f"{name} is {tuple(change.shape)}, and {tuple(weight.shape)} in the model"
+                )
             if not change.isfinite().all():
                 raise ValueError(f"{name} holds numbers that are none, or too large")
             changes[name] = weight, change

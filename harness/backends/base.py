@@ -1,6 +1,7 @@
 """The interface of a backend: requests in, completions out, in the same order.
 
-How a backend batches or threads inside is its own matter; the rest of the program does not depend on it.
+How a backend batches or threads inside is its own matter;
+the rest of the program does not depend on it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,39 +34,52 @@ class Request:
 
     id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
     role: Role  # which prompt of the version was rendered, and which schema the answer has
-    messages: tuple[Mapping[str, str], ...]  # `{"role": "system" | "user" | "assistant", "content": text}`
+    # `{"role": "system" | "user" | "assistant", "content": text}`
+    messages: tuple[Mapping[str, str], ...]
     actions: tuple[str, ...]  # meta-action names, in the environment's order
     max_tokens: int  # most tokens the answer may have
     form: str = "distribution"  # what the prompt asks for (`Prompt.form`)
-    # How the model answers. `json`: it writes freely. `constrained`: it fills in numbers and choices of a
-    # fixed text. `readout`: it is asked for one letter, and the letters' probabilities are the answer.
-    # `decision`: it is asked the `question`, by a read-out unless it is a decision model.
+    # How the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
+    # choices of a fixed text. `readout`: it is asked for one letter, and the letters' probabilities
+    # are the answer. `decision`: it is asked the `question`, by a read-out unless it is a decision
+    # model.
     answer: AnswerMode = "json"
-    question: Question | None = None  # of a decision, what `messages` ask; its options are the actions
-    # Of a read-out over cyclic orders, the chat with each further order of the actions behind the letters.
+    # of a decision, what `messages` ask; its options are the actions
+    question: Question | None = None
+    # Of a read-out over cyclic orders, the chat with each further order of the actions behind the
+    # letters.
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
-    # Of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are asked as
-    # a request of their own (`harness.evaluate.flip`); empty if that is not asked.
+    # Of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are
+    # asked as a request of their own (`harness.evaluate.flip`); empty if that is not asked.
     flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
     extension: str = ""  # further members of its answer (`Shape.extension`)
     placeholders: tuple[str, ...] = ()  # of its prompt (`Shape.placeholders`)
-    sums: Sums = "refuse"  # what is done where probabilities of `json` do not sum to 1: fail, or divide
-    thinking: bool = False  # whether the model is asked to think first (if its template can switch that)
+    # what is done where probabilities of `json` do not sum to 1: fail, or divide
+    sums: Sums = "refuse"
+    # whether the model is asked to think first (if its template can switch that)
+    thinking: bool = False
     reasons_first: bool = False  # whether the prompt asks for reasons before the answer
-    temperature: float = 0.0  # of softmax(logits / temperature), of which tokens are drawn; 0: the likeliest
+    # of softmax(logits / temperature), of which tokens are drawn; 0: the likeliest
+    temperature: float = 0.0
     sample: int = 0  # number of the answer among several to one question, which seeds its draws
-    timed: bool = False  # whether the time is measured; a server then streams, which shows the first token
+    # whether the time is measured; a server then streams, which shows the first token
+    timed: bool = False
     agent: int = 0  # which of the run's agents is asked: 0 is the ego's
-    image: Image | None = None  # the picture before the text of the last user message; None if there is none
-    # The viewer's own scene graph, for backends without a language model; it holds nothing that the prompt's
-    # author could not see.
+    # the picture before the text of the last user message; None if there is none
+    image: Image | None = None
+    # The viewer's own scene graph, for backends without a language model; it holds nothing that the
+    # prompt's author could not see.
     view: "SceneGraph | None" = None
-    truth: "SceneGraph | None" = None  # the same with everything in view, if the card is `privileged`
-    scenario: "Scenario | None" = None  # scenario of the view; only backends that read the view read it
+    # the same with everything in view, if the card is `privileged`
+    truth: "SceneGraph | None" = None
+    # scenario of the view; only backends that read the view read it
+    scenario: "Scenario | None" = None
 
     @property
     def shape(self) -> Shape:
-        """What the JSON of its answer is to be, even a helper's: a bare distribution if it is `bare`."""
+        """What the JSON of its answer is to be, even a helper's:
+        a bare distribution if it is `bare`.
+        """
         if self.bare:
             return Shape("ego", self.actions, "distribution")
         return Shape(self.role, self.actions, self.form, self.extension, self.placeholders)
@@ -80,7 +94,9 @@ class Request:
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
-        """Return the request with other values in some fields, in a third of the time of `replace`."""
+        """Return the request with other values in some fields,
+        in a third of the time of `replace`.
+        """
         request = object.__new__(Request)
         vars(request).update(vars(self), **changes)
         return request
@@ -90,8 +106,12 @@ class Request:
         return self.image.sha256 if self.image else None
 
 
-def by_scenario(requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]) -> list[T]:
-    """Answer the requests of each scenario together; return the answers in the order of the requests."""
+def by_scenario(
+    requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]
+) -> list[T]:
+    """Answer the requests of each scenario together;
+    return the answers in the order of the requests.
+    """
     places: dict[int, list[int]] = {}
     for n, request in enumerate(requests):
         places.setdefault(id(request.scenario), []).append(n)
@@ -106,32 +126,39 @@ class Completion:
     """One answer to a request."""
 
     request_id: str
-    # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file can hold;
-    # empty on an error
+    # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file
+    # can hold; empty on an error
     text: str
-    # None if the engine has no tokenizer. Of several orders, what they begin with counts once in process, and
-    # as often as a server counts it.
+    # None if the engine has no tokenizer. Of several orders, what they begin with counts once in
+    # process, and as often as a server counts it.
     prompt_tokens: int | None
-    completion_tokens: int | None  # tokens of the answer, 0 if none is written; None if nobody counts them
+    # tokens of the answer, 0 if none is written; None if nobody counts them
+    completion_tokens: int | None
     # `stop`, `length` (cut off by max_tokens), `refusal` (of a question that was read) or `error`
     finish_reason: FinishReason
-    # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a batch is not
-    # the latency of an answer.
+    # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a
+    # batch is not the latency of an answer.
     seconds: float | None
     batch_size: int  # number of requests that went through the engine together
     error: str | None = None  # the engine's message if finish_reason is `error`
-    label_mass: float | None = None  # total probability of the letters of a read-out; None otherwise
+    # total probability of the letters of a read-out; None otherwise
+    label_mass: float | None = None
     retries: int = 0  # failed attempts before this one; their time is in `seconds`
     cached: bool = False  # whether it comes from the cache, in which case it has no seconds
     slow_s: float = 0.0  # declared seconds beyond its card's latency (the slow tail of a proxy)
-    first_token_s: float | None = None  # time to first token (TTFT), prefill included; None if not known
-    token_s: float | None = None  # time per output token (TPOT, see `per_token_s`); None of only one token
-    # How much of a read-out over several orders follows the letter, 0 to 1 (`harness.backends.orders`), and
-    # whether one letter is the likeliest in every order; None otherwise.
+    # time to first token (TTFT), prefill included; None if not known
+    first_token_s: float | None = None
+    # time per output token (TPOT, see `per_token_s`); None of only one token
+    token_s: float | None = None
+    # How much of a read-out over several orders follows the letter, 0 to 1
+    # (`harness.backends.orders`), and whether one letter is the likeliest in every order; None
+    # otherwise.
     letter_share: float | None = None
     follows_letter: bool | None = None
-    server: str | None = None  # address of the server that gave it; None in process, or of several servers
-    flipped: bool | None = None  # of a replayed read-out, whether its likeliest changed in the reversed list
+    # address of the server that gave it; None in process, or of several servers
+    server: str | None = None
+    # of a replayed read-out, whether its likeliest changed in the reversed list
+    flipped: bool | None = None
 
     def __post_init__(self) -> None:
         for name in ("text", "error"):
@@ -145,11 +172,12 @@ def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Co
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
-    """Return the time per output token (TPOT): the seconds after the first token, for each later token.
+    """Return the time per output token (TPOT):
+    the seconds after the first token, for each later token.
 
-    It is (seconds - first_token_s) / (tokens - 1), as in `vllm bench serve`. Only tokens that the model chose
-    count: the fixed tokens of a constrained answer are read as input, and their time is part of the next
-    chosen token's.
+    It is (seconds - first_token_s) / (tokens - 1), as in `vllm bench serve`. Only tokens that the
+    model chose count: the fixed tokens of a constrained answer are read as input, and their time is
+    part of the next chosen token's.
     """
     if first_token_s is None or tokens is None or tokens < 2:
         return None
@@ -164,7 +192,8 @@ class Backend(Protocol):
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers, as JSON for the manifest: engine, versions, weights, settings.
+        """Return what decides the answers, as JSON for the manifest:
+        engine, versions, weights, settings.
 
         Its `answers` is the answer version of the engine's registration.
         """
@@ -172,17 +201,25 @@ class Backend(Protocol):
 
 
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether two identities are of one model; what a server did not state then is not compared."""
+    """Return whether two identities are of one model;
+    what a server did not state then is not compared.
+    """
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
 
 def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an identity without what servers state, if the stored one lacks that; the helpers' as well."""
+    """Return an identity without what servers state, if the stored one lacks that;
+    the helpers' as well.
+    """
     identity = {key: value for key, value in now.items() if key != "states" or key in stored}
     if "answers" in stored:
         identity.setdefault("answers", 1)  # of an engine from outside that states none
     helpers, theirs = identity.get("helpers"), stored.get("helpers")
-    if isinstance(helpers, list | tuple) and isinstance(theirs, list | tuple) and len(helpers) == len(theirs):
+    if (
+        isinstance(helpers, list | tuple)
+        and isinstance(theirs, list | tuple)
+        and len(helpers) == len(theirs)
+    ):
         pairs = zip(helpers, theirs, strict=True)
         identity["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
     return identity
@@ -192,7 +229,8 @@ class Rendering(Backend, Protocol):
     """A backend of a language model that can show the prompts that its model is sent."""
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return each request's prompt as the model reads it, or as sent to a server that renders it itself.
+        """Return each request's prompt as the model reads it,
+        or as sent to a server that renders it itself.
 
         Raises UserError if the chat template refuses the messages.
         """
@@ -200,13 +238,17 @@ class Rendering(Backend, Protocol):
 
 
 def window(backend: Backend) -> int:
-    """Return the most requests that a backend works on at once; 0 if `complete` takes one call at a time."""
+    """Return the most requests that a backend works on at once;
+    0 if `complete` takes one call at a time.
+    """
     return getattr(backend, "window", 0)
 
 
 @dataclass(frozen=True)
 class Served:
-    """Which server gave the answer of a request, and the model that it names; None if it names none."""
+    """Which server gave the answer of a request, and the model that it names;
+    None if it names none.
+    """
 
     id: str
     server: str
@@ -214,18 +256,24 @@ class Served:
 
 
 def served(backend: Backend) -> list[Served]:
-    """Return which server gave each answer since the last call; empty for a backend without servers."""
+    """Return which server gave each answer since the last call;
+    empty for a backend without servers.
+    """
     taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
     return taken() if taken else []
 
 
 def doubt(backend: Backend) -> str | None:
-    """Return why cached answers may be of other weights, in a line; None if a backend's identity can tell."""
+    """Return why cached answers may be of other weights, in a line;
+    None if a backend's identity can tell.
+    """
     return getattr(backend, "doubt", None)
 
 
 def several(backend: Backend) -> Sequence[str]:
-    """Return the addresses of servers of which any may answer; empty if the identity says who answers."""
+    """Return the addresses of servers of which any may answer;
+    empty if the identity says who answers.
+    """
     return getattr(backend, "several", ())
 
 

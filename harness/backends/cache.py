@@ -1,11 +1,12 @@
-"""The completion cache: keep completions between runs, so that a model answers the same question only once.
+"""The completion cache: keep completions between runs,
+so that a model answers the same question only once.
 
-What a server answered is kept under its address. A card may name several servers, whoever wrote it; so an
-answer is taken only if the server that gave it is among those of today, or the user says in the environment
-variable `SWARMDRIVE_SAME_SERVERS` that they serve the same.
+What a server answered is kept under its address. A card may name several servers, whoever wrote it;
+so an answer is taken only if the server that gave it is among those of today, or the user says in
+the environment variable `SWARMDRIVE_SAME_SERVERS` that they serve the same.
 
-The cache only saves time. A run's rows hold its answers, and if the file does not work, the run continues
-without it.
+The cache only saves time. A run's rows hold its answers, and if the file does not work,
+the run continues without it.
 """
 
 import json
@@ -46,7 +47,8 @@ T = TypeVar("T")
 # Fields of a request that do not affect its answer. Every other field is in the key.
 NOT_IN_KEY = {
     "id": "names the place in a run; the model never reads it",
-    "messages": "in the rendered prompt, with what the chat template adds to them (some write the date)",
+    "messages": "in the rendered prompt, with what the chat "
+    "template adds to them (some write the date)",
     "question": "in the rendered prompt",
     "flips": "asked as a request of their own",
     "agent": "which model is asked; what it is, is in the identity",
@@ -59,15 +61,28 @@ NOT_IN_KEY = {
     "scenario": "no language model reads it; its actions are a field of their own",
 }
 # Fields of a completion that describe one request's handling and not the answer.
-_NOT_KEPT = ("request_id", "seconds", "first_token_s", "token_s", "error", "retries", "cached", "server")
+_NOT_KEPT = (
+    "request_id",
+    "seconds",
+    "first_token_s",
+    "token_s",
+    "error",
+    "retries",
+    "cached",
+    "server",
+)
 _KEPT = tuple(f.name for f in fields(Completion) if f.name not in _NOT_KEPT)
 _MOST = 10**9  # tokens of one answer, of any engine
 _EXACT = ("float32", "F32")  # number formats in which a batch changes no answer
 _WAIT_S = 30.0  # longest wait for another process that is writing
-# Environment variable: addresses of servers that serve the same, with commas; * stands for any text.
+# Environment variable: addresses of servers that serve the same, with commas; * stands for any
+# text.
 SAME = "SWARMDRIVE_SAME_SERVERS"
 _AT_ONCE = 500  # keys in one query; SQLite has a limit
-_TABLE = "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT ROWID"
+_TABLE = (
+    "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT "
+    "ROWID"
+)
 
 
 def default_file() -> Path:
@@ -75,13 +90,15 @@ def default_file() -> Path:
     return kept.folder() / "completions.sqlite"
 
 
-def key(identity: Mapping[str, Any], prompt: str, request: Request, batch_size: int | None = None) -> str:
+def key(
+    identity: Mapping[str, Any], prompt: str, request: Request, batch_size: int | None = None
+) -> str:
     """Return the hex digest of all that decides an answer; it reveals no prompt and no secret.
 
     The identity states the version of the engine's answers.
 
-    With float32 weights other requests in a batch change no answer, and `batch_size` is None. With quantised
-    and 16-bit weights they move it by rounding: the batch size is part of the key.
+    With float32 weights other requests in a batch change no answer, and `batch_size` is None. With
+    quantised and 16-bit weights they move it by rounding: the batch size is part of the key.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     asked["image"] = request.image_sha256
@@ -90,7 +107,8 @@ def key(identity: Mapping[str, Any], prompt: str, request: Request, batch_size: 
 
 
 class CompletionFile:
-    """The SQLite file. It is opened for every call, so a file that was deleted is simply empty again.
+    """The SQLite file. It is opened for every call,
+    so a file that was deleted is simply empty again.
 
     Its methods raise sqlite3.Error or OSError if it cannot be read or written.
     """
@@ -99,13 +117,17 @@ class CompletionFile:
         self.path = path
 
     def find(self, keys: Sequence[str]) -> dict[str, Completion]:
-        """Return the stored completions by key. They have no seconds, and their request's id is empty."""
+        """Return the stored completions by key.
+        They have no seconds, and their request's id is empty.
+        """
         rows: list[tuple[str, str]] = []
         with self._open() as file:
             for start in range(0, len(keys), _AT_ONCE):
                 chunk = keys[start : start + _AT_ONCE]
                 marks = ",".join("?" * len(chunk))
-                rows += file.execute(f"SELECT key, answer FROM completions WHERE key IN ({marks})", chunk)
+                rows += file.execute(
+                    f"SELECT key, answer FROM completions WHERE key IN ({marks})", chunk
+                )
         try:
             return {key: _completion(json.loads(answer)) for key, answer in rows}
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -114,7 +136,9 @@ class CompletionFile:
     def add(self, completions: Mapping[str, Completion]) -> None:
         """Store completions by key; a stored one is not replaced."""
         # JSON in ASCII: a completion may hold a lone surrogate, which cannot be written as UTF-8.
-        rows = [(key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()]
+        rows = [
+            (key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()
+        ]
         with self._open() as file:
             file.execute("BEGIN IMMEDIATE")
             file.executemany("INSERT OR IGNORE INTO completions VALUES (?, ?)", rows)
@@ -127,7 +151,9 @@ class CompletionFile:
             file.execute("PRAGMA journal_mode = WAL")
             file.execute("PRAGMA synchronous = NORMAL")
             file.execute(_TABLE)
-            if file.execute("SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchone():
+            if file.execute(
+                "SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')"
+            ).fetchone():
                 raise sqlite3.DatabaseError("it has a view or a trigger, which may never end")
             yield file
 
@@ -139,9 +165,17 @@ def _say_once(line: str, identity: str) -> None:
 
 
 def _completion(kept: dict[str, Any]) -> Completion:
-    """Return a stored completion. Raises ValueError or TypeError unless an engine can have given it."""
+    """Return a stored completion. Raises ValueError or TypeError unless an engine can have given
+    it.
+    """
     done = msgspec.convert({**kept, "request_id": "", "seconds": None, "cached": True}, Completion)
-    counts = (done.prompt_tokens, done.completion_tokens, done.batch_size, done.label_mass, done.letter_share)
+    counts = (
+        done.prompt_tokens,
+        done.completion_tokens,
+        done.batch_size,
+        done.label_mass,
+        done.letter_share,
+    )
     if not (
         kept.keys() <= set(_KEPT)
         and all(0 <= count <= _MOST for count in counts if count is not None)
@@ -153,21 +187,29 @@ def _completion(kept: dict[str, Any]) -> Completion:
 
 
 def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
-    """Return under what the answers of each of several servers are kept, by its address, and what is taken.
+    """Return under what the answers of each of several servers are kept, by its address,
+    and what is taken.
 
-    That is the address; or, if the user says of all that they serve the same, the pattern that it fits. Then
-    answers of all patterns of today are taken, and of no others: another day's said nothing of these servers.
+    That is the address; or, if the user says of all that they serve the same, the pattern that it
+    fits. Then answers of all patterns of today are taken, and of no others: another day's said
+    nothing of these servers.
     """
     listed = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
-    fitting = {server: next((p for p in listed if fnmatchcase(server, p)), None) for server in servers}
-    same = {server: f"same as {pattern}" for server, pattern in fitting.items() if pattern is not None}
+    fitting = {
+        server: next((p for p in listed if fnmatchcase(server, p)), None) for server in servers
+    }
+    same = {
+        server: f"same as {pattern}" for server, pattern in fitting.items() if pattern is not None
+    }
     if servers and len(same) == len(fitting):
         return same, [f"same as {pattern}" for pattern in listed]
     return {server: server for server in servers}, servers
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
-    """Put a cache before a card's backend, if there is a file and the backend can show its prompts."""
+    """Put a cache before a card's backend,
+    if there is a file and the backend can show its prompts.
+    """
     if file is None or not capabilities(card.engine).renders:
         return backend
     return Cached(cast("Rendering", backend), file)
@@ -233,7 +275,8 @@ class Cached:
         except (sqlite3.Error, OSError) as error:
             print(
                 f"harness: completion cache {printable(self._file.path)}: {printable(error)}; "
-                "this run continues without it; delete the file, or set SWARMDRIVE_CACHE to another folder",
+                "this run continues without it; delete the file, or set SWARMDRIVE_CACHE to "
+                "another folder",
                 file=sys.stderr,
             )
             self._file = None

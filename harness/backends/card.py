@@ -1,6 +1,8 @@
-"""The model card: a record of a model, its engine, its weights and its latency, and the file that holds it.
+"""The model card: a record of a model, its engine, its weights and its latency,
+and the file that holds it.
 
-A file, `models/<name>.toml`, may list further engines: `<name>:<engine>` is the same model on that one.
+A file, `models/<name>.toml`, may list further engines:
+`<name>:<engine>` is the same model on that one.
 """
 
 from dataclasses import asdict, dataclass, field, replace
@@ -25,22 +27,50 @@ Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z", description="64 digits 
 Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
 # Keys that only some engines understand; a `Registration` says which.
-_ENGINE_KEYS = ("weights", "server", "revision", "sha256", "gated", "dtype", "file", "quantisation",
-                "failures", "privileged", "vision", "projector", "system", "adapter", "price")  # fmt: skip
+_ENGINE_KEYS = (
+    "weights",
+    "server",
+    "revision",
+    "sha256",
+    "gated",
+    "dtype",
+    "file",
+    "quantisation",
+    "failures",
+    "privileged",
+    "vision",
+    "projector",
+    "system",
+    "adapter",
+    "price",
+)
 # Keys that a model may set again for each further engine.
-_PER_ENGINE = ("latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-               "server", "projector", "adapter", "price")  # fmt: skip
+_PER_ENGINE = (
+    "latency",
+    "weights",
+    "file",
+    "revision",
+    "sha256",
+    "gated",
+    "dtype",
+    "quantisation",
+    "server",
+    "projector",
+    "adapter",
+    "price",
+)
 
 
 @dataclass(frozen=True)
 class Latency:
     """Declared time of one answer."""
 
-    # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means the paper's
-    # too, unless the card's is asked for: its makers' computer is not the car's
+    # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means
+    # the paper's too, unless the card's is asked for: its makers' computer is not the car's
     source: LatencySource
     inference_s: Seconds | None  # declared or cited seconds of one answer; None for the paper's
-    basis: str  # where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date"
+    # where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date"
+    basis: str
 
     def __post_init__(self) -> None:
         if (self.source == "paper") == (self.inference_s is not None):
@@ -49,7 +79,8 @@ class Latency:
 
 @dataclass(frozen=True)
 class Failures:
-    """The shares of a proxy's answers that fail on purpose, drawn for each request; the others are good.
+    """The shares of a proxy's answers that fail on purpose, drawn for each request;
+    the others are good.
 
     A text is spoilt in one way at most; any answer may be slow as well.
     """
@@ -58,8 +89,10 @@ class Failures:
     prose: Share = 0.0  # the answer is between sentences. Recovered.
     truncation: Share = 0.0  # the answer is cut off inside its JSON. Failed, `truncated_json`.
     nan: Share = 0.0  # one probability is NaN. Failed, `non_finite`.
-    unknown_action: Share = 0.0  # no action's name is one of the scenario's. Failed, `unknown_action`.
-    unclosed_think: Share = 0.0  # the answer is in a thought that never ends. Failed, `truncated_reasoning`.
+    # no action's name is one of the scenario's. Failed, `unknown_action`.
+    unknown_action: Share = 0.0
+    # the answer is in a thought that never ends. Failed, `truncated_reasoning`.
+    unclosed_think: Share = 0.0
     slow_tail: Share = 0.0  # the answer takes `slow_s` seconds longer than the card's latency
     slow_s: Seconds = 0.0
 
@@ -79,36 +112,45 @@ class Failures:
 class Card:
     """One model on one engine."""
 
-    name: str  # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
+    # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
+    name: str
     engine: str
     description: str  # one line for people
     latency: Latency
-    # Directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for `replay`;
-    # the server's name of the model for `openai`; None without a model.
+    # Directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
+    # `replay`; the server's name of the model for `openai`; None without a model.
     weights: str | None = None
     file: str | None = None  # GGUF file in `weights`, unless `weights` is the file itself
     revision: str | None = None  # branch, tag or commit on the hub; None means its default branch
     sha256: Sha256 | None = None  # of the GGUF file or model.safetensors, checked on loading
-    gated: bool = False  # whether the hub gives the weights only to those who have accepted their licence
+    # whether the hub gives the weights only to those who have accepted their licence
+    gated: bool = False
     dtype: Dtype = "auto"  # number format of a checkpoint's weights; `auto` is the checkpoint's own
-    quantisation: str | None = None  # number format of a GGUF file, for people only; the file decides
-    context_tokens: Count | None = None  # most tokens of prompt and answer; None: the checkpoint's own limit
-    thinking: Thinking = "none"  # `switch` if its template can turn it on and off, `always` if never off
-    privileged: bool = False  # whether it sees behind the occlusion: an upper reference, never a contestant
+    # number format of a GGUF file, for people only; the file decides
+    quantisation: str | None = None
+    # most tokens of prompt and answer; None: the checkpoint's own limit
+    context_tokens: Count | None = None
+    # `switch` if its template can turn it on and off, `always` if never off
+    thinking: Thinking = "none"
+    # whether it sees behind the occlusion: an upper reference, never a contestant
+    privileged: bool = False
     licence: str | None = None  # SPDX id of the weights' licence, or its name if it has no id
-    max_new_tokens: Count | None = None  # of an answer, if the model needs another limit than its prompt's
-    thinking_tokens: Count = 2048  # most tokens of a thought, in addition to the answer's, if asked to think
+    # of an answer, if the model needs another limit than its prompt's
+    max_new_tokens: Count | None = None
+    # most tokens of a thought, in addition to the answer's, if asked to think
+    thinking_tokens: Count = 2048
     server: Server | None = None  # the server of an `openai` model
     failures: Failures | None = None  # how often the proxy fails on purpose
     vision: Vision | None = None  # how the model takes pictures; None if it only reads text
-    projector: str | None = None  # name of the GGUF file beside `file` that turns pictures into tokens
+    # name of the GGUF file beside `file` that turns pictures into tokens
+    projector: str | None = None
     # folder of a LoRA adapter, absolute or beside the cards, that changes the weights; None without
     adapter: str | None = None
-    # `first-user` puts the system text at the beginning of the first user turn, for a chat template that has
-    # no place for it; None gives it a message of its own.
+    # `first-user` puts the system text at the beginning of the first user turn, for a chat template
+    # that has no place for it; None gives it a message of its own.
     system: System | None = None
-    # `raw` for a model that was trained on one order of the letters; None, or `cyclic`, averages a read-out
-    # over their orders, unless `--letters` says otherwise.
+    # `raw` for a model that was trained on one order of the letters; None, or `cyclic`, averages a
+    # read-out over their orders, unless `--letters` says otherwise.
     letters: Letters | None = None
     price: Price | None = None  # what its tokens cost; None if it costs nothing, or nobody says
 
@@ -121,7 +163,11 @@ class Card:
 
         Raises ValueError if one is not a base URL, or is named twice.
         """
-        return replace(self, server=replace(self.server, base_url=urls)) if self.server and urls else self
+        return (
+            replace(self, server=replace(self.server, base_url=urls))
+            if self.server and urls
+            else self
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the card as plain values, from which `convert` makes it again."""
@@ -146,7 +192,9 @@ class _File(Card):
 
 
 def read_cards(path: Path) -> list[Card]:
-    """Read a file's card on each of its engines, the default one first. Raises UserError on a mistake."""
+    """Read a file's card on each of its engines, the default one first.
+    Raises UserError on a mistake.
+    """
     where = f"model card {path}"
     table = _with_latency(toml(path, where))
     engines = convert(table, _File, where, name=path.stem).engines
@@ -176,7 +224,11 @@ def read_cards(path: Path) -> list[Card]:
 def _with_latency(table: dict[str, Any]) -> dict[str, Any]:
     """Add to a card's table the `inference_s` that is left out if no time is declared."""
     latency = table.get("latency")
-    return {**table, "latency": {"inference_s": None, **latency}} if isinstance(latency, dict) else table
+    return (
+        {**table, "latency": {"inference_s": None, **latency}}
+        if isinstance(latency, dict)
+        else table
+    )
 
 
 def _card(table: dict[str, Any], where: str, name: str) -> Card:
@@ -191,18 +243,24 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
             raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
     if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
         raise UserError(
-            f"{where}: [vision] and projector go together on {card.engine}: give the name of its mmproj "
+            f"{where}: [vision] and projector go together on {card.engine}: give the name of its "
+            "mmproj "
             "file, or leave both out"
         )
     if card.server and card.thinking == "switch" and not card.server.tells_thinking:
         raise UserError(
-            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a request can '
+            f'{where} [server]: thinking = "switch" needs the kind vllm or llama-server, which a '
+            "request can "
             "tell; else set it at the server, and here none or always"
         )
     if card.failures and card.failures.slow_tail and card.latency.source != "card":
-        raise UserError(f'{where} [failures]: a slow tail goes with a latency whose source = "card"')
+        raise UserError(
+            f'{where} [failures]: a slow tail goes with a latency whose source = "card"'
+        )
     return card
 
 
 def _engines_with(key: str) -> list[str]:
-    return [engine for engine, registered in ENGINES.usable().items() if key in registered.allowed_keys]
+    return [
+        engine for engine, registered in ENGINES.usable().items() if key in registered.allowed_keys
+    ]

@@ -1,6 +1,7 @@
 """The model cards by name: those of files, and those made for a model that has none.
 
-A model without a file is a directory, a GGUF file, a hub id, `replay:RUN_DIR`, or a served one by its URL.
+A model without a file is a directory, a GGUF file, a hub id, `replay:RUN_DIR`,
+or a served one by its URL.
 """
 
 import json
@@ -31,8 +32,22 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
 _SWITCH = b"enable_thinking"  # name of the thinking switch in chat templates
 # Keys that decide no answer, or whose effect is in the identity of the opened model.
-_PLACE = ("description", "latency", "weights", "file", "revision", "sha256", "gated", "dtype", "quantisation",
-          "licence", "projector", "letters", "adapter", "price")  # fmt: skip
+_PLACE = (
+    "description",
+    "latency",
+    "weights",
+    "file",
+    "revision",
+    "sha256",
+    "gated",
+    "dtype",
+    "quantisation",
+    "licence",
+    "projector",
+    "letters",
+    "adapter",
+    "price",
+)
 _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
@@ -42,12 +57,16 @@ def names() -> list[str]:
 
 
 def each_engine(stem: str) -> list[Card]:
-    """Return a file's card on each of its engines, the default one first. Raises UserError on a mistake."""
+    """Return a file's card on each of its engines, the default one first.
+    Raises UserError on a mistake.
+    """
     return read_cards(resources.find("models", f"{stem}.toml"))
 
 
 def load(name: str) -> Card:
-    """Load a card by `<name>` or `<name>:<engine>`. Raises UserError if there is none or it has a mistake."""
+    """Load a card by `<name>` or `<name>:<engine>`.
+    Raises UserError if there is none or it has a mistake.
+    """
     stem, _, engine = name.partition(":")
     if stem not in names():
         raise _no_card(name)
@@ -65,9 +84,9 @@ def load_all() -> list[Card]:
 def resolve(text: str, engine: str | None = None) -> Card:
     """Return the card of a name, a URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
-    It runs on `engine`, if there is a choice. The server at a URL is asked what it serves. Raises UserError
-    if there is no such model or engine, or the model does not run on the engine; Unanswered if no server
-    answers.
+    It runs on `engine`, if there is a choice. The server at a URL is asked what it serves. Raises
+    UserError if there is no such model or engine, or the model does not run on the engine;
+    Unanswered if no server answers.
     """
     if engine is not None:
         registration(engine)
@@ -78,12 +97,15 @@ def resolve(text: str, engine: str | None = None) -> Card:
         card = local
     else:
         hint = (
-            "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, the URL of a "
+            "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, the URL "
+            "of a "
             "server such as http://127.0.0.1:8080/v1, or replay:RUN_DIR"
         )
         raise _no_card(text, f"; or {hint}")
     if engine not in (None, card.engine):
-        raise UserError(f"--engine {engine}: {printable(text)!r} runs on {card.engine}; leave it out")
+        raise UserError(
+            f"--engine {engine}: {printable(text)!r} runs on {card.engine}; leave it out"
+        )
     return card
 
 
@@ -99,22 +121,27 @@ def argument(card: Card) -> str:
 
 
 def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
-    """Return the user's own card of the model that a run names. What the run says of it opens nothing.
+    """Return the user's own card of the model that a run names.
+    What the run says of it opens nothing.
 
-    Only the name of the card that the run states is looked up; the rest is compared. Cards that the user gave
-    come before the card files. Raises UserError, with `where` and `hint`, if there is no such card or it
-    differs.
+    Only the name of the card that the run states is looked up; the rest is compared. Cards that the
+    user gave come before the card files. Raises UserError, with `where` and `hint`, if there is no
+    such card or it differs.
     """
     name = printable(stated.name)
     card = next((card for card in given if card.name == stated.name), None)
     if card is None:
         if stated.name.partition(":")[0] not in names():
-            lost = resources.card_to_copy(stated.name) or f"its model {name} is none of your cards; {hint}"
+            lost = (
+                resources.card_to_copy(stated.name)
+                or f"its model {name} is none of your cards; {hint}"
+            )
             raise UserError(f"{where}: {lost}")
         card = load(stated.name)
     if differing := _differing(card, stated):
         raise UserError(
-            f"{where}: its model {name} is not what it was ({', '.join(differing)} of your card differs); "
+            f"{where}: its model {name} is not what it was ({', '.join(differing)} of your card "
+            "differs); "
             "restore the card, or run again"
         )
     return card
@@ -129,20 +156,24 @@ def _no_card(model: str, hint: str = "") -> UserError:
 def _differing(card: Card, stated: Card) -> list[str]:
     """Return the keys in which two cards of a model differ so that answers may differ.
 
-    Where it lies and what people read may change: the identity of the opened model says what answers.
+    Where it lies and what people read may change:
+    the identity of the opened model says what answers.
     """
     for part in ("server", "vision"):
         if bool(getattr(card, part)) != bool(getattr(stated, part)):
             return [f"[{part}]"]
     same = {key: getattr(stated, key) for key in _PLACE}
     if card.server and stated.server:
-        same["server"] = replace(card.server, **{key: getattr(stated.server, key) for key in _SERVER_PLACE})
+        same["server"] = replace(
+            card.server, **{key: getattr(stated.server, key) for key in _SERVER_PLACE}
+        )
     card = replace(card, **same)
     return [f.name for f in fields(Card) if getattr(card, f.name) != getattr(stated, f.name)]
 
 
 def _local_card(text: str, engine: str | None) -> Card | None:
-    """Return the card of a URL, `replay:RUN_DIR`, a path or a hub id, or None; on `engine` if it can choose.
+    """Return the card of a URL, `replay:RUN_DIR`, a path or a hub id, or None;
+    on `engine` if it can choose.
 
     Raises UserError if there is no such file or run, or it does not say how to open it.
     """
@@ -155,7 +186,8 @@ def _local_card(text: str, engine: str | None) -> Card | None:
         run = _path(rest)
         if run is None or not run.is_dir():
             raise UserError(
-                f"model {printable(text)!r}: no such run directory; give replay: and the directory of a run"
+                f"model {printable(text)!r}: no such run directory; give replay: and the directory "
+                "of a run"
             )
         return _run_card(run)
     path = _path(text)
@@ -167,7 +199,8 @@ def _local_card(text: str, engine: str | None) -> Card | None:
         return _new_card(text, "transformers", text, "Hub model without a card")
     if re.search(r":\d|//", text) and (url := meant(text)):
         raise UserError(
-            f"model {printable(text)!r} is no path; the URL of a server begins with http://: give {url}"
+            f"model {printable(text)!r} is no path; the URL of a server begins with http://: give "
+            f"{url}"
         )
     if "/" in text:
         raise UserError(
@@ -239,9 +272,12 @@ def _adapted(shown: str, where: Path, engine: str | None) -> Card:
         )
     _, _, other = base.name.partition(":")
     return replace(
-        base, name=f"{where.name}:{other}" if other else where.name, adapter=str(where),
-        description=f"Local adapter of {base.name}", letters=_letters(where),
-    )  # fmt: skip
+        base,
+        name=f"{where.name}:{other}" if other else where.name,
+        adapter=str(where),
+        description=f"Local adapter of {base.name}",
+        letters=_letters(where),
+    )
 
 
 def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
@@ -252,7 +288,8 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
     stated = read_facts(file)
     if stated.decision:
         raise UserError(
-            f"model {printable(text)!r} is a decision model ({printable(stated.decision, 30)}), which no "
+            f"model {printable(text)!r} is a decision model ({printable(stated.decision, 30)}), "
+            "which no "
             "engine opens here; serve it by llama-server, and copy models/systemone-example.toml"
         )
     engine = "transformers" if engine == "transformers" else "llama-cpp"
@@ -278,9 +315,13 @@ def _path(text: str) -> Path | None:
 
 
 def _thinking(checkpoint: Path) -> Thinking:
-    """Return `switch` if a checkpoint's chat template has the thinking switch; reads the file's text only."""
+    """Return `switch` if a checkpoint's chat template has the thinking switch;
+    reads the file's text only.
+    """
     files = (checkpoint / name for name in _TEMPLATE_FILES)
-    return "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
+    return (
+        "switch" if any(_SWITCH in bytes_of(f, "record") for f in files if f.is_file()) else "none"
+    )
 
 
 def _letters(weights: Path) -> Letters | None:
@@ -289,7 +330,9 @@ def _letters(weights: Path) -> Letters | None:
 
 
 def _vision(text: str, checkpoint: Path) -> Vision | None:
-    """Return how a checkpoint takes pictures, from its config files. Raises UserError if they do not say."""
+    """Return how a checkpoint takes pictures, from its config files.
+    Raises UserError if they do not say.
+    """
     try:
         config, processor = (
             json.loads(text_of(file, "record")) if file.is_file() else {}
@@ -304,17 +347,23 @@ def _vision(text: str, checkpoint: Path) -> Vision | None:
 
 
 def _system(template: str | None) -> System | None:
-    """Return how a card made on the spot gives the system text, so that its chat template takes it."""
+    """Return how a card made on the spot gives the system text,
+    so that its chat template takes it.
+    """
     from harness.backends.chat_template import needs_first_user  # imports Jinja, as few cards do
 
     return "first-user" if template and needs_first_user(template) else None
 
 
 def _template(checkpoint: Path) -> str | None:
-    """Return a checkpoint's chat template; None if its files do not say, which opening it reports."""
+    """Return a checkpoint's chat template;
+    None if its files do not say, which opening it reports.
+    """
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         if (file := checkpoint / _TEMPLATE_FILES[0]).is_file():
             return text_of(file)
-        template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get("chat_template")
+        template = json.loads(text_of(checkpoint / _TEMPLATE_FILES[1], "record")).get(
+            "chat_template"
+        )
         return template if isinstance(template, str) else None
     return None

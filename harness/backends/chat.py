@@ -1,4 +1,6 @@
-"""A model's chat template and tokenizer: render messages to the prompt that it reads, and encode that."""
+"""A model's chat template and tokenizer:
+render messages to the prompt that it reads, and encode that.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,7 +9,13 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from harness.backends.card import Thinking
-from harness.backends.chat_template import FIRST_USER, ChatTemplate, Refused, lost_message, with_system
+from harness.backends.chat_template import (
+    FIRST_USER,
+    ChatTemplate,
+    Refused,
+    lost_message,
+    with_system,
+)
 from harness.core.errors import UserError, printable
 from harness.prompts.readout import spelt
 
@@ -22,24 +30,33 @@ class Tokenizer(Protocol):
     """A model's tokenizer, which comes with a chat template."""
 
     template: str  # the template's Jinja text
-    specials: Mapping[str, str]  # texts of special tokens by their name in a template, such as `bos_token`
+    # texts of special tokens by their name in a template, such as `bos_token`
+    specials: Mapping[str, str]
     bos: int | None  # id of the token that begins a sequence; None if there is none
     vocabulary: int  # number of tokens
 
     def encode(self, text: str) -> list[int]:
-        """Return the token ids of a rendered prompt, in which the template has already written any BOS."""
+        """Return the token ids of a rendered prompt,
+        in which the template has already written any BOS.
+        """
         ...
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Return the text of an answer without special tokens. Qwen3's `<think>` is not one, and stays."""
+        """Return the text of an answer without special tokens.
+        Qwen3's `<think>` is not one, and stays.
+        """
         ...
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """Return the text of each single token, with special tokens; incomplete bytes become U+FFFD."""
+        """Return the text of each single token, with special tokens;
+        incomplete bytes become U+FFFD.
+        """
         ...
 
     def candidates(self, letters: str) -> Sequence[int]:
-        """Return the ids of all tokens whose text may be one of the letters, and perhaps of others."""
+        """Return the ids of all tokens whose text may be one of the letters,
+        and perhaps of others.
+        """
         ...
 
 
@@ -68,7 +85,10 @@ class HubTokenizer:
         return [i for text, i in short if text.startswith("<0x") or any(x in text for x in letters)]
 
     def _text(self, ids: Sequence[int], skip_special_tokens: bool) -> str:
-        options = {"skip_special_tokens": skip_special_tokens, "clean_up_tokenization_spaces": False}
+        options = {
+            "skip_special_tokens": skip_special_tokens,
+            "clean_up_tokenization_spaces": False,
+        }
         text: str = self.hub.decode(ids, **options)
         return text
 
@@ -76,15 +96,28 @@ class HubTokenizer:
 class Chat:
     """A tokenizer with its chat template; `encode`, `decode` and `pieces` are the tokenizer's.
 
-    The template writes `image_token` for a picture; None if the model takes none. The system text stands in
-    the first user turn (`system` is `first-user`), or in a message of its own (None).
+    The template writes `image_token` for a picture; None if the model takes none. The system text
+    stands in the first user turn (`system` is `first-user`), or in a message of its own (None).
     """
 
     def __init__(
-        self, name: str, tokenizer: Tokenizer, image_token: str | None = None, system: str | None = None
+        self,
+        name: str,
+        tokenizer: Tokenizer,
+        image_token: str | None = None,
+        system: str | None = None,
     ) -> None:
-        self.name, self.tokenizer, self.image_token, self.system = name, tokenizer, image_token, system
-        self.template, self.bos, self.vocabulary = tokenizer.template, tokenizer.bos, tokenizer.vocabulary
+        self.name, self.tokenizer, self.image_token, self.system = (
+            name,
+            tokenizer,
+            image_token,
+            system,
+        )
+        self.template, self.bos, self.vocabulary = (
+            tokenizer.template,
+            tokenizer.bos,
+            tokenizer.vocabulary,
+        )
         self.encode, self.decode, self.pieces = tokenizer.encode, tokenizer.decode, tokenizer.pieces
         self._compiled = ChatTemplate(name, self.template)
 
@@ -98,7 +131,9 @@ class Chat:
 
     @property
     def thinking(self) -> Thinking:
-        """What the template can do: `switch`, `none`, or `always` if its prompt always opens a thought."""
+        """What the template can do: `switch`, `none`,
+        or `always` if its prompt always opens a thought.
+        """
         if self._switch:
             return "switch"
         prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
@@ -106,13 +141,17 @@ class Chat:
 
     @cached_property
     def turn_end(self) -> int | None:
-        """Id of the token that the template writes after an answer; None if it writes no such token."""
+        """Id of the token that the template writes after an answer;
+        None if it writes no such token.
+        """
         with suppress(UserError):
             text = self._apply(self._shown(_TURN), thinking=False, add_generation_prompt=False)
             _, answer, rest = text.rpartition(_ANSWER)
             tokens = self.encode(rest.lstrip()) if answer else []
             # A mark that is a token of its own stands for no text, or is at least written like one.
-            if tokens and (not self.decode(tokens[:1]) or _MARK.fullmatch(self.pieces(tokens[:1])[0])):
+            if tokens and (
+                not self.decode(tokens[:1]) or _MARK.fullmatch(self.pieces(tokens[:1])[0])
+            ):
                 return tokens[0]
         return None
 
@@ -134,7 +173,8 @@ class Chat:
             turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
                 f"{self.shown}: its chat template leaves out or changes the text of "
-                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model "
+                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; "
+                "the model "
                 f"would not read what it is asked; {self._way_out(messages, thinking)}"
             )
         return prompt
@@ -146,16 +186,22 @@ class Chat:
             with suppress(UserError):
                 if lost_message(joined, self._apply(joined, thinking=thinking)) is None:
                     return (
-                        f'a card with system = "{FIRST_USER}" puts the system text into the first user turn'
+                        f'a card with system = "{FIRST_USER}" puts the system text into the first '
+                        "user turn"
                     )
         return "use a prompt with roles that it knows, or a model with another template"
 
     def _shown(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-        """Convert messages for the template. A picture's token written inside a text is broken up."""
+        """Convert messages for the template.
+        A picture's token written inside a text is broken up.
+        """
         token = self.image_token
         if token is None:
             return [dict(message) for message in messages]
-        texts = [{**m, "content": m["content"].replace(token, f"{token[0]} {token[1:]}")} for m in messages]
+        texts = [
+            {**m, "content": m["content"].replace(token, f"{token[0]} {token[1:]}")}
+            for m in messages
+        ]
         return in_parts(texts, {"type": "image"})
 
     def _apply(self, messages: list[dict[str, Any]], *, thinking: bool, **values: Any) -> str:
@@ -163,7 +209,9 @@ class Chat:
         return self._compiled.render(messages, **self.tokenizer.specials, **switch, **values)
 
     def spellings(self, letters: str) -> dict[str, list[int]]:
-        """Return the ids of all tokens that are each letter: alone, with blanks around it, or as a byte."""
+        """Return the ids of all tokens that are each letter:
+        alone, with blanks around it, or as a byte.
+        """
         tokens: dict[str, list[int]] = {letter: [] for letter in letters}
         candidates = self.tokenizer.candidates(letters)
         for token, piece in zip(candidates, self.pieces(candidates), strict=True):
@@ -172,12 +220,17 @@ class Chat:
         return tokens
 
 
-def in_parts(messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]) -> list[dict[str, Any]]:
+def in_parts(
+    messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]
+) -> list[dict[str, Any]]:
     """Convert messages to contents that are lists of parts, as models with vision take them.
 
     A message with the key `image` gets `picture`, the part that stands for it, before its text.
     """
     return [
-        {"role": m["role"], "content": [picture] * ("image" in m) + [{"type": "text", "text": m["content"]}]}
+        {
+            "role": m["role"],
+            "content": [picture] * ("image" in m) + [{"type": "text", "text": m["content"]}],
+        }
         for m in messages
     ]

@@ -1,4 +1,6 @@
-"""A chat template, which makes a model's prompt of messages. It comes with weights, so from strangers."""
+"""A chat template, which makes a model's prompt of messages.
+It comes with weights, so from strangers.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,9 +15,8 @@ from harness.core.errors import UserError, printable
 from harness.core.templates import Sandbox, TooMuch
 
 Messages = Sequence[Mapping[str, Any]]
-FIRST_USER: Literal["first-user"] = (
-    "first-user"  # a card's `system`: the system text begins the first user turn
-)
+# A card's `system`: the system text begins the first user turn.
+FIRST_USER: Literal["first-user"] = "first-user"
 _THOUGHT_ENDS = "</think>"
 _REMEDY = "give another model, or mend the template"
 _LONGEST_FORM = 100  # characters of a form of dates
@@ -39,19 +40,24 @@ class ChatTemplate:
     def render(self, messages: Messages, **values: Any) -> str:
         """Render messages, with the values of further names.
 
-        Raises Refused, without advice yet, if the template refuses them, and UserError if it takes too much.
+        Raises Refused, without advice yet, if the template refuses them,
+        and UserError if it takes too much.
         """
         given = {"tools": None, "documents": None, "add_generation_prompt": True, **values}
         try:
             return self._compiled.render(messages=messages, **given)
         except TooMuch as error:
-            raise UserError(f"{self._shown} takes {printable(error)} to render; {_REMEDY}") from None
+            raise UserError(
+                f"{self._shown} takes {printable(error)} to render; {_REMEDY}"
+            ) from None
         except Exception as error:  # a template is a program and may fail in any way
             raise Refused(f"{self._shown} refuses the messages ({printable(error)})") from None
 
 
 def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:
-    """Return messages in the way of a card's `system`: `first-user`, or None to leave them as they are."""
+    """Return messages in the way of a card's `system`:
+    `first-user`, or None to leave them as they are.
+    """
     if way != FIRST_USER or len(messages) < 2 or messages[0]["role"] != "system":
         return tuple(messages)
     system, first, *rest = messages
@@ -59,7 +65,8 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
 
 
 def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
-    """Return the first message whose text does not stand in a prompt, after those before it; None if all do.
+    """Return the first message whose text does not stand in a prompt, after those before it;
+    None if all do.
 
     White space around a text does not matter, and thoughts of earlier turns may be left out.
     """
@@ -77,7 +84,9 @@ def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
 
 
 def needs_first_user(text: str) -> bool:
-    """Return whether a template refuses a system message and takes its text in the first user turn."""
+    """Return whether a template refuses a system message and takes its text in the first user
+    turn.
+    """
     asked = ({"role": "system", "content": "Be brief."}, {"role": "user", "content": "Where to?"})
     empty = {"bos_token": "", "eos_token": ""}
     try:
@@ -95,11 +104,15 @@ def needs_first_user(text: str) -> bool:
 
 def _text(content: Any) -> str:
     """Return the text of a message's content, which may be a list of parts."""
-    return content if isinstance(content, str) else "".join(part.get("text", "") for part in content)
+    return (
+        content if isinstance(content, str) else "".join(part.get("text", "") for part in content)
+    )
 
 
 class _Generation(Extension):
-    """The tag `{% generation %}`, which marks a model's turns for training; its content is rendered."""
+    """The tag `{% generation %}`, which marks a model's turns for training;
+    its content is rendered.
+    """
 
     tags = {"generation"}  # noqa: RUF012 jinja2 declares it so
 
@@ -119,7 +132,9 @@ def _environment() -> Sandbox:
             raise TooMuch(f"a date of {len(form)} characters")
         return datetime.now().strftime(form)
 
-    built = Sandbox(trim_blocks=True, lstrip_blocks=True, extensions=[_Generation, "jinja2.ext.loopcontrols"])
+    built = Sandbox(
+        trim_blocks=True, lstrip_blocks=True, extensions=[_Generation, "jinja2.ext.loopcontrols"]
+    )
     built.add_filter("tojson", _tojson)
     built.globals |= {"raise_exception": raise_exception, "strftime_now": strftime_now}
     return built

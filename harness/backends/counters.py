@@ -1,9 +1,10 @@
 """Read the energy counters of a machine: NVML, RAPL, and the power rails of a Jetson.
 
-NVML (GPUs since Volta) and RAPL count energy themselves; RAPL's counter wraps around, and on Linux only root
-may read it. A Jetson reports power, which is sampled and integrated here. All are too coarse for one answer:
-on some GPUs NVML samples the power only a quarter of the time (Yang et al., SC24, arXiv 2312.02741), so a
-measurement lasts seconds and is repeated (`harness model device measure`).
+NVML (GPUs since Volta) and RAPL count energy themselves; RAPL's counter wraps around, and on Linux
+only root may read it. A Jetson reports power, which is sampled and integrated here. All are too
+coarse for one answer: on some GPUs NVML samples the power only a quarter of the time (Yang et al.,
+SC24, arXiv 2312.02741), so a measurement lasts seconds and is repeated (`harness model device
+measure`).
 """
 
 import time
@@ -29,13 +30,17 @@ class Counter:
 
 
 def counters(sys: Path = SYS) -> list[Counter]:
-    """Return the meters that can be read here. `sys` is the folder in which the kernel shows its own."""
+    """Return the meters that can be read here.
+    `sys` is the folder in which the kernel shows its own.
+    """
     return [*_nvml(), *_rapl(sys), *_jetson(sys)]
 
 
 @contextmanager
 def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
-    """Measure the energy of the block: the yielded dictionary of joules by meter is filled at its end."""
+    """Measure the energy of the block: the yielded dictionary of joules by meter is filled at its
+    end.
+    """
     spent: dict[str, float] = {}
     sums = {meter.name: 0.0 for meter in meters if meter.watts}
     ended = Event()
@@ -79,7 +84,8 @@ def _nvml() -> Iterator[Counter]:
 
 def _rapl(sys: Path) -> Iterator[Counter]:
     for folder in sorted((sys / "class/powercap").glob("*-rapl:*")):
-        if folder.name.count(":") > 1:  # a part of a package, whose energy the package's counter includes
+        # a part of a package, whose energy the package's counter includes
+        if folder.name.count(":") > 1:
             continue
         with suppress(OSError, ValueError):
             name = (folder / "name").read_text().strip()

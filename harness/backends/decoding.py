@@ -1,7 +1,7 @@
 """The answer modes, implemented once for all engines.
 
-`json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout` and
-`decision`: it is asked for one letter, and the letters' probabilities are the answer.
+`json`: the model writes freely. `constrained`: it fills in the skeleton of the answer. `readout`
+and `decision`: it is asked for one letter, and the letters' probabilities are the answer.
 """
 
 import math
@@ -28,12 +28,15 @@ from harness.prompts.readout import letters, stated
 class Choice:
     """Chooses the next tokens of some answers: the likeliest, or one drawn at a temperature.
 
-    Draws are keyed by the prompt and the answer's number, so other requests, order and a resume change none.
+    Draws are keyed by the prompt and the answer's number, so other requests,
+    order and a resume change none.
     """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
-        self.first_at_s: float | None = None  # when the first token was chosen, by `time.perf_counter`
-        self.rounds = 0  # calls of `next`: the number of chosen tokens of an answer that is asked alone
+        # when the first token was chosen, by `time.perf_counter`
+        self.first_at_s: float | None = None
+        # calls of `next`: the number of chosen tokens of an answer that is asked alone
+        self.rounds = 0
         self._drawn = {
             place: (request.temperature, noise.generator("answer", tuple(ids), request.sample))
             for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
@@ -44,7 +47,9 @@ class Choice:
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
     ) -> list[int]:
-        """Choose the next token of the request at each place, in a session, among some tokens (None: all)."""
+        """Choose the next token of the request at each place, in a session,
+        among some tokens (None: all).
+        """
         chosen = session.argmax(among)
         if self._drawn:
             log_p = session.log_probs()
@@ -79,11 +84,15 @@ class Decoding:
             return 1
         return request.max_tokens
 
-    def answer(self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]) -> list[Completion]:
-        """Answer requests of one answer mode, for each of which there is `room`; count no prompt tokens.
+    def answer(
+        self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]
+    ) -> list[Completion]:
+        """Answer requests of one answer mode, for each of which there is `room`;
+        count no prompt tokens.
 
-        `orders` has each request's rendered messages, in tokens; of a read-out over several orders the
-        messages with each, equally many. The first token of a read-out comes when it is complete.
+        `orders` has each request's rendered messages, in tokens; of a read-out over several orders
+        the messages with each, equally many. The first token of a read-out comes when it is
+        complete.
         """
         start_s = time.perf_counter()
         prompts = [prompt for prompt, *_ in orders]
@@ -101,7 +110,9 @@ class Decoding:
         token_s = per_token_s(seconds, first_s, choice.rounds)
         return [replace(answers[0], seconds=seconds, first_token_s=first_s, token_s=token_s)]
 
-    def _free(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Completion]:
+    def _free(
+        self, session: Session, requests: Sequence[Request], choice: Choice
+    ) -> list[Completion]:
         written: list[list[int]] = [[] for _ in requests]
         # An answer that is asked alone is timed, token by token.
         drafts = self._drafts(requests) if len(requests) > 1 and not choice.draws else None
@@ -135,12 +146,17 @@ class Decoding:
     def _follow(
         self, session: Session, drafts: Drafts, written: dict[int, tuple[Request, list[int]]]
     ) -> None:
-        """Append the last token of each answer to the session, and to both what is guessed rightly."""
+        """Append the last token of each answer to the session,
+        and to both what is guessed rightly.
+        """
         guesses = []
         for request, tokens in written.values():
             drafts.learn(request.shape, tokens)
-            guesses.append(drafts.after(request.shape, tokens, request.max_tokens - len(tokens) - 1))
-        width = sorted(map(len, guesses))[len(guesses) // 2]  # no wider than half of the answers fill
+            guesses.append(
+                drafts.after(request.shape, tokens, request.max_tokens - len(tokens) - 1)
+            )
+        # no wider than half of the answers fill
+        width = sorted(map(len, guesses))[len(guesses) // 2]
         guesses = [guess[:width] for guess in guesses]
         counts = session.follow([tokens[-1:] for _, tokens in written.values()], guesses)
         for (_, tokens), guess, count in zip(written.values(), guesses, counts, strict=True):
@@ -149,7 +165,9 @@ class Decoding:
     def _over(self, tokens: list[int], request: Request) -> bool:
         return tokens[-1] in self._engine.stops or len(tokens) == request.max_tokens
 
-    def _constrained(self, session: Session, requests: Sequence[Request], choice: Choice) -> list[Completion]:
+    def _constrained(
+        self, session: Session, requests: Sequence[Request], choice: Choice
+    ) -> list[Completion]:
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
         done: dict[int, Filled] = {}
@@ -173,7 +191,8 @@ class Decoding:
         if skeleton.most_tokens > request.max_tokens:
             raise UserError(
                 f"{self._chat.shown}: a constrained {request.role} answer takes "
-                f"{skeleton.most_tokens} tokens, and {request.max_tokens} are allowed; raise max_new_tokens"
+                f"{skeleton.most_tokens} tokens, and {request.max_tokens} are allowed; raise "
+                "max_new_tokens"
             )
         return skeleton
 
@@ -190,7 +209,9 @@ class Decoding:
         else:  # what all orders of a question begin with is read once, and then the rest of each
             shared = [common_length(each) for each in orders]
             heads = [each[0][:length] for each, length in zip(orders, shared, strict=True)]
-            rests = [[ids[length:] for ids in each] for each, length in zip(orders, shared, strict=True)]
+            rests = [
+                [ids[length:] for ids in each] for each, length in zip(orders, shared, strict=True)
+            ]
             with closing(self._engine.begin(heads, tokens)) as session:
                 readings = session.ends(rests, tokens)
         completions = []
@@ -201,23 +222,33 @@ class Decoding:
         return completions
 
     def _letter_tokens(self, actions: tuple[str, ...]) -> list[list[int]]:
-        """Return the tokens of each letter, in all its spellings: with a blank before it, and without."""
+        """Return the tokens of each letter, in all its spellings:
+        with a blank before it, and without.
+        """
         if (names := letters(actions)) not in self._letters:
             encodings = [tokens_after(self._chat, "\n", letter) for letter in names]
-            if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(encodings):
+            if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(
+                encodings
+            ):
                 raise UserError(
                     f"{self._chat.shown}: its tokenizer has no single token for each of "
                     f"the letters {names}; use --answer json"
                 )
             known = self._chat.spellings(names)
             self._letters[names] = [
-                sorted({token, *known[letter]}) for (token,), letter in zip(encodings, names, strict=True)
+                sorted({token, *known[letter]})
+                for (token,), letter in zip(encodings, names, strict=True)
             ]
         return self._letters[names]
 
 
 def _completion(
-    request: Request, text: str, tokens: int, batch_size: int, reason: FinishReason = "stop", **details: Any
+    request: Request,
+    text: str,
+    tokens: int,
+    batch_size: int,
+    reason: FinishReason = "stop",
+    **details: Any,
 ) -> Completion:
     return Completion(request.id, text, None, tokens, reason, None, batch_size, **details)
 
@@ -245,12 +276,14 @@ def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[i
 
 
 def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
-    """Return the token of a draw from softmax(log_p / temperature) over the tokens of `among` (None: all).
+    """Return the token of a draw from softmax(log_p / temperature) over the tokens of `among`
+    (None: all).
 
     `u` is the uniform draw, in [0, 1). The temperature is above 0.
     """
     tokens = np.arange(len(log_p)) if among is None else np.unique(among)
     with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0
         ends = np.exp((log_p[tokens] - log_p[tokens].max()) / temperature).cumsum()
-    last = np.searchsorted(ends, ends[-1])  # rounding may take a draw beyond the last possible token
+    # rounding may take a draw beyond the last possible token
+    last = np.searchsorted(ends, ends[-1])
     return int(tokens[min(np.searchsorted(ends, u * ends[-1], side="right"), last)])

@@ -35,7 +35,9 @@ def open(card: Card, **_: Any) -> "DriverBackend":
 
 
 class DriverBackend:
-    """Answers with all probability on the driver's action; `uniform` with the same on every action."""
+    """Answers with all probability on the driver's action;
+    `uniform` with the same on every action.
+    """
 
     def __init__(self, driver: str) -> None:
         self.driver = driver
@@ -49,7 +51,9 @@ class DriverBackend:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
-        asked = [(self._driver(scenario, request), request.view, request.truth) for request in requests]
+        asked = [
+            (self._driver(scenario, request), request.view, request.truth) for request in requests
+        ]
         return [
             self._answer(request, [action])
             for request, action in zip(requests, choices(scenario, asked), strict=True)
@@ -63,7 +67,8 @@ class DriverBackend:
         actions = open_loop(scenario) if self.driver == OPEN_LOOP else (always,) if always else None
         if actions is None or request.view is None:
             raise UserError(
-                f"driver {self.driver}: none was chosen for {printable(scenario.name)}; give brake or cruise"
+                f"driver {self.driver}: none was chosen for {printable(scenario.name)}; give brake "
+                "or cruise"
             )
         return actions[min(request.view.step, len(actions) - 1)]
 
@@ -73,9 +78,16 @@ class DriverBackend:
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """Return the driver and its answer version, with what the choice of `constant` follows from."""
+        """Return the driver and its answer version,
+        with what the choice of `constant` follows from.
+        """
         chosen = {}
         if self.driver in CHOSEN:
             name, file = CHOSEN[self.driver]
             chosen = {name: sha256_file(file, "record")}
-        return {"engine": "driver", "answers": BUILT_IN["driver"].answers, "driver": self.driver, **chosen}
+        return {
+            "engine": "driver",
+            "answers": BUILT_IN["driver"].answers,
+            "driver": self.driver,
+            **chosen,
+        }

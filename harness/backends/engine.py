@@ -1,6 +1,7 @@
 """The interface of an engine: read tokens, and give the distribution of the next one.
 
-The answer modes are implemented once, on top of it; an engine knows nothing of JSON, letters or roles.
+The answer modes are implemented once, on top of it;
+an engine knows nothing of JSON, letters or roles.
 """
 
 import math
@@ -17,22 +18,31 @@ class Session(Protocol):
     """n sequences that advance together, each with a distribution over its next token."""
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Return the most likely next token of each sequence among some (None: all); the lowest of equals."""
+        """Return the most likely next token of each sequence among some (None: all);
+        the lowest of equals.
+        """
         ...
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        """Return log-probabilities over the vocabulary of some next tokens (None: all), (n, tokens)."""
+        """Return log-probabilities over the vocabulary of some next tokens (None: all), (n,
+        tokens).
+        """
         ...
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append tokens to each sequence. An empty chunk leaves a sequence and its distribution unchanged."""
+        """Append tokens to each sequence.
+        An empty chunk leaves a sequence and its distribution unchanged.
+        """
         ...
 
-    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
-        """Append a chunk to each sequence, and as much of its guess as is its own likeliest next tokens.
+    def follow(
+        self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]
+    ) -> list[int]:
+        """Append a chunk to each sequence,
+        and as much of its guess as is its own likeliest next tokens.
 
-        A chunk is not empty, a guess may be. Returns how many tokens of each guess were appended; an engine
-        that checks none appends none.
+        A chunk is not empty, a guess may be. Returns how many tokens of each guess were appended;
+        an engine that checks none appends none.
         """
         self.advance(chunks)
         return [0] * len(guesses)
@@ -40,8 +50,8 @@ class Session(Protocol):
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         """Return the log-probabilities of some tokens after each of some chunks of each sequence.
 
-        Each sequence has equally many chunks, none empty, and can only be closed then. Shape (n, chunks,
-        tokens).
+        Each sequence has equally many chunks, none empty, and can only be closed then.
+        Shape (n, chunks, tokens).
         """
         ...
 
@@ -60,17 +70,19 @@ class Engine(Protocol):
     stops: Sequence[int]  # token ids that end an answer, sorted
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture in a prompt. Raises ValueError if the model takes none.
+        """Return the tokens that stand for a picture in a prompt.
+        Raises ValueError if the model takes none.
 
-        Tokens that the vision encoder fills are negative, equal for equal pixels and different for another
-        picture; markers around them are tokens of the vocabulary.
+        Tokens that the vision encoder fills are negative, equal for equal pixels and different for
+        another picture; markers around them are tokens of the vocabulary.
         """
         ...
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
         """Read some prompts, none of them empty; their common beginning is computed once.
 
-        The logits of the tokens in `exact` are computed in float32, whatever the weights' number format.
+        The logits of the tokens in `exact` are computed in float32,
+        whatever the weights' number format.
         """
         ...
 
@@ -81,7 +93,9 @@ LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of promp
 
 
 def check_logits(largest: Sequence[float]) -> None:
-    """Raise ArithmeticError if a sequence's largest logit is not finite: its answer would mean nothing."""
+    """Raise ArithmeticError if a sequence's largest logit is not finite:
+    its answer would mean nothing.
+    """
     if not all(map(math.isfinite, largest)):
         raise ArithmeticError(
             "the logits are no numbers; the weights are damaged, or too large for this dtype"
@@ -91,7 +105,9 @@ def check_logits(largest: Sequence[float]) -> None:
 def common_length(sequences: Sequence[list[int]]) -> int:
     """Return the length of the common beginning of one or more sequences."""
     first, last = min(sequences), max(sequences)  # all that sort between these two begin as both do
-    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+    return next(
+        (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first)
+    )
 
 
 def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
@@ -100,7 +116,9 @@ def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Yield the places of sequences in groups with longer common beginnings, where that saves tokens."""
+    """Yield the places of sequences in groups with longer common beginnings,
+    where that saves tokens.
+    """
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]
     yield from _split(order, shared)

@@ -11,8 +11,21 @@ from typing import Any
 
 from harness.core.files import opened
 
-LONGEST = 1 << 26  # bytes of keys and values that are read: a vocabulary of 256 000 tokens needs a third
-_NUMBERS = {0: "B", 1: "b", 2: "H", 3: "h", 4: "I", 5: "i", 6: "f", 7: "?", 10: "Q", 11: "q", 12: "d"}
+# bytes of keys and values that are read: a vocabulary of 256 000 tokens needs a third
+LONGEST = 1 << 26
+_NUMBERS = {
+    0: "B",
+    1: "b",
+    2: "H",
+    3: "h",
+    4: "I",
+    5: "i",
+    6: "f",
+    7: "?",
+    10: "Q",
+    11: "q",
+    12: "d",
+}
 _TEXT, _ARRAY = 8, 9
 
 
@@ -24,11 +37,14 @@ class ModelFacts:
     licence: str | None = None  # SPDX id of its licence, or its name, as the file writes it
     context_tokens: int | None = None  # the longest sequence that it was trained for
     template: str | None = None  # its chat template
-    decision: str | None = None  # the kind of decision model that it is, such as `kev`; None if it is none
+    # the kind of decision model that it is, such as `kev`; None if it is none
+    decision: str | None = None
 
 
 def read_facts(file: Path) -> ModelFacts:
-    """Read what a file states of its model; nothing if it is no GGUF. Raises OSError if it does not open."""
+    """Read what a file states of its model; nothing if it is no GGUF.
+    Raises OSError if it does not open.
+    """
     try:
         values = read_metadata(file)
     except ValueError:
@@ -42,13 +58,16 @@ def read_facts(file: Path) -> ModelFacts:
     context_tokens = context if isinstance(context, int) else None
     template = text("tokenizer.chat_template")
     decision = text(f"{values.get('general.architecture')}.decision.type")
-    return ModelFacts(text("general.name"), text("general.license"), context_tokens, template, decision)
+    return ModelFacts(
+        text("general.name"), text("general.license"), context_tokens, template, decision
+    )
 
 
 def read_metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
     """Read the keys and values of a GGUF file; arrays are skipped unless they are asked for.
 
-    Raises OSError if it cannot be opened, and ValueError if it is no GGUF or they are longer than `LONGEST`.
+    Raises OSError if it cannot be opened,
+    and ValueError if it is no GGUF or they are longer than `LONGEST`.
     """
     with opened(file, "weights") as data:
         head = data.read(LONGEST)
@@ -77,7 +96,8 @@ def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:
     at += 12
     if element == _TEXT:
         texts = []
-        for _ in range(count):  # each has eight bytes at least, so that a false count ends with the bytes
+        # each has eight bytes at least, so that a false count ends with the bytes
+        for _ in range(count):
             if arrays:
                 text, at = _text(head, at)
                 texts.append(text)
@@ -87,7 +107,9 @@ def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:
     size = struct.calcsize(f"<{_number(element)}") * count
     if at + size > len(head):
         raise ValueError("an array is longer than the file")
-    return list(struct.unpack_from(f"<{count}{_number(element)}", head, at)) if arrays else None, at + size
+    return list(
+        struct.unpack_from(f"<{count}{_number(element)}", head, at)
+    ) if arrays else None, at + size
 
 
 def _text(head: bytes, at: int) -> tuple[str, int]:

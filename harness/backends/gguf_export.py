@@ -1,7 +1,7 @@
 """A saved Qwen3 checkpoint as a GGUF file, which llama.cpp reads; a Qwen3-VL's as two.
 
-The second is its projector: the vision encoder, and what leads into the text part. Keys and names there are
-those of llama.cpp's `conversion/qwen3vl.py` and `tools/mtmd/clip-impl.h`.
+The second is its projector: the vision encoder, and what leads into the text part. Keys and names
+there are those of llama.cpp's `conversion/qwen3vl.py` and `tools/mtmd/clip-impl.h`.
 """
 
 import math
@@ -48,12 +48,13 @@ _DEEPSTACK = {"norm": "norm", "linear_fc1": "fc1", "linear_fc2": "fc2"}
 
 
 def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
-    """Write a Qwen3 folder as a GGUF file, whole or not at all; of a Qwen3-VL its projector beside it.
+    """Write a Qwen3 folder as a GGUF file, whole or not at all;
+    of a Qwen3-VL its projector beside it.
 
-    The folder has config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json, a chat
-    template and, of a Qwen3-VL, preprocessor_config.json. The projector is `mmproj-` and the name of `out`.
-    `dtype` is that of matrices; vectors are always F32. Raises UserError for another architecture or
-    tokenizer, and for files that are not whole.
+    The folder has config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json, a
+    chat template and, of a Qwen3-VL, preprocessor_config.json. The projector is `mmproj-` and the
+    name of `out`. `dtype` is that of matrices; vectors are always F32. Raises UserError for another
+    architecture or tokenizer, and for files that are not whole.
     """
     shown = f"checkpoint {printable(checkpoint)}"
     try:
@@ -67,7 +68,9 @@ def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
             if saved.vision:
                 part = files.enter_context(replacing(projector_of(out)))
                 describe = partial(_describe_projector, saved.vision, name)
-                _write(part, checkpoint, _projector_names(saved.vision), dtype, shown, "clip", describe)
+                _write(
+                    part, checkpoint, _projector_names(saved.vision), dtype, shown, "clip", describe
+                )
     except UserError:
         raise
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
@@ -81,9 +84,14 @@ def projector_of(out: Path) -> Path:
 
 
 def _write(
-    part: Path, checkpoint: Path, names: Mapping[str, str], dtype: Dtype, shown: str, architecture: str,
+    part: Path,
+    checkpoint: Path,
+    names: Mapping[str, str],
+    dtype: Dtype,
+    shown: str,
+    architecture: str,
     describe: Callable[[Any, int], None],
-) -> None:  # fmt: skip
+) -> None:
     from gguf import GGUFWriter, LlamaFileType
 
     writer = GGUFWriter(part, architecture)
@@ -101,7 +109,9 @@ def _write(
             with np.errstate(over="ignore"):
                 converted = _frame(name, numbers(tensor)).astype(kind)
             if not np.isfinite(converted).all():
-                raise UserError(f"{shown}: {name} has numbers past the range of {dtype}; export it as F32")
+                raise UserError(
+                    f"{shown}: {name} has numbers past the range of {dtype}; export it as F32"
+                )
             writer.write_tensor_data(converted)
     finally:
         writer.close()
@@ -145,7 +155,9 @@ def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) 
 
 
 def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[list[str], list[int]]:
-    """Return texts and types of all tokens, by id; rows of the embedding without a token are unused."""
+    """Return texts and types of all tokens, by id;
+    rows of the embedding without a token are unused.
+    """
     from gguf import TokenType
 
     tokens = {i: (text, TokenType.NORMAL) for text, i in tokenizer["model"]["vocab"].items()}
@@ -153,7 +165,9 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
         kind = TokenType.CONTROL if token["special"] else TokenType.USER_DEFINED
         tokens[token["id"]] = (token["content"], kind)
     if max(tokens) >= rows:
-        raise UserError(f"{shown}: its tokenizer has {max(tokens) + 1} tokens and the model only {rows}")
+        raise UserError(
+            f"{shown}: its tokenizer has {max(tokens) + 1} tokens and the model only {rows}"
+        )
     by_row = [tokens.get(i, (f"[PAD{i}]", TokenType.UNUSED)) for i in range(rows)]
     return [text for text, _ in by_row], [int(kind) for _, kind in by_row]
 
@@ -165,7 +179,9 @@ def _names(saved: Saved) -> dict[str, str]:
     if not saved.config["tie_word_embeddings"]:  # else llama.cpp takes the embedding for it
         names["output"] = "lm_head"
     for i in range(saved.config["num_hidden_layers"]):
-        names |= {f"blk.{i}.{ours}": f"{within}.layers.{i}.{theirs}" for theirs, ours in _BLOCK.items()}
+        names |= {
+            f"blk.{i}.{ours}": f"{within}.layers.{i}.{theirs}" for theirs, ours in _BLOCK.items()
+        }
     return {f"{ours}.weight": f"{theirs}.weight" for ours, theirs in names.items()}
 
 
@@ -179,7 +195,9 @@ def _describe_projector(vision: Mapping[str, Any], name: str, writer: Any, file_
     writer.add_clip_has_vision_encoder(True)
     writer.add_clip_projector_type(VisionProjectorType.QWEN3VL)
     writer.add_vision_projection_dim(vision["out_hidden_size"])
-    writer.add_vision_image_size(math.isqrt(vision["num_position_embeddings"]) * vision["patch_size"])
+    writer.add_vision_image_size(
+        math.isqrt(vision["num_position_embeddings"]) * vision["patch_size"]
+    )
     writer.add_vision_patch_size(vision["patch_size"])
     writer.add_vision_spatial_merge_size(vision["spatial_merge_size"])
     writer.add_vision_embedding_length(vision["hidden_size"])
@@ -231,5 +249,7 @@ def _tensors(
 
 
 def _frame(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return weights as they are; of those of a video's two frames, (out, in, 2, y, x), the name's frame."""
+    """Return weights as they are; of those of a video's two frames, (out, in, 2, y, x),
+    the name's frame.
+    """
     return values[:, :, int(name.endswith(".1"))] if values.ndim == 5 else values

@@ -1,4 +1,6 @@
-"""The backend of language models that run in this process, on any engine: batching, overflow and errors."""
+"""The backend of language models that run in this process, on any engine:
+batching, overflow and errors.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -37,9 +39,10 @@ class LanguageModel:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in the same order.
 
-        `completion_tokens` counts all written tokens, with the stop token and fixed tokens and without
-        padding. If a batch fails, its requests are asked again one at a time. Raises UserError if the
-        tokenizer or `max_tokens` leaves no room for the answer mode, or the template refuses the messages.
+        `completion_tokens` counts all written tokens, with the stop token and fixed tokens and
+        without padding. If a batch fails, its requests are asked again one at a time. Raises
+        UserError if the tokenizer or `max_tokens` leaves no room for the answer mode, or the
+        template refuses the messages.
         """
         done: dict[int, Completion] = {}
         fitting = []
@@ -66,9 +69,14 @@ class LanguageModel:
         if len(after) != 1:
             raise UserError(
                 f"{self.chat.shown}: its chat template writes {len(after)} places for one "
-                "picture; give a model that takes pictures, with the template that it was trained with"
+                "picture; give a model that takes pictures, with the template that it was trained "
+                "with"
             )
-        return [*self.chat.encode(before), *self.engine.look(request.image), *self.chat.encode(after[0])]
+        return [
+            *self.chat.encode(before),
+            *self.engine.look(request.image),
+            *self.chat.encode(after[0]),
+        ]
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
@@ -82,13 +90,20 @@ class LanguageModel:
         return self.engine.identity()
 
     def _batches(self, prompts: list[_Prompt]) -> Iterator[list[_Prompt]]:
-        """Yield batches of prompts that have one answer mode, similar beginnings and similar lengths.
+        """Yield batches of prompts that have one answer mode,
+        similar beginnings and similar lengths.
 
         Prompts of one role begin alike, since they have the same system prompt.
         """
 
         def kind(p: _Prompt) -> tuple[str, int, str, int, int]:
-            return p.request.answer, len(p.orders), p.request.role, p.request.max_tokens, len(p.orders[0])
+            return (
+                p.request.answer,
+                len(p.orders),
+                p.request.role,
+                p.request.max_tokens,
+                len(p.orders[0]),
+            )
 
         for _, group in groupby(sorted(prompts, key=kind, reverse=True), lambda p: kind(p)[:2]):
             same_mode = list(group)
@@ -99,7 +114,8 @@ class LanguageModel:
         answers = self._try(batch)
         if isinstance(answers, list):
             return answers
-        # `_try` has returned, so nothing refers to the failed batch and an engine can free its memory.
+        # `_try` has returned, so nothing refers to the failed batch and an engine can free its
+        # memory.
         alone = [self._try([prompt]) for prompt in batch]
         return [
             a[0] if isinstance(a, list) else failed(p.request, a, len(p.orders[0]))
@@ -112,4 +128,6 @@ class LanguageModel:
             answers = self._decoding.answer([p.request for p in batch], [p.orders for p in batch])
         except Exception as error:  # an engine may fail in any way; its message is data
             return f"{type(error).__name__}: {one_line(error)}"
-        return [replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)]
+        return [
+            replace(answer, prompt_tokens=p.read) for p, answer in zip(batch, answers, strict=True)
+        ]

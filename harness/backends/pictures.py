@@ -1,7 +1,8 @@
 """The pictures that tokens of prompts stand for, and the encodings of those that were used last.
 
-A picture's tokens are negative numbers, the same in every engine and process: digits of its digest, then bits
-of the token's place in it. It is encoded when they are first read, as part of an answer's time.
+A picture's tokens are negative numbers, the same in every engine and process: digits of its digest,
+then bits of the token's place in it. It is encoded when they are first read, as part of an answer's
+time.
 """
 
 from collections import OrderedDict
@@ -12,7 +13,8 @@ from weakref import WeakValueDictionary
 from harness.core.image import Image
 
 T = TypeVar("T")
-KEPT = 64  # encodings that are kept: those of a chunk of requests, for repair turns and fusion calls
+# encodings that are kept: those of a chunk of requests, for repair turns and fusion calls
+KEPT = 64
 _PLACE_BITS, _DIGITS = 16, 10
 
 
@@ -44,13 +46,17 @@ class Pictures(Generic[T]):
     def image(self, number: int) -> Image:
         """Return a picture. Raises LookupError if it is not alive."""
         if (image := self._images.get(number)) is None:
-            raise LookupError("a picture is gone that a prompt's tokens stand for; look at it again")
+            raise LookupError(
+                "a picture is gone that a prompt's tokens stand for; look at it again"
+            )
         return image
 
     def encodings(self, numbers: Sequence[int]) -> list[T]:
         """Return the encodings of some pictures; those that are not kept are encoded together."""
         if new := [number for number in dict.fromkeys(numbers) if number not in self._encoded]:
-            self._encoded |= zip(new, self._encode([self.image(number) for number in new]), strict=True)
+            self._encoded |= zip(
+                new, self._encode([self.image(number) for number in new]), strict=True
+            )
         for number in numbers:
             self._encoded.move_to_end(number)
         encodings = [self._encoded[number] for number in numbers]

@@ -16,7 +16,9 @@ class Price:
 
     input: _Amount  # of those that the model reads
     output: _Amount  # of those that it writes, thoughts included
-    currency: Annotated[str, Meta(pattern=r"^[A-Z]{3}\Z", description="three capitals, such as USD")]
+    currency: Annotated[
+        str, Meta(pattern=r"^[A-Z]{3}\Z", description="three capitals, such as USD")
+    ]
 
     def of(self, read: float, written: float) -> float:
         """Return what so many tokens cost."""

@@ -1,8 +1,10 @@
-"""The proxy backend: a deterministic rule in place of a language model, which reads the viewer's scene graph.
+"""The proxy backend: a deterministic rule in place of a language model,
+which reads the viewer's scene graph.
 
-It exercises the whole pipeline without a model. It plans on what its viewer sees, as `local-view` does, and
-is less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not fitted: its scores say
-something about the harness and nothing about any language model. Its card may make it fail at known rates.
+It exercises the whole pipeline without a model. It plans on what its viewer sees, as `local-view`
+does, and is less sure the more of the ego's sectors it cannot see. Its numbers are chosen, not
+fitted: its scores say something about the harness and nothing about any language model. Its card
+may make it fail at known rates.
 """
 
 import re
@@ -22,7 +24,8 @@ from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
 SURE_SLOWER = 0.90  # probability of SLOWER if the viewer sees a conflict that calls for it
-LEAST_DOUBT, MOST_DOUBT = 0.05, 0.38  # probability of SLOWER with every sector in sight, and with one hidden
+# probability of SLOWER with every sector in sight, and with one hidden
+LEAST_DOUBT, MOST_DOUBT = 0.05, 0.38
 OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor the planned one
 
 
@@ -44,7 +47,9 @@ class Proxy:
         completions = []
         for request, text in zip(requests, answers(requests), strict=True):
             finish_reason: FinishReason = "stop"
-            how, slow_s = draw_failure(self._failures, request.id) if self._failures else (None, 0.0)
+            how, slow_s = (
+                draw_failure(self._failures, request.id) if self._failures else (None, 0.0)
+            )
             if how:
                 text, finish_reason = spoil(text, how, request.actions)
             completions.append(
@@ -117,15 +122,20 @@ def _reason(view: SceneGraph) -> str:
     for conflict in view.conflicts:
         if conflict.other.braking and conflict.kind == "ahead":
             away_m = conflict.ego.arc_m
-            return f"{conflict.vehicle} brakes {away_m:.0f} m ahead of the ego, {conflict.lane} lane."
+            return (
+                f"{conflict.vehicle} brakes {away_m:.0f} m ahead of the ego, {conflict.lane} lane."
+            )
     if view.conflicts:
         first = min(view.conflicts, key=lambda conflict: abs(conflict.other.arc_m))
-        return f"{first.vehicle} from {first.sector} {first.other.arc_m:.0f} m before the ego's path."
+        return (
+            f"{first.vehicle} from {first.sector} {first.other.arc_m:.0f} m before the ego's path."
+        )
     return f"Nothing on the ego's path; hidden: {', '.join(view.occluded) or 'none'}."
 
 
 def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float]:
-    """Draw how a request's text fails (None if it does not), and by how many seconds its answer is slow.
+    """Draw how a request's text fails (None if it does not),
+    and by how many seconds its answer is slow.
 
     The draw depends on the id only, so batch, order, prompt and condition do not change it.
     """

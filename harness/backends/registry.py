@@ -27,35 +27,43 @@ if TYPE_CHECKING:
 class Capabilities:
     """What an engine can do. Other code tests these capabilities, never an engine's name."""
 
-    language_model: bool = True  # whose answers can be timed, and which can be asked to fuse messages
+    # whose answers can be timed, and which can be asked to fuse messages
+    language_model: bool = True
     answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout", "decision")
     thinks: Literal["always", "card", "never"] = "always"  # if its `card` says so
-    renders: bool = True  # is `Rendering`: its answers can be cached, a check can show what its model reads
-    has_weights: bool = False  # loads weights, which can be pulled, and has a device and a number format
+    # is `Rendering`: its answers can be cached, a check can show what its model reads
+    renders: bool = True
+    # loads weights, which can be pulled, and has a device and a number format
+    has_weights: bool = False
     asks_helpers: bool = True  # whether helpers are asked as well as the ego
     closed_loop: bool = True  # whether it answers for new scenes and not only for recorded ones
     own_latency: bool = False  # is `Timed`: its answers were timed earlier
     reference: bool = False  # whether it is a driver that a report compares models with
-    samples: bool = False  # whether it heeds a request's `temperature` and `sample` (never if it is `bare`)
+    # whether it heeds a request's `temperature` and `sample` (never if it is `bare`)
+    samples: bool = False
 
 
 @dataclass(frozen=True)
 class Registration:
     """One engine."""
 
-    opens: str  # `module:function`, called with a card and the options of `open_backend`; returns a backend
+    # `module:function`, called with a card and the options of `open_backend`; returns a backend
+    opens: str
     capabilities: Capabilities  # what the engine can do
-    # the version of its answers, which its `identity()` states: it goes up when the engine answers a request
-    # otherwise than before, which tests/conformance/test_answer_versions.py notices
+    # the version of its answers, which its `identity()` states: it goes up when the engine answers
+    # a request otherwise than before, which tests/conformance/test_answer_versions.py notices
     answers: int = 1
-    card_keys: tuple[str, ...] = ()  # card keys that this engine understands and not every engine does
+    # card keys that this engine understands and not every engine does
+    card_keys: tuple[str, ...] = ()
     required_keys: tuple[str, ...] = ()  # such keys that its cards must have
     packages: Mapping[str, str] = field(default_factory=dict)  # that it needs, by the module's name
     install: str = ""  # the command that installs them
-    # For an engine that has weights, `module:function` of a card, each empty if there is no such thing:
+    # For an engine that has weights, `module:function` of a card, each empty if there is no such
+    # thing:
     finds: str = ""  # returns the path of its weights, or raises UserError
     prepares: str = ""  # makes weights ready that were just fetched
-    sees: str = ""  # returns the tokens that its image processor makes of a picture, without loading weights
+    # returns the tokens that its image processor makes of a picture, without loading weights
+    sees: str = ""
 
     @property
     def allowed_keys(self) -> tuple[str, ...]:
@@ -73,7 +81,8 @@ BUILT_IN: Mapping[str, Registration] = {
         card_keys=("privileged",),
     ),
     "replay": Registration(
-        "harness.backends.replay:open", Capabilities(renders=False, closed_loop=False, own_latency=True)
+        "harness.backends.replay:open",
+        Capabilities(renders=False, closed_loop=False, own_latency=True),
     ),
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
@@ -98,7 +107,8 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True),
-        answers=2,  # 2: an answer that was broken off is none, a refusal and parts of a content are read
+        # 2: an answer that was broken off is none, a refusal and parts of a content are read
+        answers=2,
         card_keys=("vision", "system", "price"),
         required_keys=("weights", "server"),
     ),
@@ -126,7 +136,9 @@ ENGINES: Plugins[Registration] = Plugins("swarmdrive.backends", Registration, BU
 
 
 def registration(engine: str) -> Registration:
-    """Return the registration of an engine. Raises UserError if there is none, or a plug-in fails."""
+    """Return the registration of an engine.
+    Raises UserError if there is none, or a plug-in fails.
+    """
     if (entry := ENGINES.get(engine)) is None:
         raise unknown("engine", engine, ENGINES)
     return entry
@@ -147,13 +159,16 @@ def open_backend(
 ) -> Backend:
     """Open the backend of a card and load its weights; engines without weights ignore the options.
 
-    The device is `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any. `dtype` is a number format
-    instead of the card's; `batch_size` the most requests that go through the engine together. Raises
-    UserError if a package or the weights are missing, an option is wrong, or a file does not load.
+    The device is `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any. `dtype` is a number
+    format instead of the card's; `batch_size` the most requests that go through the engine
+    together. Raises UserError if a package or the weights are missing, an option is wrong, or a
+    file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
-        raise UserError(f"{card.shown} needs {package}, which is not installed; run `{engine.install}`")
+        raise UserError(
+            f"{card.shown} needs {package}, which is not installed; run `{engine.install}`"
+        )
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     options = {"device": device, "dtype": dtype, "batch_size": batch_size}
@@ -167,10 +182,12 @@ def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int)
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
 
-# Keyed by the process: a forked one inherits its parent's backend, and two that use one pipe would read each
-# other's answers.
+# Keyed by the process: a forked one inherits its parent's backend, and two that use one pipe would
+# read each other's answers.
 @lru_cache(maxsize=8)
-def _opened_in(process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
+def _opened_in(
+    process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int
+) -> Backend:
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 
 
@@ -183,7 +200,9 @@ def import_object(place: str) -> Any:
 def missing_package(engine: str) -> str | None:
     """Return the first package that an engine needs and that is not installed; None if all are."""
     packages = registration(engine).packages
-    return next((package for module, package in packages.items() if find_spec(module) is None), None)
+    return next(
+        (package for module, package in packages.items() if find_spec(module) is None), None
+    )
 
 
 def missing(card: "Card") -> str | None:
@@ -199,13 +218,17 @@ def missing(card: "Card") -> str | None:
 
 
 def locate(card: "Card") -> Path:
-    """Return where the weights of a card lie for its engine. Raises UserError if they are not found."""
+    """Return where the weights of a card lie for its engine.
+    Raises UserError if they are not found.
+    """
     where: Path = import_object(registration(card.engine).finds)(card)
     return where
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Return the tokens that a card's image processor makes of its picture; None if it is not installed."""
+    """Return the tokens that a card's image processor makes of its picture;
+    None if it is not installed.
+    """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None
     tokens: int = import_object(sees)(card)

@@ -1,4 +1,6 @@
-"""The replay backend: answers from an earlier run, to score a changed parser, rule or mix without a model."""
+"""The replay backend: answers from an earlier run, to score a changed parser,
+rule or mix without a model.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -24,8 +26,8 @@ _KEPT = [field.name for field in fields(Completion)[2:] if field.name != "server
 def open(card: Card, **_: Any) -> "Replay":
     """Open the run folder that a card names.
 
-    Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego only, or
-    lacks answers that no run can do without.
+    Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego
+    only, or lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
     engine = ENGINES.get(str(run.manifest.model.get("engine")))
@@ -35,15 +37,18 @@ def open(card: Card, **_: Any) -> "Replay":
             f"run it again with --model {printable(run.manifest.model['name'])}"
         )
     if reason := why(run.path):
-        raise UserError(f"{printable(run.path)} lacks answers, so nothing replays it: {reason}; run it again")
+        raise UserError(
+            f"{printable(run.path)} lacks answers, so nothing replays it: {reason}; run it again"
+        )
     return Replay(run)
 
 
 class Replay:
-    """Looks up answers by scene and viewer. A prompt that was never asked is an error and not a guess.
+    """Looks up answers by scene and viewer.
+    A prompt that was never asked is an error and not a guess.
 
-    If other decisions lead to a decision point that the run did not reach, the run's model is asked; its
-    identity must be the same.
+    If other decisions lead to a decision point that the run did not reach,
+    the run's model is asked; its identity must be the same.
     """
 
     def __init__(self, run: Run) -> None:
@@ -74,20 +79,28 @@ class Replay:
         return answer if answer and (answer.first or not request.id.endswith(AGAIN)) else None
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
-        """Open the model that answered in a role. Raises UserError if it cannot be asked these requests."""
+        """Open the model that answered in a role.
+        Raises UserError if it cannot be asked these requests.
+        """
         manifest, shown = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
-            # A run answers the first step of each of its episodes; only blind answers may be missing, and
-            # those of helpers that no condition asked.
+            # A run answers the first step of each of its episodes; only blind answers may be
+            # missing, and those of helpers that no condition asked.
             unasked = role == "helper" and manifest.settings.ask == "used"
             first_step = _step(request.id) == "0" and not unasked and not request.id.endswith(BLIND)
-            again = request.id.endswith(AGAIN)  # a changed parser may ask for a repair that the run did not
+            # a changed parser may ask for a repair that the run did not
+            again = request.id.endswith(AGAIN)
             foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id
             if (foreign and not again) or (role == "helper" and len(manifest.helpers) > 1):
                 raise UserError(
-                    f"{shown} holds no answer for {request.id}; replay a run of the same dataset and limit"
-                    + (", whose conditions delivered the same messages" if "+" in request.id else "")
+                    f"{shown} holds no answer for {request.id}; replay a run of the same dataset "
+                    "and limit"
+                    + (
+                        ", whose conditions delivered the same messages"
+                        if "+" in request.id
+                        else ""
+                    )
                     + (", made with --ask all" if unasked else "")
                 )
             self._check(request, agent)
@@ -95,7 +108,9 @@ class Replay:
             stated = convert(agent["model"], Card, f"{shown}: its model")
             lacking = f"{shown} holds no answer for {requests[0].id}"
             card = find_own(stated, (), lacking, "write one of that name, or make the run again")
-            model = open_backend(card, dtype=manifest.settings.dtype, batch_size=manifest.settings.batch_size)
+            model = open_backend(
+                card, dtype=manifest.settings.dtype, batch_size=manifest.settings.batch_size
+            )
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 helpers = manifest.identity.get("helpers")
@@ -112,18 +127,26 @@ class Replay:
         if request.bare:
             return request
         return replace(
-            request, temperature=manifest.settings.temperature, sample=manifest.settings.sampling_seed
+            request,
+            temperature=manifest.settings.temperature,
+            sample=manifest.settings.sampling_seed,
         )
 
     def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
         shown = printable(self._run.path)
         # The prompt's digest cannot tell: free and constrained answers have the same prompt.
         if agent["answer"] != request.answer:
-            raise UserError(f"{shown} was run with --answer {agent['answer']}; replay it with the same")
+            raise UserError(
+                f"{shown} was run with --answer {agent['answer']}; replay it with the same"
+            )
         if bool(request.orders) != (agent["answer"] in BARE and agent["letters"] == "cyclic"):
-            raise UserError(f"{shown} was run with --letters {agent['letters']}; replay it with the same")
+            raise UserError(
+                f"{shown} was run with --letters {agent['letters']}; replay it with the same"
+            )
         if request.flips and not agent["flip"]:
-            raise UserError(f"{shown} was run without --flip; leave it out, or make the run again with it")
+            raise UserError(
+                f"{shown} was run without --flip; leave it out, or make the run again with it"
+            )
         if request.thinking != agent["thinking"]:
             how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
             raise UserError(f"{shown} was run with thinking {how}")
@@ -131,13 +154,15 @@ class Replay:
     def _completion(self, request: Request, answer: Answer) -> Completion:
         agent = self._run.agent(answer)
         self._check(request, agent)
-        if self._run.actions != request.actions == self._run.actions[::-1]:  # only its likeliest was compared
+        # only its likeliest was compared
+        if self._run.actions != request.actions == self._run.actions[::-1]:
             return failed(request, "the run has no such answer")
         again = request.id.endswith(AGAIN)
         asked = digest(request.messages[: -2 if again else None]), request.image_sha256
         if asked != (answer.prompt_sha256, answer.image_sha256 or None):
             raise UserError(
-                f"{printable(self._run.path)} was asked {request.id} with another prompt or dataset; "
+                f"{printable(self._run.path)} was asked {request.id} with another prompt or "
+                "dataset; "
                 "replay it with that run's --prompt, --image and --dataset"
             )
         whole = Completion(request.id, answer.raw, **{name: answer.cell(name) for name in _KEPT})
@@ -164,7 +189,9 @@ class Kept(Replay):
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """Raise UserError: the run has no such answer."""
-        raise UserError(f"{printable(self._run.path)} holds no answer for {printable(requests[0].id)}")
+        raise UserError(
+            f"{printable(self._run.path)} holds no answer for {printable(requests[0].id)}"
+        )
 
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:

@@ -1,7 +1,7 @@
 """A saved Qwen3 or Qwen3-VL checkpoint, read from its files without torch or transformers.
 
-What llama.cpp would take otherwise than the checkpoint means it, without a word, is refused: another
-pre-tokeniser, another rope, a bias, another vision encoder.
+What llama.cpp would take otherwise than the checkpoint means it, without a word, is refused:
+another pre-tokeniser, another rope, a bias, another vision encoder.
 """
 
 import json
@@ -16,14 +16,23 @@ from harness.backends.tokens import QWEN2_SPLIT
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of
 
-# Where a file may say otherwise, and llama.cpp would not hear it. Its Unicode normalisation is none; NFC is
-# what Qwen's tokenizer does, and nothing to text that is composed already.
+# Where a file may say otherwise, and llama.cpp would not hear it. Its Unicode normalisation is
+# none; NFC is what Qwen's tokenizer does, and nothing to text that is composed already.
 _ONE_VALUE = {"attention_bias": False, "use_sliding_window": False, "hidden_act": "silu"}
-_SEEN = {"temporal_patch_size": 2, "spatial_merge_size": 2, "in_channels": 3,
-         "hidden_act": "gelu_pytorch_tanh"}  # fmt: skip
+_SEEN = {
+    "temporal_patch_size": 2,
+    "spatial_merge_size": 2,
+    "in_channels": 3,
+    "hidden_act": "gelu_pytorch_tanh",
+}
 _NORMALIZERS = (None, {"type": "NFC"})
 _PIXELS = "preprocessor_config.json"
-_SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_SPLIT}, "behavior": "Isolated", "invert": False}
+_SPLIT = {
+    "type": "Split",
+    "pattern": {"Regex": QWEN2_SPLIT},
+    "behavior": "Isolated",
+    "invert": False,
+}
 _BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
 
 
@@ -33,50 +42,69 @@ class Saved(NamedTuple):
     config: dict[str, Any]  # of the text part
     tokenizer: dict[str, Any]  # whole
     template: str  # of a chat
-    # config of the vision encoder, and its processor's `image_mean` and `image_std`; None if the model reads
-    # text only
+    # config of the vision encoder, and its processor's `image_mean` and `image_std`; None if the
+    # model reads text only
     vision: dict[str, Any] | None = None
 
 
 def read(checkpoint: Path, shown: str) -> Saved:
-    """Read the small files of a checkpoint; UserError if one is not there, or says what no GGUF can."""
+    """Read the small files of a checkpoint;
+    UserError if one is not there, or says what no GGUF can.
+    """
     texts = {
         name: text_of(checkpoint / name, "record")
-        for name in ("config.json", "tokenizer.json", "tokenizer_config.json", "chat_template.jinja", _PIXELS)
+        for name in (
+            "config.json",
+            "tokenizer.json",
+            "tokenizer_config.json",
+            "chat_template.jinja",
+            _PIXELS,
+        )
         if (checkpoint / name).is_file()
     }
     for name in ("config.json", "tokenizer.json", "model.safetensors"):
         if not (checkpoint / name).is_file():
-            raise UserError(f"{shown} has no {name}; give the folder of a saved model with its tokenizer")
+            raise UserError(
+                f"{shown} has no {name}; give the folder of a saved model with its tokenizer"
+            )
     config, tokenizer = json.loads(texts["config.json"]), json.loads(texts["tokenizer.json"])
-    template = texts.get("chat_template.jinja") or json.loads(texts.get("tokenizer_config.json", "{}")).get(
-        "chat_template"
-    )
+    template = texts.get("chat_template.jinja") or json.loads(
+        texts.get("tokenizer_config.json", "{}")
+    ).get("chat_template")
     if not isinstance(template, str):
-        raise UserError(f"{shown} has no chat template; put a chat_template.jinja beside its config.json")
+        raise UserError(
+            f"{shown} has no chat template; put a chat_template.jinja beside its config.json"
+        )
     vision = None
     if config["architectures"] == ["Qwen3VLForConditionalGeneration"]:
         if _PIXELS not in texts:
             raise UserError(f"{shown} has no {_PIXELS}; save its image processor as well")
         processor = json.loads(texts[_PIXELS])
-        vision = config["vision_config"] | {key: processor[key] for key in ("image_mean", "image_std")}
+        vision = config["vision_config"] | {
+            key: processor[key] for key in ("image_mean", "image_std")
+        }
         config = {**config["text_config"], "tie_word_embeddings": config["tie_word_embeddings"]}
         _check(vision, _SEEN, f"{shown} [vision_config]")
         sections, half = rope(config)["mrope_section"], config["head_dim"] // 2
-        # Frequencies go to time, height and width in turn. One past its turn is time's to transformers, and
-        # not turned at all by llama.cpp.
+        # Frequencies go to time, height and width in turn. One past its turn is time's to
+        # transformers, and not turned at all by llama.cpp.
         if any(i >= 3 * sections[i % 3] for i in range(half)):
             whole = [-(-(half - axis) // 3) for axis in range(3)]
-            raise UserError(f"{shown}: mrope_section = {printable(sections)}; only {whole} can be exported")
+            raise UserError(
+                f"{shown}: mrope_section = {printable(sections)}; only {whole} can be exported"
+            )
     elif config["architectures"] != ["Qwen3ForCausalLM"]:
         given = printable(config["architectures"])
         raise UserError(
-            f"{shown} is a {given}; only Qwen3ForCausalLM and Qwen3VLForConditionalGeneration can be exported"
+            f"{shown} is a {given}; only Qwen3ForCausalLM and Qwen3VLForConditionalGeneration can "
+            "be exported"
         )
     _check(config, _ONE_VALUE, shown)
     scaling = rope(config).get("rope_type", "default")
     if scaling != "default" or config.get("rope_scaling"):
-        raise UserError(f"{shown} scales its rope ({printable(scaling)}); only the default can be exported")
+        raise UserError(
+            f"{shown} scales its rope ({printable(scaling)}); only the default can be exported"
+        )
     _check_tokenizer(tokenizer, shown)
     return Saved(config, tokenizer, template, vision)
 
@@ -84,7 +112,9 @@ def read(checkpoint: Path, shown: str) -> Saved:
 def _check(config: Mapping[str, Any], only: Mapping[str, Any], shown: str) -> None:
     for key, value in only.items():
         if config.get(key, value) != value:
-            raise UserError(f"{shown}: {key} = {printable(config[key])}; only {value} can be exported")
+            raise UserError(
+                f"{shown}: {key} = {printable(config[key])}; only {value} can be exported"
+            )
 
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -99,7 +129,11 @@ def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
         {key: step.get(key) for key in wanted}
         for step, wanted in zip(pre.get("pretokenizers", ()), (_SPLIT, _BYTES), strict=False)
     ]
-    odd = [t["content"] for t in tokenizer["added_tokens"] if t["lstrip"] or t["rstrip"] or t["single_word"]]
+    odd = [
+        t["content"]
+        for t in tokenizer["added_tokens"]
+        if t["lstrip"] or t["rstrip"] or t["single_word"]
+    ]
     if model["type"] != "BPE" or model.get("ignore_merges") or model.get("byte_fallback"):
         what = "is no plain BPE"
     elif steps != [_SPLIT, _BYTES] or len(pre["pretokenizers"]) != len(steps):

@@ -18,7 +18,8 @@ from harness.core.errors import UserError
 Kind = Literal["generic", "vllm", "llama-server", "ollama", "lm-studio", "llama-cpp-python"]
 KINDS = get_args(Kind)
 MOST_LOGPROBS = 20  # most log-probabilities of one token that OpenAI and vLLM give
-# An address without a scheme or with one misspelt. It has no place for a password, so it may be shown.
+# An address without a scheme or with one misspelt. It has no place for a password, so it may be
+# shown.
 _ADDRESS = re.compile(
     r"(?P<scheme>[a-z]{3,6}(?::/{1,2}|//))?"
     r"(?P<host>(?:\[[\da-f:.]+\]|localhost|[\w-]+(?:\.[\w-]+)+|[\w-]+(?=:))(?::\d{2,5})?)"
@@ -26,24 +27,49 @@ _ADDRESS = re.compile(
     re.ASCII | re.IGNORECASE,
 )
 _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{0,63}")
-_NAME = Meta(pattern=r"^[a-z][a-z0-9_]{0,63}\Z", description="true, false or another name of the field")
+_NAME = Meta(
+    pattern=r"^[a-z][a-z0-9_]{0,63}\Z", description="true, false or another name of the field"
+)
 _Sent = bool | Annotated[str, _NAME]
 _Listed = Annotated[int, Meta(ge=1, le=MOST_LOGPROBS, description=f"1 to {MOST_LOGPROBS}")]
-# Fields that say what is asked, how the answer comes, or how often; no other field may take their names.
-_RESERVED = frozenset({
-    "model", "messages", "prompt", "input", "stream", "stream_options", "logprobs", "top_logprobs", "n",
-    "best_of", "response_format", "structured_outputs", "grammar", "json_schema", "chat_template",
-    "chat_template_kwargs", "tools", "tool_choice", "functions", "function_call", "stop", "user", "store",
-    "metadata",
-})  # fmt: skip
+# Fields that say what is asked, how the answer comes, or how often; no other field may take their
+# names.
+_RESERVED = frozenset(
+    {
+        "model",
+        "messages",
+        "prompt",
+        "input",
+        "stream",
+        "stream_options",
+        "logprobs",
+        "top_logprobs",
+        "n",
+        "best_of",
+        "response_format",
+        "structured_outputs",
+        "grammar",
+        "json_schema",
+        "chat_template",
+        "chat_template_kwargs",
+        "tools",
+        "tool_choice",
+        "functions",
+        "function_call",
+        "stop",
+        "user",
+        "store",
+        "metadata",
+    }
+)
 
 
 @dataclass(frozen=True)
 class Fields:
     """How a server is sent the fields of a request that servers refuse, or call by other names.
 
-    Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens =
-    "max_completion_tokens"`. No other field can be changed.
+    Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens
+    = "max_completion_tokens"`. No other field can be changed.
     """
 
     max_tokens: _Sent = True  # most tokens of the answer
@@ -59,7 +85,9 @@ class Fields:
         names = [alias for alias in vars(self).values() if isinstance(alias, str)]
         for name, alias in self.changed.items():
             if alias in _RESERVED or alias in vars(self) or names.count(str(alias)) > 1:
-                raise ValueError(f"{name} is sent as {alias}, the name of another field; give one of its own")
+                raise ValueError(
+                    f"{name} is sent as {alias}, the name of another field; give one of its own"
+                )
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
@@ -69,42 +97,78 @@ class Fields:
         """Return a request with the fields left out and renamed."""
         sent = {name: vars(self).get(name, True) for name in body}
         return {
-            name if alias is True else alias: body[name] for name, alias in sent.items() if alias is not False
+            name if alias is True else alias: body[name]
+            for name, alias in sent.items()
+            if alias is not False
         }
 
 
-KEYS = "SWARMDRIVE_KEYS"  # environment variable: names of further variables, with commas, that cards may use
-# Words of which one is in the name of a variable that holds a key of models, such as AZURE_OPENAI_API_KEY.
+# environment variable: names of further variables, with commas, that cards may use
+KEYS = "SWARMDRIVE_KEYS"
+# Words of which one is in the name of a variable that holds a key of models, such as
+# AZURE_OPENAI_API_KEY.
 _OF_MODELS = {
-    "ANTHROPIC", "CEREBRAS", "COHERE", "DASHSCOPE", "DEEPINFRA", "DEEPSEEK", "FIREWORKS", "GEMINI", "GROQ",
-    "LITELLM", "LLAMA", "LLM", "LMSTUDIO", "MISTRAL", "MOONSHOT", "NVIDIA", "OLLAMA", "OPENAI", "OPENROUTER",
-    "SAMBANOVA", "SGLANG", "TGI", "TOGETHER", "TOGETHERAI", "VLLM", "XAI", "ZAI",
-}  # fmt: skip
+    "ANTHROPIC",
+    "CEREBRAS",
+    "COHERE",
+    "DASHSCOPE",
+    "DEEPINFRA",
+    "DEEPSEEK",
+    "FIREWORKS",
+    "GEMINI",
+    "GROQ",
+    "LITELLM",
+    "LLAMA",
+    "LLM",
+    "LMSTUDIO",
+    "MISTRAL",
+    "MOONSHOT",
+    "NVIDIA",
+    "OLLAMA",
+    "OPENAI",
+    "OPENROUTER",
+    "SAMBANOVA",
+    "SGLANG",
+    "TGI",
+    "TOGETHER",
+    "TOGETHERAI",
+    "VLLM",
+    "XAI",
+    "ZAI",
+}
 
 
 @dataclass(frozen=True)
 class Server:
     """A server that speaks OpenAI's chat completions."""
 
-    # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list of servers,
-    # any of them may answer, and each must list the model.
+    # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
+    # of servers, any of them may answer, and each must list the model.
     base_url: str | tuple[str, ...]
-    kind: Kind = "generic"  # decides how a constrained answer is asked for; `generic` is OpenAI's own way
-    # environment variable with the key; it need not be set for a server without one. Its name tells that it
-    # is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS.
+    # decides how a constrained answer is asked for; `generic` is OpenAI's own way
+    kind: Kind = "generic"
+    # environment variable with the key; it need not be set for a server without one. Its name tells
+    # that it is a key of models (`readable`), or the user lists it in SWARMDRIVE_KEYS.
     key_env: str = "OPENAI_API_KEY"
     # longest time of one attempt, from connecting to the last byte, in seconds
-    timeout_s: Annotated[float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")] = 120.0
-    # attempts after the first, if a server was busy, broke down or was not reached; of several servers, each
-    # is tried at least once
+    timeout_s: Annotated[
+        float, Meta(gt=0, le=float_info.max, description="seconds, more than 0")
+    ] = 120.0
+    # attempts after the first, if a server was busy, broke down or was not reached; of several
+    # servers, each is tried at least once
     retries: Annotated[int, Meta(ge=0, le=10, description="0 to 10")] = 3
     top_logprobs: _Listed | None = None  # asked for in a read-out; None: 20, the usual limit
-    fields: Fields | None = None  # fields of a request that it is sent otherwise; None if there are none
+    # fields of a request that it is sent otherwise; None if there are none
+    fields: Fields | None = None
 
     def __post_init__(self) -> None:
         # A refused URL is not shown, since it may hold a password.
-        if fault := next(filter(None, map(_fault, self.urls)), None if self.urls else "is an empty list"):
-            mended = next(filter(None, map(meant, self.urls)), "one such as http://127.0.0.1:8080/v1")
+        if fault := next(
+            filter(None, map(_fault, self.urls)), None if self.urls else "is an empty list"
+        ):
+            mended = next(
+                filter(None, map(meant, self.urls)), "one such as http://127.0.0.1:8080/v1"
+            )
             raise ValueError(f"base_url {fault}; give {mended}")
         if len(set(self.urls)) < len(self.urls):
             raise ValueError("base_url names a server twice; name each once")
@@ -117,14 +181,16 @@ class Server:
     def key(self) -> str | None:
         """Return the server's key; None if its variable is not set.
 
-        A card may come from others, so it may not have any variable sent to its server. Raises UserError if
-        the variable holds no key of models, by its name, and the user does not list it.
+        A card may come from others, so it may not have any variable sent to its server. Raises
+        UserError if the variable holds no key of models, by its name, and the user does not list
+        it.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
             return None
         if not readable(self.key_env):
             raise UserError(
-                f"key_env {self.key_env} is no name of a key of models, such as OPENAI_API_KEY or VLLM_KEY, "
+                f"key_env {self.key_env} is no name of a key of models, such as OPENAI_API_KEY or "
+                "VLLM_KEY, "
                 f"so it is not sent; if it holds one, set {KEYS}={self.key_env} in your environment"
             )
         return key
@@ -136,7 +202,9 @@ class Server:
 
     @property
     def any_may_answer(self) -> bool:
-        """Whether any of several servers may answer, so that the model's identity is what they list."""
+        """Whether any of several servers may answer,
+        so that the model's identity is what they list.
+        """
         return not isinstance(self.base_url, str)
 
     @property
@@ -147,7 +215,8 @@ class Server:
 def readable(variable: str) -> bool:
     """Return whether a card may have this environment variable sent to its server.
 
-    It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists it.
+    It ends in KEY or TOKEN and has the word of a service or a server of models,
+    or the user lists it.
     """
     *words, last = variable.split("_")
     listed = {name.strip() for name in os.environ.get(KEYS, "").split(",")}
@@ -155,7 +224,9 @@ def readable(variable: str) -> bool:
 
 
 def meant(address: str) -> str | None:
-    """Return the base URL that an address means which does not begin with http:// or https://, or None."""
+    """Return the base URL that an address means which does not begin with http:// or https://, or
+    None.
+    """
     found = _ADDRESS.fullmatch(address)
     if found is None or address.startswith(("http://", "https://")):
         return None

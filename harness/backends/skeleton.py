@@ -1,11 +1,14 @@
-"""The fixed text of a constrained answer, in which the model fills in digits, choices and bounded texts.
+"""The fixed text of a constrained answer, in which the model fills in digits,
+choices and bounded texts.
 
-The text is compact JSON that always fits the answer's schema. A probability is `0.` and two digits, so 1.00
-cannot be written, and the digits need not sum to 1: `harness.parsing` divides by their sum, as it does with
-what a server wrote. A helper's evidence is empty; the members that a prompt version adds may have text.
+The text is compact JSON that always fits the answer's schema. A probability is `0.` and two digits,
+so 1.00 cannot be written, and the digits need not sum to 1: `harness.parsing` divides by their sum,
+as it does with what a server wrote. A helper's evidence is empty; the members that a prompt version
+adds may have text.
 
-The model is never asked for fixed text. A choice is made token by token, and the model decides only where the
-remaining options differ in their next token (LANE_LEFT and LANE_RIGHT share two in Qwen's vocabulary).
+The model is never asked for fixed text. A choice is made token by token, and the model decides only
+where the remaining options differ in their next token (LANE_LEFT and LANE_RIGHT share two in Qwen's
+vocabulary).
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -38,7 +41,8 @@ class Point:
     options: tuple[str, ...]  # texts to choose from; one empty text where only the branch is chosen
     most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
     branches: tuple[Branch, ...]  # what may follow
-    instead: tuple[Branch, ...] = ()  # what may stand here instead: the end of a list that has no numbers
+    # what may stand here instead: the end of a list that has no numbers
+    instead: tuple[Branch, ...] = ()
 
 
 def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:
@@ -61,7 +65,9 @@ def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch
             members = [*schema["properties"].items()]
             branches = _after("}", branches)
             for place, (name, member) in reversed([*enumerate(members)]):
-                branches = _after(f"{',' if place else '{'}{canonical_json(name)}:", expand(member, branches))
+                branches = _after(
+                    f"{',' if place else '{'}{canonical_json(name)}:", expand(member, branches)
+                )
             return branches
         case "array":
             ends = further = _after("]", branches)
@@ -98,7 +104,8 @@ def filled(shape: Shape, place: int) -> str:
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
-    """Return the tokens of a text that follows another, since some tokenizers mark the beginning of a text.
+    """Return the tokens of a text that follows another,
+    since some tokenizers mark the beginning of a text.
 
     If a token would span both texts, the tokens are those of the text alone.
     """
@@ -107,7 +114,9 @@ def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
 
 
 class Ask(NamedTuple):
-    """A decision of the model: `forced` tokens to append first, then the sorted tokens to choose from."""
+    """A decision of the model: `forced` tokens to append first,
+    then the sorted tokens to choose from.
+    """
 
     forced: list[int]
     among: Sequence[int]
@@ -144,13 +153,18 @@ class Skeleton:
         """Return what may be chosen at a point that follows a fixed text."""
         if (point, before) not in self._legs:
             # Only the first option stands before a branch: those of one kind end alike.
-            ends = [self._tokens(point.options[0] or before, branch.text) for branch in point.branches]
+            ends = [
+                self._tokens(point.options[0] or before, branch.text) for branch in point.branches
+            ]
             self._legs[point, before] = legs = [
                 Leg(option + branch.text, self._tokens(before, option) + end, branch)
                 for option in point.options
                 for branch, end in zip(point.branches, ends, strict=True)
             ]
-            legs += [Leg(branch.text, self._tokens(before, branch.text), branch) for branch in point.instead]
+            legs += [
+                Leg(branch.text, self._tokens(before, branch.text), branch)
+                for branch in point.instead
+            ]
             # One option may be a prefix of another (SLOW, SLOWER), so the tokens after it decide.
             by_tokens = sorted(leg.tokens for leg in legs)
             if any(longer[: len(tokens)] == tokens for tokens, longer in pairwise(by_tokens)):
@@ -167,11 +181,15 @@ class Skeleton:
             before, point = pending[-1]
             if point is None or point in longest:
                 pending.pop()
-            elif later := [branch for branch in point.branches + point.instead if branch.then not in longest]:
+            elif later := [
+                branch for branch in point.branches + point.instead if branch.then not in longest
+            ]:
                 pending += later
             else:
                 legs = self._legs_of(point, before)
-                longest[point] = point.most + max(len(leg.tokens) + longest[leg.branch.then] for leg in legs)
+                longest[point] = point.most + max(
+                    len(leg.tokens) + longest[leg.branch.then] for leg in legs
+                )
         return longest[self._start]
 
     def walk(self) -> Generator[Ask, int, Filled]:
@@ -202,7 +220,9 @@ class Skeleton:
     def _write(
         self, point: Point, before: str, legs: list[Leg], forced: list[int]
     ) -> Generator[Ask, int, tuple[str, int, list[Leg]]]:
-        """Let the model write a text; return it, its tokens, and what may follow. `forced` is used up."""
+        """Let the model write a text; return it, its tokens, and what may follow.
+        `forced` is used up.
+        """
         ids: list[int] = []
         head = self._chat.encode(before)
         left, ends = point.most, frozenset(leg.tokens[0] for leg in legs)
@@ -221,7 +241,9 @@ class Skeleton:
         return self._chat.decode([*head, *ids])[len(self._chat.decode(head)) :]
 
     def _among(self, left: int, ends: frozenset[int]) -> list[int]:
-        """Return the tokens that end a text, and those of plain text of up to so many characters, sorted."""
+        """Return the tokens that end a text,
+        and those of plain text of up to so many characters, sorted.
+        """
         if not self._sizes:
             head = self._chat.encode('"')
             texts = ((i, self._text(head, [i])) for i in range(self._chat.vocabulary))

@@ -41,7 +41,11 @@ def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[B
     return [opened[card] for card in cards]
 
 
-def together(cards: Sequence[Card], backends: Sequence[Backend], cache: Path | None = None) -> Backend:
-    """Combine the backends of a run's agents into one; each has a cache before it if there is a file."""
+def together(
+    cards: Sequence[Card], backends: Sequence[Backend], cache: Path | None = None
+) -> Backend:
+    """Combine the backends of a run's agents into one;
+    each has a cache before it if there is a file.
+    """
     agents = [cached(backend, card, cache) for backend, card in zip(backends, cards, strict=True)]
     return agents[0] if len(agents) == 1 else Swarm(agents)

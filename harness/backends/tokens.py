@@ -35,7 +35,8 @@ _WHOLE_FIRST = ("llama-bpe",)  # a piece that is a token is not merged out of it
 def tokenizer(source: Path) -> Any:
     """Load a `tokenizers.Tokenizer` from a GGUF file, a tokenizer.json, or a folder with one.
 
-    It neither cuts texts off nor pads them, whatever the file says. Raises UserError if there is none.
+    It neither cuts texts off nor pads them, whatever the file says.
+    Raises UserError if there is none.
     """
     from tokenizers import Tokenizer
 
@@ -46,7 +47,9 @@ def tokenizer(source: Path) -> Any:
         )
     try:
         return (
-            _from_gguf(file) if file.suffix == ".gguf" else whole(Tokenizer.from_str(text_of(file, "record")))
+            _from_gguf(file)
+            if file.suffix == ".gguf"
+            else whole(Tokenizer.from_str(text_of(file, "record")))
         )
     except UserError:
         raise
@@ -62,13 +65,17 @@ def whole(loaded: Any) -> Any:
 
 
 def token_ids(loaded: Any, text: str) -> list[int]:
-    """Return the token ids of a text in a chat, without those that a tokenizer puts around a whole prompt."""
+    """Return the token ids of a text in a chat,
+    without those that a tokenizer puts around a whole prompt.
+    """
     encoded: list[int] = loaded.encode(text, add_special_tokens=False).ids
     return encoded
 
 
 def _from_gguf(file: Path) -> Any:
-    """Build the tokenizer of a GGUF file: a byte-level one of its vocabulary, another by transformers."""
+    """Build the tokenizer of a GGUF file:
+    a byte-level one of its vocabulary, another by transformers.
+    """
     from tokenizers import AddedToken, models
 
     values = read_metadata(file, arrays=True)
@@ -76,9 +83,13 @@ def _from_gguf(file: Path) -> Any:
     if values["tokenizer.ggml.model"] != "gpt2" or pre not in _SPLITS:
         return _converted(file, values["tokenizer.ggml.model"], pre)
     vocabulary = values["tokenizer.ggml.tokens"]
-    merges = [(left, right) for left, right in (p.split(" ") for p in values["tokenizer.ggml.merges"])]
+    merges = [
+        (left, right) for left, right in (p.split(" ") for p in values["tokenizer.ggml.merges"])
+    ]
     model = models.BPE(
-        vocab={t: i for i, t in enumerate(vocabulary)}, merges=merges, ignore_merges=pre in _WHOLE_FIRST
+        vocab={t: i for i, t in enumerate(vocabulary)},
+        merges=merges,
+        ignore_merges=pre in _WHOLE_FIRST,
     )
     built = byte_level(model, _SPLITS[pre])
     # Control tokens, and user-defined tokens that are never split, such as `<think>`.
@@ -89,7 +100,9 @@ def _from_gguf(file: Path) -> Any:
 
 
 def _converted(file: Path, kind: str, pre: str) -> Any:
-    """Have transformers build a tokenizer. Where it does not know the name, it splits text as GPT-2 does."""
+    """Have transformers build a tokenizer.
+    Where it does not know the name, it splits text as GPT-2 does.
+    """
     try:
         from transformers.integrations import gguf
         from transformers.integrations.gguf.gguf_tokenizer_mapping import GGUF_PRE_TOKENIZER_SPLITS
@@ -97,7 +110,8 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
         raise without(f"the tokenizer of {printable(file)}", *OPTIONAL["transformers"]) from None
     if kind == "gpt2" and pre not in GGUF_PRE_TOKENIZER_SPLITS:
         raise UserError(
-            f"{printable(file)} has the pre-tokeniser {printable(pre)}, which is not known here; give the "
+            f"{printable(file)} has the pre-tokeniser {printable(pre)}, which is not known here; "
+            "give the "
             "model's tokenizer.json, or run it on llama-cpp"
         )
     architecture, stated, _ = gguf.get_gguf_tokenizer(str(file))
@@ -106,7 +120,9 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
 
 
 def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
-    """Build a `tokenizers.Tokenizer` of a byte-level BPE model, which splits text as Qwen2 or by `splits`."""
+    """Build a `tokenizers.Tokenizer` of a byte-level BPE model,
+    which splits text as Qwen2 or by `splits`.
+    """
     from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
 
     built = Tokenizer(model)
@@ -123,7 +139,8 @@ def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
 def counter(
     source: Path | None, card: Card | None = None
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
-    """Return a function that counts the tokens of chat messages, without those of the chat template.
+    """Return a function that counts the tokens of chat messages,
+    without those of the chat template.
 
     It uses the given tokenizer, or else the one with the model's weights; None if there is neither.
     """

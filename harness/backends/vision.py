@@ -1,4 +1,6 @@
-"""The `[vision]` table of a card: the size of the pictures that a model is shown, and their tokens."""
+"""The `[vision]` table of a card: the size of the pictures that a model is shown,
+and their tokens.
+"""
 
 import math
 from collections.abc import Mapping
@@ -14,8 +16,9 @@ WIDE, HIGH = 16, 8  # tokens along the sides of a picture whose size the checkpo
 class Vision:
     """Numbers of a model's image processor.
 
-    A token stands for a square of `merge` x `merge` patches. A picture is scaled so that both sides hold
-    whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one size (Idefics3).
+    A token stands for a square of `merge` x `merge` patches. A picture is scaled so that both sides
+    hold whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one
+    size (Idefics3).
     """
 
     width_px: Count  # width of the pictures that the model is shown
@@ -23,14 +26,19 @@ class Vision:
     patch_px: Count  # side of a patch
     merge: Count  # number of patches along a side of a token's square
     least_px: Count | None = None  # least area of a picture; a smaller one is enlarged
-    most_px: Count | None = None  # greatest area; a larger one is scaled down. None if there is no limit.
+    # greatest area; a larger one is scaled down. None if there is no limit.
+    most_px: Count | None = None
     scaled_to_px: tuple[Count, Count] | None = None  # size that every picture is scaled to, if any
 
     def __post_init__(self) -> None:
         if self.height_px % 2:
-            raise ValueError(f"height_px is {self.height_px}, wants an even number: two cameras share it")
+            raise ValueError(
+                f"height_px is {self.height_px}, wants an even number: two cameras share it"
+            )
         if max(self.width_px, self.height_px) > 4096:
-            raise ValueError(f"a picture of {self.width_px} x {self.height_px} pixels; allowed: 4096 a side")
+            raise ValueError(
+                f"a picture of {self.width_px} x {self.height_px} pixels; allowed: 4096 a side"
+            )
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -44,11 +52,14 @@ class Vision:
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """Return the error text for a model that makes another number of tokens; None if it agrees."""
+        """Return the error text for a model that makes another number of tokens;
+        None if it agrees.
+        """
         if tokens == self.tokens:
             return None
         return (
-            f"its processor makes {tokens} tokens of {self.width_px} x {self.height_px} pixels, and its card "
+            f"its processor makes {tokens} tokens of {self.width_px} x {self.height_px} pixels, "
+            "and its card "
             f"says {self.tokens}; fix [vision]"
         )
 
@@ -57,7 +68,9 @@ class Vision:
         width, height = (max(square, round(side / square) * square) for side in sides)
         if self.most_px is not None and width * height > self.most_px:
             shrink = math.sqrt(sides[0] * sides[1] / self.most_px)
-            width, height = (max(square, math.floor(side / shrink / square) * square) for side in sides)
+            width, height = (
+                max(square, math.floor(side / shrink / square) * square) for side in sides
+            )
         elif self.least_px is not None and width * height < self.least_px:
             grow = math.sqrt(self.least_px / (sides[0] * sides[1]))
             width, height = (math.ceil(side * grow / square) * square for side in sides)
@@ -65,10 +78,12 @@ class Vision:
 
 
 def read_vision(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
-    """Return what a checkpoint's config.json and preprocessor_config.json state; None without vision.
+    """Return what a checkpoint's config.json and preprocessor_config.json state;
+    None without vision.
 
-    Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own. Raises LookupError
-    or TypeError if the model is neither Qwen's nor Idefics3's kind, or a file is malformed.
+    Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own. Raises
+    LookupError or TypeError if the model is neither Qwen's nor Idefics3's kind, or a file is
+    malformed.
     """
     vision = config.get("vision_config")
     if vision is None:

@@ -13,22 +13,32 @@ from harness.backends import packages
 from harness.backends.adapters import find_adapter
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
-from harness.backends.registry import capabilities, import_object, locate, missing_package, registration
+from harness.backends.registry import (
+    capabilities,
+    import_object,
+    locate,
+    missing_package,
+    registration,
+)
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, sha256_file, text_of
 from harness.core.resources import find
 
 # Without one of these AutoTokenizer silently builds an empty tokenizer.
 _TOKENIZERS = ("tokenizer.json", "tokenizer.model", "vocab.json")
-_WEIGHTS = ("*.safetensors",)  # a pickle, such as pytorch_model.bin, may hold code and is never read
+# a pickle, such as pytorch_model.bin, may hold code and is never read
+_WEIGHTS = ("*.safetensors",)
 _SMALL, _LARGE = {".json", ".jinja", ".model", ".txt"}, {".safetensors"}
 _SHARDS = "model.safetensors.index.json"
-# The files that transformers loads; a repository may hold the same weights in other formats as well.
+# The files that transformers loads; a repository may hold the same weights in other formats as
+# well.
 _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Find the directory of a card's checkpoint: as given, beside the cards, or in the hub's cache."""
+    """Find the directory of a card's checkpoint:
+    as given, beside the cards, or in the hub's cache.
+    """
     find_adapter(card)
     local = find("models", card.weights or "")
     where = local if local.is_dir() else _snapshot(card)
@@ -49,7 +59,9 @@ def find_checkpoint(card: Card) -> Path:
 
 
 def _check_files(card: Card, checkpoint: Path) -> None:
-    """Raise UserError if a file that the engine would open by itself is none, or is too large to be it."""
+    """Raise UserError if a file that the engine would open by itself is none,
+    or is too large to be it.
+    """
     for path in checkpoint.iterdir():
         try:
             if path.suffix in _SMALL or path.suffix in _LARGE:
@@ -60,12 +72,15 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Find the GGUF file of a card: as given, beside the cards, out of a package, or in the hub's cache."""
+    """Find the GGUF file of a card: as given, beside the cards, out of a package,
+    or in the hub's cache.
+    """
     find_adapter(card)
     if wanted := packages.find_packaged(card):
         if not wanted.place.is_file():
             raise UserError(
-                f"{wanted.shown} is not fetched yet; run `harness model pull {printable(card.name)}`"
+                f"{wanted.shown} is not fetched yet; run `harness model pull "
+                f"{printable(card.name)}`"
             )
         return wanted.place
     local = find("models", card.weights or "")
@@ -85,19 +100,28 @@ def find_gguf(card: Card) -> Path:
 
 
 def is_gguf(card: Card) -> bool:
-    """Return whether a card's weights are a GGUF file, on whatever engine; packages have no others."""
+    """Return whether a card's weights are a GGUF file, on whatever engine;
+    packages have no others.
+    """
     weights = card.file or card.weights or ""
     return weights.endswith(".gguf") or weights.startswith(packages.PREFIX)
 
 
 def find_weights(card: Card) -> Path:
-    """Find the checkpoint's directory or the GGUF file of a card. Raises UserError if it is not whole."""
+    """Find the checkpoint's directory or the GGUF file of a card.
+    Raises UserError if it is not whole.
+    """
     return find_gguf(card) if is_gguf(card) else find_checkpoint(card)
 
 
 def check_digest(card: Card, file: Path) -> Path:
-    """Return the file if its digest is the card's, or the card has none. Raises UserError if they differ."""
-    if card.sha256 and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256:
+    """Return the file if its digest is the card's, or the card has none.
+    Raises UserError if they differ.
+    """
+    if (
+        card.sha256
+        and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256
+    ):
         raise UserError(
             f"{card.shown}: {printable(file)} is not what its card says: sha256 {digest}, "
             f"and the card has {card.sha256}; fetch it again, or fix the card"
@@ -108,18 +132,27 @@ def check_digest(card: Card, file: Path) -> Path:
 def contradictions(card: Card) -> Iterator[str]:
     """Yield a line for each thing that a card says otherwise than its weights. The card holds.
 
-    A shorter context than that of the weights is a choice. Raises UserError if the weights are not found.
+    A shorter context than that of the weights is a choice.
+    Raises UserError if the weights are not found.
     """
     where = locate(card)
-    stated = read_facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
+    stated = (
+        read_facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
+    )
     if card.licence and stated.licence and card.licence.casefold() != stated.licence.casefold():
         yield (
-            f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its file; "
+            f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its "
+            "file; "
             "correct the card, or ask who made the file"
         )
-    if card.context_tokens and stated.context_tokens and card.context_tokens > stated.context_tokens:
+    if (
+        card.context_tokens
+        and stated.context_tokens
+        and card.context_tokens > stated.context_tokens
+    ):
         yield (
-            f"context of {card.context_tokens} tokens by its card, {stated.context_tokens} by its weights: "
+            f"context of {card.context_tokens} tokens by its card, {stated.context_tokens} by its "
+            "weights: "
             "what is longer was never trained; lower context_tokens"
         )
 
@@ -135,10 +168,11 @@ def _context_tokens(checkpoint: Path) -> int | None:
 
 
 def pull(card: Card) -> Path:
-    """Download what a card's engine needs and lacks into a cache; return the checkpoint or the GGUF file.
+    """Download what a card's engine needs and lacks into a cache;
+    return the checkpoint or the GGUF file.
 
-    Raises UserError if there is nothing to fetch, the hub or the registry is not reached or refuses, or the
-    digest is not the card's.
+    Raises UserError if there is nothing to fetch,
+    the hub or the registry is not reached or refuses, or the digest is not the card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"{card.shown} runs on {card.engine}: it has no weights to pull")
@@ -168,7 +202,8 @@ def _download(card: Card) -> None:
         snapshot_download(card.weights or "", revision=card.revision, allow_patterns=patterns)
     except errors.GatedRepoError:
         raise UserError(
-            f"{card.shown}: {at} asks for its licence to be accepted; do so on that page, then `hf auth "
+            f"{card.shown}: {at} asks for its licence to be accepted; do so on that page, then `hf "
+            "auth "
             "login`"
         ) from None
     except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):
@@ -180,7 +215,8 @@ def _download(card: Card) -> None:
         # Its first sentence, as long as it may be: those after it give advice of the library's own.
         reason = printable(" ".join(str(error).split()).partition(". ")[0].rstrip("."), 400)
         raise UserError(
-            f"{card.shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and give their "
+            f"{card.shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and "
+            "give their "
             "path"
         ) from None
 
@@ -198,15 +234,21 @@ def fetching(card: Card) -> str:
 
 
 def _hub_cache() -> Path:
-    """Return the cache folder of the hub's package, without importing it, which would slow down listings."""
+    """Return the cache folder of the hub's package, without importing it,
+    which would slow down listings.
+    """
     home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     home = os.environ.get("HF_HOME") or f"{home}/huggingface"
-    cache = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE") or f"{home}/hub"
+    cache = (
+        os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE") or f"{home}/hub"
+    )
     return Path(os.path.expandvars(os.path.expanduser(cache)))
 
 
 def _snapshot(card: Card) -> Path | None:
-    """Return the folder of a card's repository at its revision in the hub's cache; None if there is none."""
+    """Return the folder of a card's repository at its revision in the hub's cache;
+    None if there is none.
+    """
     repository = _hub_cache() / f"models--{(card.weights or '').replace('/', '--')}"
     revision = card.revision or "main"
     reference = repository / "refs" / revision
@@ -216,7 +258,9 @@ def _snapshot(card: Card) -> Path | None:
 
 
 def _shards(checkpoint: Path) -> list[str]:
-    """Return the names of the files that weights are split into; an interrupted download lacks some."""
+    """Return the names of the files that weights are split into;
+    an interrupted download lacks some.
+    """
     try:
         index = json.loads(text_of(checkpoint / _SHARDS, "record"))
         return sorted(set(index["weight_map"].values()))

@@ -45,14 +45,30 @@ def common(
     """Evaluate prompts and parsing in cooperative driving."""
 
 
-# What is wrong with the machine and not with the program: disks that are full, read-only, broken or not ours.
-MACHINE = frozenset({
-    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR,
-    errno.EISDIR, errno.ENAMETOOLONG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ELOOP,
-})  # fmt: skip
+# What is wrong with the machine and not with the program: disks that are full, read-only, broken or
+# not ours.
+MACHINE = frozenset(
+    {
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EIO,
+        errno.ENOTDIR,
+        errno.EISDIR,
+        errno.ENAMETOOLONG,
+        errno.EMFILE,
+        errno.ENFILE,
+        errno.ENOMEM,
+        errno.ELOOP,
+    }
+)
 
 
-COLLECT_AFTER = 50_000  # new objects; at 700, as usual, imports and tables are walked again and again
+# new objects; at 700, as usual, imports and tables are walked again and again
+COLLECT_AFTER = 50_000
 
 
 # typer carries a click of its own and exports of its errors only this one's children.
@@ -62,7 +78,8 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 def main() -> None:
     """Entry point: what a user can mend is one line on stderr, and one of `EXIT_CODES`."""
     gc.set_threshold(COLLECT_AFTER, 10, 10)
-    atexit.register(gc.freeze)  # all memory goes as the process ends; its last collections would walk it all
+    # all memory goes as the process ends; its last collections would walk it all
+    atexit.register(gc.freeze)
     out = sys.stdout
     try:
         try:
@@ -93,8 +110,11 @@ def _program() -> Any:
 
 def _typed() -> None:
     if strange := [word for word in sys.argv if not _is_text(word)]:
-        _fail(f"`{printable(strange[0])}` is no UTF-8, as all that is kept is; rename what it names")
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own takes 20 MB more, and time
+        _fail(
+            f"`{printable(strange[0])}` is no UTF-8, as all that is kept is; rename what it names"
+        )
+    # Arrow's own takes 20 MB more, and time
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     try:
         sys.exit(_program()(standalone_mode=False))
     except UserError as error:

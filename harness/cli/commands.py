@@ -1,4 +1,5 @@
-"""State every command of the core: what is typed, the function behind it, and how it was typed before.
+"""State every command of the core: what is typed, the function behind it,
+and how it was typed before.
 
 Extensions add to each of these tables.
 """
@@ -7,8 +8,8 @@ from collections.abc import Mapping
 
 from harness.core.extensions import extensions, joined
 
-# The function behind each command, as `module:function` of this package. A module alone stands for its
-# function `command`.
+# The function behind each command, as `module:function` of this package. A module alone stands for
+# its function `command`.
 COMMANDS = {
     "init": "init",
     "eval": "eval",

@@ -11,21 +11,32 @@ from harness.core.errors import UserError, in_range, printable
 
 def command(
     a: Path = typer.Argument(help="Folder of the run to compare with.", metavar="A"),
-    b: Path = typer.Argument(help="Folder of the run to judge: differences are B - A.", metavar="B"),
+    b: Path = typer.Argument(
+        help="Folder of the run to judge: differences are B - A.", metavar="B"
+    ),
     fail_if: list[str] | None = typer.Option(
         None,
-        help="Gate on the difference B - A: '[CONDITION:]METRIC[.low|.high] OP NUMBER'. It fails where that "
-        "is true: '6g:success_rate < -0.01' fails if 6g lost more than one point of success. Rates are from "
-        "0 to 1; .low and .high are the ends of the 95 % interval; without CONDITION, the gate is on every "
+        help="Gate on the difference B - A: '[CONDITION:]METRIC[.low|.high] OP NUMBER'. It fails "
+        "where that "
+        "is true: '6g:success_rate < -0.01' fails if 6g lost more than one point of success. Rates "
+        "are from "
+        "0 to 1; .low and .high are the ends of the 95 % interval; without CONDITION, the gate is "
+        "on every "
         "condition. Repeatable. Exit code 1 if a gate fails.",
     ),
-    show: int = typer.Option(10, help="Number of episodes, decisions and requests to list of each kind."),
-    html: Path | None = typer.Option(None, help="Also write the comparison as a page to this file."),
+    show: int = typer.Option(
+        10, help="Number of episodes, decisions and requests to list of each kind."
+    ),
+    html: Path | None = typer.Option(
+        None, help="Also write the comparison as a page to this file."
+    ),
     junit: Path | None = typer.Option(
         None, help="Also write the gates to this file, as test cases in JUnit XML for a CI system."
     ),
     every: bool = typer.Option(
-        False, "--all", help="Print every metric, not only the primary ones and what changed most clearly."
+        False,
+        "--all",
+        help="Print every metric, not only the primary ones and what changed most clearly.",
     ),
     as_markdown: bool = typer.Option(
         False, "--markdown", help="Print Markdown, such as for a comment on a pull request."
@@ -49,8 +60,13 @@ def command(
     if junit and not fail_if:
         raise UserError("--junit writes gates; give one or more with --fail-if")
     gates = [gate(typed) for typed in fail_if or ()]
-    if reasons := [f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))]:
-        lacks = f"{'; '.join(reasons)}: the model could not be asked, so that --fail-if has nothing to judge"
+    if reasons := [
+        f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))
+    ]:
+        lacks = (
+            f"{'; '.join(reasons)}: the model could not be asked, so that --fail-if has nothing to "
+            "judge"
+        )
         if junit:
             save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
         raise UserError(f"{lacks}; type the command of the run again")
@@ -67,5 +83,7 @@ def command(
     if as_json:
         echo_json(text.mapping(difference, verdicts, show))
     else:
-        typer.echo((text.markdown if as_markdown else text.terminal)(difference, verdicts, show, every))
+        typer.echo(
+            (text.markdown if as_markdown else text.terminal)(difference, verdicts, show, every)
+        )
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

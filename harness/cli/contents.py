@@ -1,4 +1,6 @@
-"""`harness study contents`: intents, objects, both or nothing, over bits, loss, delay and density."""
+"""`harness study contents`: intents, objects, both or nothing, over bits, loss,
+delay and density.
+"""
 
 from pathlib import Path
 
@@ -12,7 +14,8 @@ from harness.core.errors import printable
 from harness.runs.settings import parse_seeds
 
 Runs = typer.Argument(
-    help="Folders of finished runs of `harness eval`, or of suites. Several families of scenes are averaged.",
+    help="Folders of finished runs of `harness eval`, or of suites. Several families of scenes are "
+    "averaged.",
     metavar="RUN...",
 )
 
@@ -21,23 +24,29 @@ def command(
     runs: list[Path] = Runs,
     condition: list[str] = typer.Option(
         [],
-        help="Operating point to play every content in: 6g:encoding=etsi. Repeatable. Default: that, and "
+        help="Operating point to play every content in: 6g:encoding=etsi. Repeatable. Default: "
+        "that, and "
         "mode2:encoding=etsi over density.",
     ),
     over: list[str] = typer.Option(
         [],
-        help="Setting to vary in each condition, alone: loss, latency (ms), tau, max_helpers, or any other. "
+        help="Setting to vary in each condition, alone: loss, latency (ms), tau, max_helpers, or "
+        "any other. "
         "Repeatable. Default: these, if no --condition is given.",
     ),
     grid: list[str] = typer.Option(
-        [], help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same order."
+        [],
+        help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same "
+        "order.",
     ),
     seeds: options.RunSeeds = None,
     latency: options.RunLatency = "run",
     model: options.RunModel = None,
     no_model: options.NoModel = False,
     dry_run: bool = typer.Option(
-        False, "--dry-run", help="Only count the questions that the runs may lack; ask and write nothing."
+        False,
+        "--dry-run",
+        help="Only count the questions that the runs may lack; ask and write nothing.",
     ),
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: RUN/contents, in the first folder."
@@ -47,8 +56,8 @@ def command(
 ) -> None:
     """Compare contents of messages: intents, objects, both.
 
-    Each is played at every point from stored answers. The model is asked only where the runs have no answer.
-    If the study is stopped, the same command continues it.
+    Each is played at every point from stored answers. The model is asked only where the runs have
+    no answer. If the study is stopped, the same command continues it.
     """
     from harness.studies.contents import asked_at_most, folders, models, panels_of, run_contents
     from harness.studies.contents_page import contents_study

@@ -1,4 +1,6 @@
-"""`harness dataset`: build frozen scenes, verify them, look at one, compare them with closed loop."""
+"""`harness dataset`: build frozen scenes, verify them, look at one,
+compare them with closed loop.
+"""
 
 import time
 from dataclasses import replace
@@ -27,7 +29,9 @@ Dataset = Annotated[
 
 def build(
     name: str | None = typer.Argument(
-        None, help="Scenario to freeze; `harness dataset scenario list` shows them.", show_default=False
+        None,
+        help="Scenario to freeze; `harness dataset scenario list` shows them.",
+        show_default=False,
     ),
     env: options.Env = None,
     env_config: options.EnvConfig = None,
@@ -36,7 +40,8 @@ def build(
     workers: options.Workers = "2",
     lag: float | None = typer.Option(
         None,
-        help="Seconds from the start of a decision to its action. Default: the scenario's, usually 0.145.",
+        help="Seconds from the start of a decision to its action. Default: the scenario's, usually "
+        "0.145.",
     ),
     audit: bool = typer.Option(
         True, help="With 100 layouts or more, audit whether the ego's view gives the danger away."
@@ -55,7 +60,9 @@ def build(
     if lag is not None:
         period_s = scenario.parameters.decision_period_s
         if not 0 <= lag < period_s:
-            raise UserError(f"--lag {lag}: give seconds from 0 to below {period_s:g}, the decision period")
+            raise UserError(
+                f"--lag {lag}: give seconds from 0 to below {period_s:g}, the decision period"
+            )
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
     from harness.world import scenarios
@@ -64,7 +71,9 @@ def build(
     begun_s, part = time.monotonic(), options.shard_of(shard)
     mine = len(part.part(range(episodes))) if part else episodes
     with bar(f"freezing {printable(name, 30)}", mine) as progress:
-        manifest = build_dataset(scenario, out, episodes, seed, who, progress, audit, progress.more, part)
+        manifest = build_dataset(
+            scenario, out, episodes, seed, who, progress, audit, progress.more, part
+        )
     if part:
         options.say_shard(part, out, f"{mine} of {episodes} layouts")
         return
@@ -75,13 +84,16 @@ def build(
     )
     if env and (module := environment.module_of(name)):
         shown = printable(module)
-        typer.echo(f"commands that read it import {shown}, if you set {environment.IMPORTS}={shown}")
+        typer.echo(
+            f"commands that read it import {shown}, if you set {environment.IMPORTS}={shown}"
+        )
 
 
 def check(dataset: Dataset, as_json: options.Json = False) -> None:
     """Check every file and every decision point of a dataset. Exit code 1 if something is wrong.
 
-    Where highway-env is installed, first scenes and three whole layouts are built again from their seeds.
+    Where highway-env is installed, first scenes and three whole layouts are built again from their
+    seeds.
     """
     from harness.dataset import load, rebuilt, verify
 
@@ -93,10 +105,15 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     built_again = find_spec("highway_env") is not None
     if as_json:
         counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
-        echo_json({
-            **counts, "sha256": digest, "problems": problems, "lost_before_first_action": lost,
-            "built_again": built_again,
-        })  # fmt: skip
+        echo_json(
+            {
+                **counts,
+                "sha256": digest,
+                "problems": problems,
+                "lost_before_first_action": lost,
+                "built_again": built_again,
+            }
+        )
     elif problems:
         typer.echo("\n".join(problems))
     else:
@@ -105,10 +122,13 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
             f"manifest sha256 {digest}"
         )
         if not built_again:
-            typer.echo("no layout was built again from its seed, since highway-env is not installed")
+            typer.echo(
+                "no layout was built again from its seed, since highway-env is not installed"
+            )
         if lost:
             console().print(
-                f"{lost} of {manifest.episodes} episodes are lost before the ego's first action: it begins "
+                f"{lost} of {manifest.episodes} episodes are lost before the ego's first action: "
+                "it begins "
                 "in a collision, or cannot escape one; mend the environment, or choose other seeds"
             )
     if problems:
@@ -119,8 +139,12 @@ def show(
     dataset: Dataset,
     scene: str = typer.Argument(help="Scene id, such as 00003-0."),
     out: Path = typer.Option(..., help="Picture to write: .svg or .png; with --camera .png."),
-    viewer: str | None = typer.Option(None, help="Vehicle whose view to draw, such as v2. Default: the ego."),
-    camera: bool = typer.Option(False, "--camera", help="Draw what its cameras see, front above rear."),
+    viewer: str | None = typer.Option(
+        None, help="Vehicle whose view to draw, such as v2. Default: the ego."
+    ),
+    camera: bool = typer.Option(
+        False, "--camera", help="Draw what its cameras see, front above rear."
+    ),
 ) -> None:
     """Draw a scene from above, or as a vehicle's cameras see it."""
     from io import BytesIO
@@ -131,7 +155,8 @@ def show(
     kinds = (".png",) if camera else (".svg", ".png")
     if out.suffix not in kinds:
         raise UserError(
-            f"--out {printable(out)} is no picture that can be written; end it in {' or '.join(kinds)}"
+            f"--out {printable(out)} is no picture that can be written; end it in "
+            f"{' or '.join(kinds)}"
         )
     data = load.load(load.find(dataset))
     drawn = data.scene(scene)
@@ -166,8 +191,8 @@ def export(
 ) -> None:
     """Write a dataset as Parquet that other programs load.
 
-    A card and a Croissant file describe it. A row is a decision point, with what the ego is asked and how
-    safe each action is. Each dataset of a suite is a table.
+    A card and a Croissant file describe it. A row is a decision point, with what the ego is asked
+    and how safe each action is. Each dataset of a suite is a table.
     """
     from harness.dataset import load, suites
     from harness.dataset.publish import Chat, publish
@@ -190,7 +215,9 @@ def export(
     typer.echo(f"wrote {printable(out)}: {rows} decision points, {size / 1e6:.1f} MB of Parquet")
 
 
-def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False) -> None:
+def rank_drivers(
+    dataset: Dataset, workers: options.Workers = "2", as_json: options.Json = False
+) -> None:
     """Compare the reference drivers, frozen and in closed loop.
 
     Both are on the same episodes.
@@ -214,20 +241,31 @@ def rank_drivers(dataset: Dataset, workers: options.Workers = "2", as_json: opti
 def _as_mapping(standing: dict[str, "Estimate"]) -> dict[str, "Estimate"]:
     points = {end: 100 * getattr(standing["difference"], end) for end in ("value", "low", "high")}
     return {
-        "frozen": standing["frozen"], "live": standing["closed"],
-        "difference_points": replace(standing["difference"], **points), "agreement": standing["agreement"],
-    }  # fmt: skip
+        "frozen": standing["frozen"],
+        "live": standing["closed"],
+        "difference_points": replace(standing["difference"], **points),
+        "agreement": standing["agreement"],
+    }
 
 
 def _table(episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> None:
     heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
-    table(heads, [
-        (driver, *(shown(s[name]) for name in ("frozen", "closed", "difference")),
-         f"{100 * s['agreement'].value:.0f}")
-        for driver, s in standings.items()
-    ])  # fmt: skip
+    table(
+        heads,
+        [
+            (
+                driver,
+                *(shown(s[name]) for name in ("frozen", "closed", "difference")),
+                f"{100 * s['agreement'].value:.0f}",
+            )
+            for driver, s in standings.items()
+        ],
+    )
     text = console()
-    text.print(f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop")
     text.print(
-        "these few drivers give no rank correlation: compare runs of models with `harness study fidelity`"
+        f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop"
+    )
+    text.print(
+        "these few drivers give no rank correlation: compare runs of models with `harness study "
+        "fidelity`"
     )

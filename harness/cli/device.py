@@ -1,4 +1,6 @@
-"""`harness model device`: the computers of a vehicle, what each rests on, and what fits the window."""
+"""`harness model device`: the computers of a vehicle, what each rests on,
+and what fits the window.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 
 MOST_TOKENS = 1_000_000
 MOST_MS = 60_000
-Name = typer.Argument(help="Device profile; `harness model device list` shows them.", metavar="NAME")
+Name = typer.Argument(
+    help="Device profile; `harness model device list` shows them.", metavar="NAME"
+)
 Model = typer.Option(
     None,
     "--device-model",
@@ -53,8 +57,8 @@ def show(
 ) -> None:
     """Show which answers fit the decision window on a device.
 
-    It shows their time and energy, too. The time is that of the ego's own answer, without any message.
-    Nothing else runs on the computer.
+    It shows their time and energy, too. The time is that of the ego's own answer,
+    without any message. Nothing else runs on the computer.
     """
     from harness.runs import devices
     from harness.runs.folder import read
@@ -63,22 +67,34 @@ def show(
     in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
     in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
     if not 0 < window_ms <= MOST_MS:
-        raise UserError(f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}")
+        raise UserError(
+            f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}"
+        )
     device = devices.load(name)
     rows = [devices.find_row(device, model)] if model else device.rows
     answers = answers_of(read(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
-        echo_json({
-            "device": msgspec.to_builtins(device), "window_ms": window_ms, "run": run and str(run),
-            "fits": [
-                {"model": fit.row.model, "answer": fit.answer, "prompt_tokens": fit.prompt_tokens,
-                 "output_tokens": fit.output_tokens, "ms": known(1000 * fit.seconds),
-                 "in_time": fit.in_time, "joules": fit.joules,
-                 "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value}
-                for fit in results
-            ],
-        })  # fmt: skip
+        echo_json(
+            {
+                "device": msgspec.to_builtins(device),
+                "window_ms": window_ms,
+                "run": run and str(run),
+                "fits": [
+                    {
+                        "model": fit.row.model,
+                        "answer": fit.answer,
+                        "prompt_tokens": fit.prompt_tokens,
+                        "output_tokens": fit.output_tokens,
+                        "ms": known(1000 * fit.seconds),
+                        "in_time": fit.in_time,
+                        "joules": fit.joules,
+                        "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value,
+                    }
+                    for fit in results
+                ],
+            }
+        )
         return
     typer.echo(f"{printable(device.name)} · {printable(device.description)}")
     if device.memory_gb:
@@ -94,9 +110,13 @@ def show(
                 fit.answer,
                 f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
                 _known(fit.seconds, f"{1000 * fit.seconds:.{0 if fit.seconds >= 0.1 else 1}f}"),
-                _known(fit.in_time.value, shown(fit.in_time) if run else yes_or_no[bool(fit.in_time.value)]),
                 _known(
-                    fit.joules.value, shown(fit.joules, joules) if run else joules.number(fit.joules.value)
+                    fit.in_time.value,
+                    shown(fit.in_time) if run else yes_or_no[bool(fit.in_time.value)],
+                ),
+                _known(
+                    fit.joules.value,
+                    shown(fit.joules, joules) if run else joules.number(fit.joules.value),
                 ),
                 f"{fit.row.memory_gb.value:.2g}" if fit.row.memory_gb else "unknown",
             )
@@ -106,9 +126,12 @@ def show(
     typer.echo()
     if run:
         echo_text(
-            f"{printable(run)}: n = {len(answers.prompt)} answers of {printable(answers.who)} for the ego; "
-            "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; in time: "
-            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are counted by the "
+            f"{printable(run)}: n = {len(answers.prompt)} answers of {printable(answers.who)} for "
+            "the ego; "
+            "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; "
+            "in time: "
+            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are "
+            "counted by the "
             "model's own tokenizer"
         )
     _origins(device, rows)
@@ -116,9 +139,13 @@ def show(
 
 def check(
     name: str = Name,
-    run: Path = typer.Argument(help="Folder of a run made with --batch-size 1 --no-cache.", metavar="RUN"),
+    run: Path = typer.Argument(
+        help="Folder of a run made with --batch-size 1 --no-cache.", metavar="RUN"
+    ),
     model: str | None = typer.Option(
-        None, "--device-model", help="Row of the profile to check. Default: that of the run's model."
+        None,
+        "--device-model",
+        help="Row of the profile to check. Default: that of the run's model.",
     ),
     as_json: options.Json = False,
 ) -> None:
@@ -137,8 +164,11 @@ def check(
     if as_json:
         echo_json(results)
         return
-    scales = {"seconds": ("answer, ms", 1000.0), "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
-              "decode_tokens_per_s": ("decoding, tokens/s", 1.0)}  # fmt: skip
+    scales = {
+        "seconds": ("answer, ms", 1000.0),
+        "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
+        "decode_tokens_per_s": ("decoding, tokens/s", 1.0),
+    }
     table(
         ["role", "what", "measured", f"{printable(device.name)} says", "n"],
         [
@@ -153,7 +183,8 @@ def check(
         ],
     )
     echo_text(
-        f"medians of answers asked alone, with 95 % intervals over episodes; {printable(row.model)}'s row"
+        "medians of answers asked alone, with 95 % intervals over episodes; "
+        f"{printable(row.model)}'s row"
     )
     _origins(device, [row])
 
@@ -163,14 +194,16 @@ def measure(
     engine: options.Engine = None,
     prompt: options.Prompt = "v2",
     answer: options.Answer = "json",
-    window_s: float = typer.Option(2.0, help="Length of each of the five measurements in s, at least."),
+    window_s: float = typer.Option(
+        2.0, help="Length of each of the five measurements in s, at least."
+    ),
     device: options.Device = None,
     as_json: options.Json = False,
 ) -> None:
     """Measure the energy of a model's answers on this machine.
 
-    The meters are NVML, RAPL and a Jetson's rails; `harness model doctor` lists those that can be read. Each
-    measurement first idles, then asks one question after the other for as long.
+    The meters are NVML, RAPL and a Jetson's rails; `harness model doctor` lists those that can be
+    read. Each measurement first idles, then asks one question after the other for as long.
     """
     from harness.backends import cards
     from harness.backends.counters import counters
@@ -184,28 +217,43 @@ def measure(
     meters = counters()
     if not meters:
         raise UserError(
-            "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and the "
+            "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and "
+            "the "
             "nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
         )
-    agent = Agent(cards.load(f"{model}:{engine}" if engine else model), versions.load(prompt), answer)
+    agent = Agent(
+        cards.load(f"{model}:{engine}" if engine else model), versions.load(prompt), answer
+    )
     with bar("windows", WINDOWS, quiet=as_json) as progress:
         powers, n = measure_agent(agent, meters, window_s, device, progress)
     if as_json:
-        echo_json({
-            "model": agent.name, "answers": n, "windows": WINDOWS, "window_s": window_s, "meters": powers
-        })  # fmt: skip
+        echo_json(
+            {
+                "model": agent.name,
+                "answers": n,
+                "windows": WINDOWS,
+                "window_s": window_s,
+                "meters": powers,
+            }
+        )
         return
     typer.echo(f"{printable(agent.name)} · {n} answers, one by one")
     table(
         ["meter", "idle W", "asking W", "J an answer", "J above idling"],
         [
-            (printable(each.meter), f"{each.idle_watts:.2f}", shown(each.watts, Unit("W", 2)),
-             shown(each.answer_j, Unit("J", 3)), shown(each.more_j, Unit("J", 3)))
+            (
+                printable(each.meter),
+                f"{each.idle_watts:.2f}",
+                shown(each.watts, Unit("W", 2)),
+                shown(each.answer_j, Unit("J", 3)),
+                shown(each.more_j, Unit("J", 3)),
+            )
             for each in powers
         ],
-    )  # fmt: skip
+    )
     echo_text(
-        f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a meter "
+        f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a "
+        "meter "
         "counts all that draws from it, other programs and idling included"
     )
 
@@ -214,11 +262,18 @@ def _origins(device: "Device", rows: "Sequence[DeviceRow]") -> None:
     """Print what the numbers rest on, each source once."""
     from harness.runs.devices import APART, JOULES, RATES, constants
 
-    for names, head in (((*RATES, "answer_ms"), "times"), (tuple(JOULES), "J"), (("memory_gb",), "GB")):
+    for names, head in (
+        ((*RATES, "answer_ms"), "times"),
+        (tuple(JOULES), "J"),
+        (("memory_gb",), "GB"),
+    ):
         sources = {
             f"{c.status} ({_source(device, c)})": None
             for row in rows
-            for name, c in (*constants(device, row), *((name, getattr(row, name)) for name in APART))
+            for name, c in (
+                *constants(device, row),
+                *((name, getattr(row, name)) for name in APART),
+            )
             if name in names and c
         }
         echo_text(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")

@@ -45,7 +45,9 @@ class Videos(Protocol):
         ...
 
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
-        """Draw at most so many episodes that failed under the run's last condition; return the files."""
+        """Draw at most so many episodes that failed under the run's last condition;
+        return the files.
+        """
         ...
 
 
@@ -87,14 +89,19 @@ def command(
     world: Any = settings.world
     if ALL in settings.condition:
         if len(settings.condition) > 1:
-            raise UserError(f"--condition {ALL} stands for every operating point; leave the others out")
+            raise UserError(
+                f"--condition {ALL} stands for every operating point; leave the others out"
+            )
         settings = changed(settings, {"condition": ()})
-    name = options.scenario_name(world.scenario if world.scenario or env else DEFAULT, env, env_config)
+    name = options.scenario_name(
+        world.scenario if world.scenario or env else DEFAULT, env, env_config
+    )
     name = name if agents is None else deciding(name, agents)
     who, part = options.workers_of(workers), options.shard_of(shard)
     if part and (out is None or save_video or tracker):
         raise UserError(
-            f"--shard {part}: give --out with a folder for this shard alone, and leave --save-video and "
+            f"--shard {part}: give --out with a folder for this shard alone, and leave "
+            "--save-video and "
             "--tracker out"
         )
     if save_video:
@@ -108,7 +115,8 @@ def command(
     spec = resolve.spec(settings, source)
     if max_cost is not None and not isinstance(who, int):
         raise UserError(
-            f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; leave it out"
+            f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; "
+            "leave it out"
         )
     silent, trackers = as_json or quiet, hooks.chosen(tracker or ())
     with costs.budget(max_cost, [spec]) as limit:
@@ -127,34 +135,48 @@ def command(
                 videos.extend(drawer.write(where, save_video, silent))
 
         done, page = evaluate(
-            spec, where, cache=None if no_cache else default_file(), quiet=silent, workers=who, full=full,
-            then=draw, hooks=trackers,
-        )  # fmt: skip
+            spec,
+            where,
+            cache=None if no_cache else default_file(),
+            quiet=silent,
+            workers=who,
+            full=full,
+            then=draw,
+            hooks=trackers,
+        )
     tell(done, as_json, quiet)
     if silent:
         return
     if videos:
-        typer.echo(f"wrote {printable(where / 'videos')}: {', '.join(video.name for video in videos)}")
+        typer.echo(
+            f"wrote {printable(where / 'videos')}: {', '.join(video.name for video in videos)}"
+        )
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {printable(page)}")
 
 
 def deciding(scenario: str, agents: str) -> str:
-    """Return the name of a scenario in which these agents decide. Raises UserError if it has no seats."""
+    """Return the name of a scenario in which these agents decide.
+    Raises UserError if it has no seats.
+    """
     from harness.world import scenarios
 
     share = {"ego": "0", ALL: "1"}.get(agents, agents)
     if not re.fullmatch(r"[01]|0?\.\d+|[01]\.0*", share):
         raise UserError(
-            f"--agents is {printable(agents)!r}; give ego, all, or a share from 0 to 1, written as 0.5"
+            f"--agents is {printable(agents)!r}; give ego, all, or a share from 0 to 1, written as "
+            "0.5"
         )
     if SHARE in scenario:
-        raise UserError(f"--agents {agents}: {printable(scenario)} states {SHARE} already; give one of them")
+        raise UserError(
+            f"--agents {agents}: {printable(scenario)} states {SHARE} already; give one of them"
+        )
     if share != "0" and SHARE not in scenarios.get(scenario).dials:
         able = [name for name in scenarios.names() if SHARE in scenarios.get(name).dials]
         raise UserError(
-            f"--agents {agents}: in {printable(scenario)} only the ego has a goal; use {', '.join(able)}"
+            f"--agents {agents}: in {printable(scenario)} only the ego has a goal; use "
+            f"{', '.join(able)}"
         )
     if share == "0":
         return scenario

@@ -41,7 +41,8 @@ def command(
     repeat: int | None = typer.Option(
         None,
         "--repeats",
-        help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a --temperature "
+        help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a "
+        "--temperature "
         "above 0.",
         rich_help_panel=ANSWERS,
     ),
@@ -80,29 +81,39 @@ def command(
     specs = [resolve.spec(settings, source) for source in sources]
     if named:
         suite.check(named, specs)
-    several = f"--repeats {repeat}" if repeat is not None else f"suite {named.name}" if named else ""
+    several = (
+        f"--repeats {repeat}" if repeat is not None else f"suite {named.name}" if named else ""
+    )
     if several and sources[0].until:
-        raise UserError(f"{several}: runs that stop early have other layouts each; leave --until-... out")
+        raise UserError(
+            f"{several}: runs that stop early have other layouts each; leave --until-... out"
+        )
     if repeat is not None:
         if named:
             raise UserError(
-                f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of its "
+                f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of "
+                "its "
                 "datasets"
             )
         if full:
             raise UserError("--full: repeats have a page without decisions; leave it out")
         if tracker:
-            raise UserError(f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out")
+            raise UserError(
+                f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out"
+            )
         repeats.check(specs[0], repeat)
         if workers is not None:
             raise UserError(
-                f"--workers {printable(workers)}: repeats are asked from one process; leave it out, or type "
+                f"--workers {printable(workers)}: repeats are asked from one process; leave it "
+                "out, or type "
                 "a command for each --sampling-seed"
             )
     if dry_run:
         from harness.evaluate.dry_run import count
 
-        counted = [count(spec, dataset, tokenizer) for spec, dataset in zip(specs, frozen, strict=True)]
+        counted = [
+            count(spec, dataset, tokenizer) for spec, dataset in zip(specs, frozen, strict=True)
+        ]
         if repeat is not None:
             counted[0] |= {"repeats": repeat}
         if as_json:
@@ -119,7 +130,9 @@ def command(
     with costs.budget(max_cost, specs) as limit:
         specs = [replace(spec, budget=limit) for spec in specs]
         silent, cache = as_json or quiet, None if no_cache else default_file()
-        evaluated = partial(evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=trackers)
+        evaluated = partial(
+            evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=trackers
+        )
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
             return
@@ -137,12 +150,17 @@ def command(
     selected = bool(sources[0].selection.given)
     seeds_of = dataset.manifest.episodes if selected else len(dataset.episodes)
     references = in_trees(dataset)
-    gain = [of for of in [GAINS[leading.lead_of(done)]] if any(s.metric == of.metric for s in done.scores)]
+    gain = [
+        of
+        for of in [GAINS[leading.lead_of(done)]]
+        if any(s.metric == of.metric for s in done.scores)
+    ]
     beside = {name: references[name] for name in BESIDE if name in references}
     notes = (
         f"n = {crossed(len(dataset.episodes), len(specs[0].seeds))}; "
         f"{'of ' if selected else ''}{stated(dataset.manifest.seed, seeds_of)};",
-        "95 % intervals over episodes; msgs: per episode" + "; gain: over single-local, paired" * bool(gain),
+        "95 % intervals over episodes; msgs: per episode"
+        + "; gain: over single-local, paired" * bool(gain),
         *map(meaning, beside),
     )
     rows = {label(name, dataset.scenario): scores for name, scores in beside.items()}
@@ -156,12 +174,14 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
     for agent in (agent for spec in specs for agent in spec.agents if agent.can.language_model):
         if not agent.card.server:
             raise UserError(
-                f"--workers {printable(workers)}: rules and servers answer to several processes, and "
+                f"--workers {printable(workers)}: rules and servers answer to several processes, "
+                "and "
                 f"{printable(agent.card.name)} is a language model of one; give --batch-size"
             )
         if isinstance(who, Ray):
             raise UserError(
-                f"--workers {printable(workers)}: {printable(agent.card.name)} is asked at servers, by "
+                f"--workers {printable(workers)}: {printable(agent.card.name)} is asked at "
+                "servers, by "
                 "processes of this machine; give their number"
             )
 
@@ -171,14 +191,17 @@ def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
     if "helper" in by_role and not spec.asks_all:
-        requests = f"{by_role['ego']} requests to the ego and at most {by_role['helper']} to helpers"
+        requests = (
+            f"{by_role['ego']} requests to the ego and at most {by_role['helper']} to helpers"
+        )
     elif "fusion" in by_role:
         requests = f"{counted['requests'] - by_role['fusion']} requests"
     if "fusion" in by_role:
         requests += f", at most {by_role['fusion']} fusion calls"
     typer.echo(
         f"{spec.source.name}: {requests}{repeated} for the {counted['scenes']} scenes "
-        f"on the reference drivers' courses; would score {len(spec.points)} conditions × {len(spec.seeds)} "
+        f"on the reference drivers' courses; would score {len(spec.points)} conditions × "
+        f"{len(spec.seeds)} "
         "channel seeds; no model was called"
     )
     echo_prompt_tokens(counted["prompt_tokens"])

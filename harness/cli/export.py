@@ -18,13 +18,26 @@ from harness.runs.exports import EXPORTS, Export, Option, options_of
 
 # Words of the command's own options.
 TAKEN = {
-    "added", "as_csv", "as_jsonl", "csv", "dataset", "help", "jsonl", "junit", "out", "run", "values",
-}  # fmt: skip
-NONE: Mapping[str, Any] = MappingProxyType({})  # of formats and their options, where no extension adds one
+    "added",
+    "as_csv",
+    "as_jsonl",
+    "csv",
+    "dataset",
+    "help",
+    "jsonl",
+    "junit",
+    "out",
+    "run",
+    "values",
+}
+# of formats and their options, where no extension adds one
+NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 def _formats() -> dict[str, Export]:
-    """Return the formats that extensions add, by option, but those whose name is taken or no option's."""
+    """Return the formats that extensions add, by option,
+    but those whose name is taken or no option's.
+    """
     return {f"--{name}": format for name, format in EXPORTS.usable().items() if _is_free(name, ())}
 
 
@@ -49,7 +62,8 @@ def _word(flag: str) -> str:
 def _with_formats(command: Any) -> Any:
     """Give a command the options that extensions add.
 
-    It gets what is typed for a format's file as `added`, and for a further option as `values`, by option.
+    It gets what is typed for a format's file as `added`,
+    and for a further option as `values`, by option.
     """
     formats = _formats()
     options = _options(formats)
@@ -76,7 +90,9 @@ def _file(flag: str, format: Export) -> inspect.Parameter:
 def _value(flag: str, option: Option) -> inspect.Parameter:
     if option.kind is bool:
         return _parameter(flag, typer.Option(False, flag, help=option.help), bool)
-    return _parameter(flag, typer.Option(None, help=option.help, show_default=False), option.kind | None)
+    return _parameter(
+        flag, typer.Option(None, help=option.help, show_default=False), option.kind | None
+    )
 
 
 def _parameter(flag: str, default: Any, annotation: Any) -> inspect.Parameter:
@@ -94,7 +110,9 @@ def command(
         help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
         "spreadsheet would take for a formula gets an apostrophe before it.",
     ),
-    as_jsonl: bool = typer.Option(False, "--jsonl", help="Write decisions.jsonl, one object per decision."),
+    as_jsonl: bool = typer.Option(
+        False, "--jsonl", help="Write decisions.jsonl, one object per decision."
+    ),
     out: Path | None = typer.Option(
         None, help="Folder for the files of --csv and --jsonl. Default: the run's."
     ),
@@ -117,7 +135,9 @@ def command(
         raise UserError(f"{', '.join(asked)}: give exactly one of them")
     formats = _formats()
     further = _options(formats)
-    typed = {flag: value for flag, value in values.items() if value is not None and value is not False}
+    typed = {
+        flag: value for flag, value in values.items() if value is not None and value is not False
+    }
     for flag, value in typed.items():
         if why := further[flag].refusal(value, option):
             raise UserError(why)
@@ -127,7 +147,8 @@ def command(
         raise UserError(f"--dataset only goes with {goes_with}; leave it out")
     if out and option in files:
         raise UserError(
-            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out out"
+            f"--out only goes with --csv and --jsonl; {option} names its own file, so leave --out "
+            "out"
         )
     if junit and (reason := work.unanswered(run)):
         from harness.report.page import save
@@ -141,7 +162,8 @@ def command(
     target = files.get(option)
     try:
         if as_csv:
-            decisions, answers = source.decisions, source.answers  # both are read before anything is written
+            # both are read before anything is written
+            decisions, answers = source.decisions, source.answers
             written = [
                 export.decisions_csv(decisions, folder / "decisions.csv"),
                 export.answers_csv(answers, source.actions, folder / "answers.csv"),
@@ -154,7 +176,11 @@ def command(
             format = formats[option]
             extras.need(option, *(module for module in extras.OPTIONAL if module in format.needs))
             own = {f"--{name}": each for name, each in options_of(format).items()}
-            rest = {_word(flag): value for flag, value in typed.items() if own.get(flag) is further[flag]}
+            rest = {
+                _word(flag): value
+                for flag, value in typed.items()
+                if own.get(flag) is further[flag]
+            }
             ours = type(format).__module__.startswith("harness.")
             with bar(format.doing), worded(f"format {option}", built_in=ours):
                 wrote: object = format.write(source, file, dataset, **rest)
@@ -162,7 +188,11 @@ def command(
                     raise ValueError("it wrote no file")
             written = [wrote]
     except OSError as error:
-        where = f"{option} {printable(target)}" if target else f"{'--out ' if out else ''}{printable(folder)}"
+        where = (
+            f"{option} {printable(target)}"
+            if target
+            else f"{'--out ' if out else ''}{printable(folder)}"
+        )
         remedy = "name another file" if target else "choose another folder with --out"
         raise UserError(f"{where} cannot be written ({error.strerror}); {remedy}") from None
     for file in written:

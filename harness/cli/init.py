@@ -10,7 +10,9 @@ PROMPT = "v3"  # what one's own prompt begins as
 
 
 def command(
-    folder: Path = typer.Argument(metavar="DIR", help="Folder to make; it may exist if it is empty."),
+    folder: Path = typer.Argument(
+        metavar="DIR", help="Folder to make; it may exist if it is empty."
+    ),
 ) -> None:
     """Make a project with a prompt, a model card and settings.
 
@@ -23,21 +25,30 @@ def command(
 
     starter = Path(__file__).parent / "starter"
     try:
-        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {".git"}):
+        if folder.exists() and (
+            not folder.is_dir() or {path.name for path in folder.iterdir()} - {".git"}
+        ):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder) as draft:  # so that a full disk leaves nothing half-written
-            # Contents alone: what is installed may be read-only, and a project is there to be changed.
+        # so that a full disk leaves nothing half-written
+        with TemporaryDirectory(dir=folder) as draft:
+            # Contents alone: what is installed may be read-only, and a project is there to be
+            # changed.
             copytree(starter, draft, copy_function=copyfile, dirs_exist_ok=True)
             copytree(
-                resources.folder("prompts") / PROMPT, Path(draft, "prompts/mine"), copy_function=copyfile
+                resources.folder("prompts") / PROMPT,
+                Path(draft, "prompts/mine"),
+                copy_function=copyfile,
             )
             for whole in Path(draft).iterdir():
                 whole.rename(folder / whole.name)
     except OSError as error:
         reason = printable(error.strerror)
-        raise UserError(f"{printable(folder)} cannot be made ({reason}); give another folder") from None
+        raise UserError(
+            f"{printable(folder)} cannot be made ({reason}); give another folder"
+        ) from None
     typer.echo(
-        f"made {printable(folder)}; next: cd there, `harness eval --model swarm-tiny --prompt mine`; "
+        f"made {printable(folder)}; next: cd there, `harness eval --model swarm-tiny --prompt "
+        "mine`; "
         "README.md says more"
     )

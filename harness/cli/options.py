@@ -1,4 +1,6 @@
-"""Options that several commands have, and the options of an evaluation, which its settings state."""
+"""Options that several commands have, and the options of an evaluation,
+which its settings state.
+"""
 
 import inspect
 from collections.abc import Callable, Collection, Mapping
@@ -24,12 +26,16 @@ else:  # typer takes any text; what is evaluated says which are allowed
 
 _RAY = "or a Ray cluster: ray, ray://HOST:PORT or ray:HOST:PORT."
 
-Runs = Annotated[list[Path], Argument(help="One or more folders of finished runs.", metavar="RUN...")]
+Runs = Annotated[
+    list[Path], Argument(help="One or more folders of finished runs.", metavar="RUN...")
+]
 Reports = Annotated[Path, Argument(metavar="DIR", help="Folder that holds the runs.")]
 Model = Annotated[
     str,
     Option(
-        help="Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
+        help="Model: a card name (`harness model list` shows "
+        "them), a checkpoint directory, a .gguf "
+        "file, a "
         "hub id, or the URL of a server."
     ),
 ]
@@ -37,22 +43,30 @@ RunModel = Annotated[
     list[str] | None,
     Option(
         "--model",
-        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf file, a hub "
-        "id or a URL. Nothing that only a run names is opened or asked. Repeatable, for several models.",
+        help="The run's model, where it is none of your cards: a checkpoint directory, a .gguf "
+        "file, a hub "
+        "id or a URL. Nothing that only a run names is opened or asked. Repeatable, for several "
+        "models.",
     ),
 ]
-Scenario = Annotated[str, Argument(help="Scenario name; `harness dataset scenario list` shows them.")]
+Scenario = Annotated[
+    str, Argument(help="Scenario name; `harness dataset scenario list` shows them.")
+]
 Env = Annotated[
     str | None,
     Option(
-        help="A highway-env environment to use instead of a scenario: merge-v0, or my_package:MyEnv-v0 for "
+        help="A highway-env environment to use instead of a scenario: merge-v0, or "
+        "my_package:MyEnv-v0 for "
         "one of your own.",
         rich_help_panel=stated.EPISODES,
     ),
 ]
 EnvConfig = Annotated[
     Path | None,
-    Option(help="With --env: JSON file with changes to its configuration.", rich_help_panel=stated.EPISODES),
+    Option(
+        help="With --env: JSON file with changes to its configuration.",
+        rich_help_panel=stated.EPISODES,
+    ),
 ]
 Engine = Annotated[str | None, Option(help=HELP["engine"])]
 Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows them.")]
@@ -61,20 +75,25 @@ RunSeeds = Annotated[
     str | None, Option("--seeds", help="Channel seeds, such as 0:5 or 3,7,9. Default: the run's.")
 ]
 RunLatency = Annotated[
-    str, Option("--latency", help="Inference time of one answer: run (as in the run) or paper (145 ms).")
+    str,
+    Option(
+        "--latency", help="Inference time of one answer: run (as in the run) or paper (145 ms)."
+    ),
 ]
 NoModel = Annotated[
     bool,
     Option(
         "--no-model",
-        help="Never ask the model: leave out episodes that reach a decision point without a stored answer.",
+        help="Never ask the model: leave out episodes that reach a decision point without a stored "
+        "answer.",
     ),
 ]
 RunsDataset = Annotated[
     Path | None,
     Option(
         "--dataset",
-        help="Folder of the run's dataset, if it has moved. Default: where the run states, or by its name.",
+        help="Folder of the run's dataset, if it has moved. Default: where the run states, or by "
+        "its name.",
     ),
 ]
 Dataset = Annotated[str, Option(help="Name of a shipped dataset, or a dataset's folder.")]
@@ -106,21 +125,26 @@ RuleWorkers = Annotated[
     str | None,
     Option(
         metavar="WHO",
-        help=f"Number of worker processes, {_RAY} For rules such as proxy, and for processes that ask "
-        "servers; used on more than 256 layouts, and for the report of more than 5376 scenes. Default: 2, of "
+        help=f"Number of worker processes, {_RAY} For rules such as proxy, and for processes that "
+        "ask "
+        "servers; used on more than 256 layouts, and for the report of more than 5376 scenes. "
+        "Default: 2, of "
         "servers 1.",
         rich_help_panel=stated.ENGINE,
     ),
 ]
 PageWorkers = Annotated[
     str,
-    Option(metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 5376 scenes."),
+    Option(
+        metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 5376 scenes."
+    ),
 ]
 FullPage = Annotated[
     bool,
     Option(
         "--full",
-        help="Write prompts that no model reads, and every decision's camera pictures, into the page too.",
+        help="Write prompts that no model reads, and every decision's camera pictures, into the "
+        "page too.",
         rich_help_panel=stated.OUTPUT,
     ),
 ]
@@ -128,7 +152,8 @@ Shard = Annotated[
     str | None,
     Option(
         metavar="I/N",
-        help="Do only part I of N, such as 3/16; `harness run merge` joins the parts. auto/N takes I from "
+        help="Do only part I of N, such as 3/16; `harness run merge` joins the parts. auto/N takes "
+        "I from "
         "the task number of a Slurm or Kubernetes job.",
         rich_help_panel=stated.EPISODES,
     ),
@@ -154,7 +179,8 @@ MaxCost = Annotated[
     float | None,
     Option(
         metavar="AMOUNT",
-        help="Ask no more once the answers of this command have cost so much, in the currency of the card's "
+        help="Ask no more once the answers of this command have cost so much, in the currency of "
+        "the card's "
         "[price]. The same command goes on.",
         rich_help_panel=stated.ENGINE,
     ),
@@ -162,7 +188,8 @@ MaxCost = Annotated[
 Tokenizer = Annotated[
     Path | None,
     Option(
-        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF file. "
+        help="With --dry-run: tokenizer to count with: a tokenizer.json, its folder, or a GGUF "
+        "file. "
         "Default: the model's.",
         rich_help_panel=stated.OUTPUT,
     ),
@@ -174,12 +201,15 @@ QuietOutput = Annotated[bool, Option("--quiet", help=_QUIET, rich_help_panel=sta
 
 
 def takes(
-    world: type[stated.FrozenSettings] | type[stated.DriveSettings], help: Mapping[str, str] = {},
+    world: type[stated.FrozenSettings] | type[stated.DriveSettings],
+    help: Mapping[str, str] = {},
     without: Collection[str] = (),
-) -> Callable[[Any], Any]:  # fmt: skip
-    """Give a command the options of an evaluation; the command's first parameter gets their `Settings`.
+) -> Callable[[Any], Any]:
+    """Give a command the options of an evaluation;
+    the command's first parameter gets their `Settings`.
 
-    A first argument names a file of settings, or a run's folder; options that are typed beside it win.
+    A first argument names a file of settings, or a run's folder;
+    options that are typed beside it win.
 
     Args:
         world: what is evaluated.
@@ -211,7 +241,8 @@ def takes(
             default=Argument(
                 None,
                 metavar="RUN.TOML",
-                help="Settings of a run: its run.toml, or its folder. Options that are typed beside it win.",
+                help="Settings of a run: its run.toml, or its folder. Options that are typed "
+                "beside it win.",
             ),
             annotation=Path | None,
         )
@@ -224,7 +255,9 @@ def takes(
 
 
 def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
-    """Return a function as typer reads it: with these parameters, and the name and help of a command."""
+    """Return a function as typer reads it:
+    with these parameters, and the name and help of a command.
+    """
     typed.__signature__ = inspect.Signature(parameters)
     typed.__annotations__ = {each.name: each.annotation for each in parameters}
     typed.__doc__, typed.__name__ = command.__doc__, command.__name__
@@ -232,9 +265,15 @@ def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) ->
 
 
 def _parameter(option: stated.Option) -> inspect.Parameter:
-    """Return a setting as a parameter; it is None where nothing is typed, so that a file's value stays."""
+    """Return a setting as a parameter;
+    it is None where nothing is typed, so that a file's value stays.
+    """
     flags = (option.flag, *([option.off] if option.kind is bool else ()))
-    usual = "" if option.default in (None, ()) or option.kind is bool else f" Default: {option.default}."
+    usual = (
+        ""
+        if option.default in (None, ()) or option.kind is bool
+        else f" Default: {option.default}."
+    )
     return inspect.Parameter(
         option.name,
         inspect.Parameter.KEYWORD_ONLY,
@@ -260,7 +299,8 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
     for dataset in datasets:
         if limit is not None and limit > (n := dataset.manifest.episodes):
             echo(
-                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are used",
+                f"--limit {limit}: {printable(dataset.name)} has {n} episodes, all of which are "
+                "used",
                 err=True,
             )
 
@@ -272,7 +312,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
     from harness.world.environments import environment
 
     if (name is None) == (env is None):
-        raise UserError("give either a scenario or --env; `harness dataset scenario list` lists scenarios")
+        raise UserError(
+            "give either a scenario or --env; `harness dataset scenario list` lists scenarios"
+        )
     if name is not None:
         if env_config is not None:
             raise UserError("--env-config changes an environment; give --env as well")
@@ -287,12 +329,15 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
         return named
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
-            f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a JSON file"
+            f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a "
+            "JSON file"
         ) from None
 
 
 def typed_scenario(scenario: str) -> str:
-    """Return a scenario's name that the user typed, which may thus import an environment's module."""
+    """Return a scenario's name that the user typed,
+    which may thus import an environment's module.
+    """
     from harness.world.environments import environment
 
     if scenario.startswith(environment.PREFIX):

@@ -1,4 +1,6 @@
-"""`harness prompt parse`: how one answer is parsed. A failed verdict is data, so the exit code is 0."""
+"""`harness prompt parse`: how one answer is parsed.
+A failed verdict is data, so the exit code is 0.
+"""
 
 import os
 import sys
@@ -16,19 +18,25 @@ FINISH_REASONS = ("stop", "length", "refusal", "error")
 
 def command(
     file: str = typer.Argument(help="File with one raw completion; - means standard input."),
-    scenario: str = typer.Option("occluded-intersection", help="Scenario whose actions the answer is about."),
+    scenario: str = typer.Option(
+        "occluded-intersection", help="Scenario whose actions the answer is about."
+    ),
     role: str = typer.Option("ego", help="Role that answered: ego or helper."),
     prompt: str | None = typer.Option(
         None,
-        help="Prompt version that asked: its form of answer, what else it asks for, and whether reasons may "
+        help="Prompt version that asked: its form of answer, what else it asks for, and whether "
+        "reasons may "
         "come first. Default: any form.",
     ),
-    thinking: bool = typer.Option(False, "--thinking", help="State that the model was asked to think first."),
+    thinking: bool = typer.Option(
+        False, "--thinking", help="State that the model was asked to think first."
+    ),
     reasons_first: bool = typer.Option(
         False, "--reasons-first", help="State that the prompt asked for reasons before the answer."
     ),
     finish_reason: str = typer.Option(
-        "stop", help="Why the engine stopped: stop (it was done), length (token limit), refusal or error."
+        "stop",
+        help="Why the engine stopped: stop (it was done), length (token limit), refusal or error.",
     ),
     as_json: options.Json = False,
 ) -> None:
@@ -49,18 +57,36 @@ def command(
     if prompt is not None:
         version = versions.load(prompt)
         if reason := versions.unfit(version, of):
-            raise errors.UserError(f"--prompt {errors.printable(version.version)} {reason}; give {of.prompt}")
-        shape, reasons_first = version.shape(role, actions), reasons_first or role in version.reasons_first
+            raise errors.UserError(
+                f"--prompt {errors.printable(version.version)} {reason}; give {of.prompt}"
+            )
+        shape, reasons_first = (
+            version.shape(role, actions),
+            reasons_first or role in version.reasons_first,
+        )
     parsed = parse(
-        _read(file), **shape._asdict(), thinking=thinking, reasons_first=reasons_first,
+        _read(file),
+        **shape._asdict(),
+        thinking=thinking,
+        reasons_first=reasons_first,
         finish_reason=finish_reason,
-    )  # fmt: skip
+    )
     shares = None if parsed.intent is None else dict(zip(actions, parsed.intent, strict=True))
     if as_json:
         fields = (
-            "status", "verdict", "repairs", "intent", "mass", "message", "extension", "reasoning", "detail",
-        )  # fmt: skip
-        echo_json({**{name: getattr(parsed, name) for name in fields}, "intent": shares}, indent=None)
+            "status",
+            "verdict",
+            "repairs",
+            "intent",
+            "mass",
+            "message",
+            "extension",
+            "reasoning",
+            "detail",
+        )
+        echo_json(
+            {**{name: getattr(parsed, name) for name in fields}, "intent": shares}, indent=None
+        )
         return
     rows = [("status", f"{parsed.status}: {parsed.status.meaning}")]
     rows += [("repair", f"{repair}: {repair.meaning}") for repair in parsed.repairs]
@@ -80,7 +106,9 @@ def command(
 
 
 def _read(file: str) -> str:
-    """The text, line ends untouched. Bytes that are not UTF-8 become U+FFFD, and a note on stderr says so."""
+    """The text, line ends untouched. Bytes that are not UTF-8 become U+FFFD,
+    and a note on stderr says so.
+    """
     try:
         if file == "-" or os.path.dirname(file) in HANDED_OVER:
             with sys.stdin.buffer if file == "-" else open(file, "rb") as source:
@@ -93,10 +121,13 @@ def _read(file: str) -> str:
         reason = getattr(error, "strerror", None) or str(error)
         shown = errors.printable(file)
         raise errors.UserError(
-            f"cannot read completion file {shown!r}: {reason}; give a text file, or - for what is piped in"
+            f"cannot read completion file {shown!r}: {reason}; give a text file, or - for what is "
+            "piped in"
         ) from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        typer.echo(f"note: not UTF-8 from byte {error.start} on; such bytes are read as U+FFFD", err=True)
+        typer.echo(
+            f"note: not UTF-8 from byte {error.start} on; such bytes are read as U+FFFD", err=True
+        )
         return data.decode("utf-8-sig", errors="replace")

@@ -1,4 +1,6 @@
-"""The picture of an image prompt: the model that it is drawn for, its tokens, its looks in a terminal."""
+"""The picture of an image prompt: the model that it is drawn for, its tokens,
+its looks in a terminal.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +36,9 @@ class PictureModel:
     def picture(self) -> str:
         """Its pictures, in a line."""
         name, (width, height) = printable(self.card.name), self.vision.size_px
-        return f"{width} x {height} pixels, front above rear; {self.vision.tokens} tokens with {name}"
+        return (
+            f"{width} x {height} pixels, front above rear; {self.vision.tokens} tokens with {name}"
+        )
 
     @property
     def checked(self) -> bool:
@@ -51,10 +55,17 @@ class PictureModel:
     def as_mapping(self) -> dict[str, Any]:
         """Return the same as plain values."""
         width, height = self.vision.size_px
-        return {"model": self.card.name, "width_px": width, "height_px": height, "tokens": self.vision.tokens}
+        return {
+            "model": self.card.name,
+            "width_px": width,
+            "height_px": height,
+            "tokens": self.vision.tokens,
+        }
 
 
-def picture_model(prompt: "Prompt", model: str | None, checked: bool = False) -> PictureModel | None:
+def picture_model(
+    prompt: "Prompt", model: str | None, checked: bool = False
+) -> PictureModel | None:
     """Return the model that an image prompt's picture is drawn for; None if the prompt shows none.
 
     Args:
@@ -73,26 +84,32 @@ def picture_model(prompt: "Prompt", model: str | None, checked: bool = False) ->
     card = resolve(model or MODEL)
     if card.vision is None:
         raise UserError(
-            f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this model reads "
+            f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this "
+            "model reads "
             f"texts alone (its card has no [vision]); give another, such as {MODEL}"
         )
     return PictureModel(card, card.vision, processor_tokens(card) if checked else None)
 
 
 def write(image: "Image", file: Path) -> str:
-    """Write a picture as a PNG file, its folder made where it is not there; returns what to say of it."""
+    """Write a picture as a PNG file, its folder made where it is not there;
+    returns what to say of it.
+    """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         write_whole(file, image.png())
     except OSError as error:
         raise UserError(
-            f"--out {printable(file.parent)} cannot be written ({error.strerror}); give another folder"
+            f"--out {printable(file.parent)} cannot be written ({error.strerror}); give another "
+            "folder"
         ) from None
     return f"wrote {printable(file)}"
 
 
 def draw(image: "Image") -> bool:
-    """Draw a picture in the terminal. False, and nothing drawn, where there is none, or none with colours."""
+    """Draw a picture in the terminal. False, and nothing drawn, where there is none,
+    or none with colours.
+    """
     screen = console()
     if not screen.is_terminal or screen.color_system in (None, "standard"):
         return False
@@ -101,7 +118,9 @@ def draw(image: "Image") -> bool:
 
 
 def half_blocks(pixels: "Pixels") -> "Text":
-    """A picture in characters: each is an upper half block of one pixel's colour on the colour of another."""
+    """A picture in characters: each is an upper half block of one pixel's colour on the colour of
+    another.
+    """
     from rich.color import Color
     from rich.style import Style
     from rich.text import Text

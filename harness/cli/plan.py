@@ -20,21 +20,25 @@ WHOLE = Unit(decimals=0)
 def command(
     pilots: list[Path] | None = typer.Argument(
         None,
-        help="Finished runs to plan by: one, for the gain of its conditions over single-local, or two, for B "
+        help="Finished runs to plan by: one, for the gain of its conditions over single-local, or "
+        "two, for B "
         "- A.",
         metavar="PILOT",
     ),
     detect: float = typer.Option(5.0, help="Difference of success to find, in points: 0.1 to 99."),
     power: float = typer.Option(80.0, help="Chance to find it, in percent: 50 to 99."),
     layouts: int | None = typer.Option(
-        None, help="Also say which difference so many layouts find. Default: as many as the pilots have."
+        None,
+        help="Also say which difference so many layouts find. Default: as many as the pilots have.",
     ),
     rate: float | None = typer.Option(
         None, help="Instead of pilots: the success that is expected, in percent."
     ),
     correlation: float | None = typer.Option(
         None,
-        help="With --rate: correlation of both outcomes over layouts, 0 to 1. Default: 0, as if the layouts "
+        help="With --rate: correlation of both outcomes over "
+        "layouts, 0 to 1. Default: 0, as if the "
+        "layouts "
         "were not the same.",
     ),
     as_json: options.Json = False,
@@ -51,7 +55,8 @@ def command(
         in_range("--layouts", layouts, 2, MOST)
     if bool(pilots) == (rate is not None):
         raise UserError(
-            "a plan needs one or two finished runs as pilots, or --rate with the success that you expect, in "
+            "a plan needs one or two finished runs as pilots, or --rate with the success that you "
+            "expect, in "
             "percent; give one of both"
         )
     if correlation is not None:
@@ -83,16 +88,24 @@ def _show(plan: "Plan", detect: float, power: float) -> None:
         if not needed.n:
             layouts = WHOLE.number(needed.value)
         cost = [WHOLE.number(value) for value in vars(row.cost).values()] if row.cost else []
-        return [row.condition or "stated rate", layouts, *cost, *([POINTS.text(row.finds)] if finds else [])]
+        return [
+            row.condition or "stated rate",
+            layouts,
+            *cost,
+            *([POINTS.text(row.finds)] if finds else []),
+        ]
 
     table(heads, [cells(row) for row in plan.rows])
     echo_text(
-        f"layouts: so many find a difference of {detect:g} points with a chance of {power:g} %, by a 95 % "
-        f"interval, if {plan.basis}" + ("; [..]: over other pilots of as many layouts" if costs else "")
+        f"layouts: so many find a difference of {detect:g} points with a chance of {power:g} %, by "
+        "a 95 % "
+        f"interval, if {plan.basis}"
+        + ("; [..]: over other pilots of as many layouts" if costs else "")
     )
     if costs:
         echo_text(
-            "requests, tokens, minutes: of all runs and conditions of the pilots, at their number a layout; "
+            "requests, tokens, minutes: of all runs and conditions of the pilots, at their number "
+            "a layout; "
             "minutes one answer after the other, known where pilots asked with --batch-size 1"
         )
     else:

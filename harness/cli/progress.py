@@ -1,4 +1,6 @@
-"""How far anything slower than two seconds is, on stderr: a bar on a terminal, else a line every 30 s."""
+"""How far anything slower than two seconds is, on stderr:
+a bar on a terminal, else a line every 30 s.
+"""
 
 import sys
 import time
@@ -54,7 +56,9 @@ class Bar(Progress):
 
 @contextmanager
 def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) -> Iterator[Bar]:
-    """How many are done, how fast, and the time left (at least, if more follows); nothing if `quiet`."""
+    """How many are done, how fast, and the time left (at least, if more follows);
+    nothing if `quiet`.
+    """
     progress = Bar(label, total, grows)
     if quiet:
         yield progress
@@ -101,7 +105,9 @@ def _lines(progress: Bar) -> Iterator[None]:
 
 
 def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> str:
-    """`asking proxy 812/1206 58.0/s 0:00:07 left`; `marks` are times in seconds and what was done by then."""
+    """`asking proxy 812/1206 58.0/s 0:00:07 left`;
+    `marks` are times in seconds and what was done by then.
+    """
     (since_s, before), (now_s, done) = marks[0], marks[-1]
     speed = (done - before) / (now_s - since_s)
     reached = f"{done}/{progress.total}" if progress.total else str(done or "")
@@ -115,7 +121,14 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
 
 def drawn(console: "Console") -> "Columns":
     """Return the bar's columns. The bar itself gives way where the line is narrow."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+    )
     from rich.table import Column
     from rich.text import Text
 
@@ -134,11 +147,14 @@ def drawn(console: "Console") -> "Columns":
     )
 
 
-def pace(speed: float | None, left_s: float | None, took_s: float | None, grows: bool = False) -> str:
-    """`61.3/s 0:00:06 left`: what is known of how many a second (or minute), and of the seconds to go.
+def pace(
+    speed: float | None, left_s: float | None, took_s: float | None, grows: bool = False
+) -> str:
+    """`61.3/s 0:00:06 left`: what is known of how many a second (or minute),
+    and of the seconds to go.
 
-    It is `at least` so long where more follows from what is done. At the end, `took_s`, it is `in` how long
-    all was done.
+    It is `at least` so long where more follows from what is done.
+    At the end, `took_s`, it is `in` how long all was done.
     """
     parts = []
     if speed:

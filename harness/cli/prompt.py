@@ -22,14 +22,16 @@ Version = Annotated[str, typer.Argument(help="Prompt version; `harness prompt li
 Tokenizer = Annotated[
     Path | None,
     typer.Option(
-        help="Tokenizer to count with: a tokenizer.json, its folder, or a GGUF file with the tokenizer of "
+        help="Tokenizer to count with: a tokenizer.json, its folder, or a GGUF file with the "
+        "tokenizer of "
         "Qwen2."
     ),
 ]
 Asked = Annotated[
     str | None,
     typer.Option(
-        help="Model to ask; of an image prompt, the model whose picture size and picture tokens to use. "
+        help="Model to ask; of an image prompt, the model whose picture size and picture tokens to "
+        "use. "
         f"Default: nobody is asked, and {pictures.MODEL}'s pictures."
     ),
 ]
@@ -41,10 +43,11 @@ def list_prompts(as_json: options.Json = False) -> None:
 
     fields = ("version", "released", "sha256", "description", "changed", "known_failures")
     rows: list[dict[str, Any]] = [
-        {"version": name, "error": str(each)} if isinstance(each, UserError)
+        {"version": name, "error": str(each)}
+        if isinstance(each, UserError)
         else {field: getattr(each, field) for field in fields}
         for name, each in resources.each(prompts.names(), prompts.load).items()
-    ]  # fmt: skip
+    ]
     if as_json:
         echo_json(rows)
     else:
@@ -67,7 +70,8 @@ def show(
     dataset: options.Dataset = resources.DATASET,
     model: str | None = typer.Option(
         None,
-        help="Model that is sent it: its card says where the system text stands, and how large pictures are. "
+        help="Model that is sent it: its card says where the system text stands, and how large "
+        "pictures are. "
         f"Default for pictures: {pictures.MODEL}.",
     ),
     out: Path | None = typer.Option(
@@ -77,8 +81,8 @@ def show(
 ) -> None:
     """Print exactly what a model is sent about a scene.
 
-    Its chat template is not applied yet; the system text stands in the first user turn if the card of
-    `--model` says so. Pictures are drawn if the terminal has colours.
+    Its chat template is not applied yet; the system text stands in the first user turn if the card
+    of `--model` says so. Pictures are drawn if the terminal has colours.
     """
     from harness.backends.cards import resolve
     from harness.backends.chat_template import with_system
@@ -94,15 +98,24 @@ def show(
     if reader is None and out:
         raise UserError(f"--out: prompt {version} shows no picture; leave it out")
     system = resolve(model).system if model else None
-    sent = {v: with_system(prompt.render(at.graphs[v], data.actions, words=words), system) for v in viewers}
+    sent = {
+        v: with_system(prompt.render(at.graphs[v], data.actions, words=words), system)
+        for v in viewers
+    }
     seen = {v: Sight(data.scenario, at.state, v, reader.vision.size_px) for v in viewers if reader}
     wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
     if as_json:
-        images = {v: {**reader.as_mapping(), "sha256": image.sha256} for v, image in seen.items() if reader}
-        echo_json({
-            v: [{**m, "image": images[v]} if "image" in m else m for m in messages]
-            for v, messages in sent.items()
-        })  # fmt: skip
+        images = {
+            v: {**reader.as_mapping(), "sha256": image.sha256}
+            for v, image in seen.items()
+            if reader
+        }
+        echo_json(
+            {
+                v: [{**m, "image": images[v]} if "image" in m else m for m in messages]
+                for v, messages in sent.items()
+            }
+        )
         return
     for v, messages in sent.items():
         for message in messages:
@@ -110,7 +123,9 @@ def show(
             if reader and "image" in message:
                 typer.echo(f"picture: {reader.picture}, sha256 {seen[v].sha256[:8]}")
                 if not pictures.draw(seen[v]) and not out:
-                    typer.echo("not drawn: no terminal with colours here; --out FOLDER writes PNG files")
+                    typer.echo(
+                        "not drawn: no terminal with colours here; --out FOLDER writes PNG files"
+                    )
                 if out:
                     typer.echo(wrote[v])
             for line in message["content"].split("\n"):
@@ -129,8 +144,8 @@ def compare(
 ) -> None:
     """Show what differs between two prompt versions, word by word.
 
-    It compares their settings, their templates, and what a model is sent about one scene: as the ego, as its
-    first helper, and as the ego with a message from every helper.
+    It compares their settings, their templates, and what a model is sent about one scene: as the
+    ego, as its first helper, and as the ego with a message from every helper.
     """
     from harness.backends.tokens import counter
     from harness.dataset import load
@@ -143,8 +158,18 @@ def compare(
     sent = difference.sent(before, after, at, data.scenario, counter(tokenizer))
     if as_json:
         about = ("version", "sha256", "released")
-        sides = {key: {name: getattr(p, name) for name in about} for key, p in (("a", before), ("b", after))}
-        echo_json({**sides, **asdict(change), "scene": at.id, "sent": [asdict(message) for message in sent]})
+        sides = {
+            key: {name: getattr(p, name) for name in about}
+            for key, p in (("a", before), ("b", after))
+        }
+        echo_json(
+            {
+                **sides,
+                **asdict(change),
+                "scene": at.id,
+                "sent": [asdict(message) for message in sent],
+            }
+        )
         return
     typer.echo(f"{a} → {b}: {'differ' if change else 'the same settings and texts'}")
     for name, *values in change.settings:
@@ -157,7 +182,9 @@ def compare(
     for message in sent:
         counts = {"words": message.words, "tokens": message.tokens}
         sizes = ", ".join(
-            f"{n[0]} → {n[1]} {unit} ({n[1] - n[0]:+d})" for unit, n in counts.items() if n is not None
+            f"{n[0]} → {n[1]} {unit} ({n[1] - n[0]:+d})"
+            for unit, n in counts.items()
+            if n is not None
         )
         typer.echo(f"\n{message.viewer} {message.role}: {sizes}")
         for part, text in message.parts.items():
@@ -184,5 +211,7 @@ def release(version: Version) -> None:
     from harness.prompts import versions as prompts
 
     if prompts.load(version).released:
-        raise UserError(f"prompt {version} is released already; copy it to a new version to change it")
+        raise UserError(
+            f"prompt {version} is released already; copy it to a new version to change it"
+        )
     typer.echo(f"released {version}, sha256 {prompts.lock(version)}")

@@ -1,4 +1,6 @@
-"""`harness radio`: the radios that a condition can name, what each rests on, and how far it reaches."""
+"""`harness radio`: the radios that a condition can name, what each rests on,
+and how far it reaches.
+"""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +20,8 @@ if TYPE_CHECKING:
 
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(
-    help="Channel profile, or one with changed settings: `mode4:density_per_km=200`.", metavar="NAME"
+    help="Channel profile, or one with changed settings: `mode4:density_per_km=200`.",
+    metavar="NAME",
 )
 
 
@@ -38,8 +41,8 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 
     It names the profile's source, status and settings.
 
-    Reception is the probability that one message arrives, averaged over shadowing. A table's latencies are
-    shown if it has their percentiles.
+    Reception is the probability that one message arrives, averaged over shadowing. A table's
+    latencies are shown if it has their percentiles.
     """
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
@@ -57,11 +60,17 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     if as_json:
         about = {key: value for key, value in asdict(profile).items() if key != "parameters"}
         reception = {"distance_m": DISTANCES_M, **curves} if curves else None
-        echo_json({
-            "name": name, **about, "settings": settings, "outside": beyond, "reception": reception,
-            "busy_ratio": busy,
-            "latency_ms": {"distance_m": DISTANCES_M, **latencies} if latencies else None,
-        })  # fmt: skip
+        echo_json(
+            {
+                "name": name,
+                **about,
+                "settings": settings,
+                "outside": beyond,
+                "reception": reception,
+                "busy_ratio": busy,
+                "latency_ms": {"distance_m": DISTANCES_M, **latencies} if latencies else None,
+            }
+        )
         return
     typer.echo(f"{printable(profile_name)} · {printable(profile.model)} · {profile.status}")
     for text in (profile.description, f"source: {profile.source}"):
@@ -82,8 +91,10 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     )
     if latencies:
         typer.echo()
-        pairs = ([f"{p50:.1f} / {p95:.1f}" for p50, p95 in zip(*both.values(), strict=True)]
-                 for both in latencies.values())  # fmt: skip
+        pairs = (
+            [f"{p50:.1f} / {p95:.1f}" for p50, p95 in zip(*both.values(), strict=True)]
+            for both in latencies.values()
+        )
         rows = zip(DISTANCES_M, *pairs, strict=True)
         table(["latency p50 / p95, ms", *sights], [(f"{d} m", *row) for d, *row in rows])
     if busy is not None:
@@ -92,22 +103,29 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
 
 def check(
     name: str = Name,
-    n: int = typer.Option(2000, "-n", help="Number of messages to simulate at each distance, 100 to 100000."),
+    n: int = typer.Option(
+        2000, "-n", help="Number of messages to simulate at each distance, 100 to 100000."
+    ),
     against: list[Path] | None = typer.Option(
         None,
-        help="CSV file with published curves: columns distance_m, reception (0 to 1) and, where their "
-        "settings differ from the profile's, configuration (such as rate_hz=10,power_dbm=20). Repeatable.",
+        help="CSV file with published curves: columns distance_m, reception (0 to 1) and, where "
+        "their "
+        "settings differ from the profile's, configuration (such as rate_hz=10,power_dbm=20). "
+        "Repeatable.",
     ),
-    out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
+    out: Path | None = typer.Option(
+        None, help="Also draw a picture to this file: .svg, .pdf or .png."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Check a radio against simulation and published curves.
 
     Computed reception is compared with that of simulated messages, and with published curves.
 
-    Messages are simulated as in a run, with sender and receiver in sight of each other; each message has its
-    own shadowing. The waits are those from one received background packet of a vehicle to the next; they take
-    a tenth as many samples. Each published curve is compared at its own settings.
+    Messages are simulated as in a run, with sender and receiver in sight of each other; each
+    message has its own shadowing. The waits are those from one received background packet of a
+    vehicle to the next; they take a tenth as many samples. Each published curve is compared at its
+    own settings.
     """
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
@@ -119,7 +137,8 @@ def check(
     profile, channel = channel_of(name)
     if not isinstance(channel, Physical):
         raise UserError(
-            f"{printable(name)} loses the same at every distance, so there is no curve to check; give a "
+            f"{printable(name)} loses the same at every distance, so there is no curve to check; "
+            "give a "
             "physical radio, such as mode4"
         )
     _refuse_format(out)
@@ -132,31 +151,45 @@ def check(
         save(reception(name, channel, found.messages, found.curves), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         curves = [
-            {"configuration": c.curve.configuration, "source": c.curve.source, "n": len(c.reception),
-             "mean_difference": c.mean_difference, "largest_difference": c.largest_difference}
+            {
+                "configuration": c.curve.configuration,
+                "source": c.curve.source,
+                "n": len(c.reception),
+                "mean_difference": c.mean_difference,
+                "largest_difference": c.largest_difference,
+            }
             for c in found.curves
-        ]  # fmt: skip
+        ]
         echo_json({"name": name, "outside": beyond, **vars(found), "curves": curves})
         return
     table(
         ["in sight", "model %", "one message %", "round trip %", "delay ms"],
         [
-            (f"{m.distance_m:g} m", f"{100 * m.model:.1f}", shown(m.crossing), shown(m.round_trip),
-             f"{1000 * m.delay_s:.1f}")
+            (
+                f"{m.distance_m:g} m",
+                f"{100 * m.model:.1f}",
+                shown(m.crossing),
+                shown(m.round_trip),
+                f"{1000 * m.delay_s:.1f}",
+            )
             for m in found.messages
         ],
-    )  # fmt: skip
+    )
     typer.echo(f"n = {n} messages per distance, each with its own shadowing; 95 % intervals")
     if found.waits:
         typer.echo()
         table(
             ["next packet after, s", "mean", "95th percentile", "if independent"],
             [
-                (f"{w.distance_m:g} m", shown(w.mean_s, Unit("s", 3)), shown(w.p95_s, Unit("s", 2)),
-                 f"{w.independent_s:.3f}")
+                (
+                    f"{w.distance_m:g} m",
+                    shown(w.mean_s, Unit("s", 3)),
+                    shown(w.p95_s, Unit("s", 2)),
+                    f"{w.independent_s:.3f}",
+                )
                 for w in found.waits
             ],
-        )  # fmt: skip
+        )
         busy = f"busy ratio {found.busy_ratio:.3f}"
         typer.echo(f"n = {n // 10} trips a distance, {PACKETS} packets each; {busy}")
     for line in beyond:
@@ -166,11 +199,15 @@ def check(
         table(
             ["curve", "points", "mean apart", "largest"],
             [
-                (c.curve.configuration or c.curve.source, str(len(c.reception)),
-                 f"{100 * c.mean_difference:.1f}", f"{100 * c.largest_difference:+z.1f}")
+                (
+                    c.curve.configuration or c.curve.source,
+                    str(len(c.reception)),
+                    f"{100 * c.mean_difference:.1f}",
+                    f"{100 * c.largest_difference:+z.1f}",
+                )
                 for c in found.curves
             ],
-        )  # fmt: skip
+        )
         mean = f"{100 * found.mean_difference:.1f} points apart on average"
         typer.echo(f"{len(found.curves)} curves, {mean}; model less theirs")
         sources = dict.fromkeys(c.curve.source for c in found.curves)
@@ -187,12 +224,17 @@ def crowd(
         50.0, min=1.0, max=1000.0, help="Distance from sender to receiver, in m."
     ),
     radius_m: float = typer.Option(
-        100.0, min=10.0, max=1000.0, help="Radius around the sender within which all vehicles are, in m."
+        100.0,
+        min=10.0,
+        max=1000.0,
+        help="Radius around the sender within which all vehicles are, in m.",
     ),
     sight: str = typer.Option(
         "clear", help="What blocks the line of sight: clear (nothing), vehicle or building."
     ),
-    out: Path | None = typer.Option(None, help="Also draw a picture to this file: .svg, .pdf or .png."),
+    out: Path | None = typer.Option(
+        None, help="Also draw a picture to this file: .svg, .pdf or .png."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Show packet loss by swarm size, beside the paper's line.
@@ -210,9 +252,10 @@ def crowd(
     _refuse_format(out)
     every = {name: channel_of(name)[1] for name in names} if names else CHANNELS.usable()
     loaded = {
-        name: channel for name, channel in every.items()
+        name: channel
+        for name, channel in every.items()
         if isinstance(channel, Physical) and "density_per_km" in settable(channel)
-    }  # fmt: skip
+    }
     if lacks := [name for name in names or () if name not in loaded]:
         raise UserError(
             f"{printable(lacks[0])} has no density_per_km that a swarm could change; leave it out"
@@ -222,15 +265,23 @@ def crowd(
         from harness.report.drawing.pictures import save
         from harness.studies.figures.lines import crowds as draw
 
-        between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[sight]
+        between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[
+            sight
+        ]
         title = f"one transmission over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
         save(draw(VEHICLES, losses, title), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         paper = losses.pop("paper")
-        echo_json({
-            "vehicles": VEHICLES, "distance_m": distance_m, "radius_m": radius_m, "sight": sight,
-            "paper": paper, "loss": losses,
-        })  # fmt: skip
+        echo_json(
+            {
+                "vehicles": VEHICLES,
+                "distance_m": distance_m,
+                "radius_m": radius_m,
+                "sight": sight,
+                "paper": paper,
+                "loss": losses,
+            }
+        )
         return
     shares = zip(VEHICLES, *losses.values(), strict=True)
     table(
@@ -251,11 +302,15 @@ def _refuse_format(out: Path | None) -> None:
 
 
 def channel_of(text: str) -> "tuple[str, Channel]":
-    """Return the profile that a condition's text names, and its channel with the text's settings."""
+    """Return the profile that a condition's text names,
+    and its channel with the text's settings.
+    """
     from harness.coordination.operating_point import named_point
     from harness.radio.wrapped import innermost
 
     point = named_point(text)
     if point.radio.profile is None:
-        raise UserError(f"{printable(text)} has no channel; `harness radio list` shows those there are")
+        raise UserError(
+            f"{printable(text)} has no channel; `harness radio list` shows those there are"
+        )
     return point.radio.profile, innermost(point.channel)

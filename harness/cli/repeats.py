@@ -1,4 +1,6 @@
-"""`harness eval --repeats`: one evaluation several times, with other draws of the model's answers."""
+"""`harness eval --repeats`: one evaluation several times,
+with other draws of the model's answers.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,12 +24,14 @@ def check(spec: "Spec", repeats: int) -> None:
     in_range("--repeats", repeats, 2, MOST)
     if not spec.settings.temperature:
         raise UserError(
-            f"--repeats {repeats}: greedy answers are the same every time; give a --temperature above 0, "
+            f"--repeats {repeats}: greedy answers are the same every time; give a --temperature "
+            "above 0, "
             "such as 0.7"
         )
     if spec.settings.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; "
+            "measure "
             "once without --repeats, and give the seconds that its run.json has"
         )
 

@@ -26,15 +26,21 @@ def command(
 ) -> None:
     """Write one HTML page about a run or suite, or about several. It works offline."""
     if out is None and len(runs) > 1:
-        raise UserError(f"{len(runs)} runs and no --out; name the file to write, such as --out report.html")
+        raise UserError(
+            f"{len(runs)} runs and no --out; name the file to write, such as --out report.html"
+        )
     page = write(runs, out, dataset=dataset, workers=options.workers_of(workers), full=full)
     typer.echo(f"wrote {printable(page)}")
 
 
 def write(
-    runs: list[Path], out: Path | None = None, quiet: bool = False, dataset: "Dataset | Path | None" = None,
-    workers: "Workers" = 1, full: bool = False,
-) -> Path:  # fmt: skip
+    runs: list[Path],
+    out: Path | None = None,
+    quiet: bool = False,
+    dataset: "Dataset | Path | None" = None,
+    workers: "Workers" = 1,
+    full: bool = False,
+) -> Path:
     """Write a report, with a progress bar; returns the file.
 
     `dataset` spares reading theirs again, or says in which folder it is.

@@ -1,4 +1,6 @@
-"""What `harness eval` and `harness drive` have in common: a run's folder, its table and its JSON."""
+"""What `harness eval` and `harness drive` have in common:
+a run's folder, its table and its JSON.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +33,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a run's table: its head and its metric, whose unit or whose `interval` it shows."""
+    """A column of a run's table: its head and its metric,
+    whose unit or whose `interval` it shows.
+    """
 
     head: str
     metric: str
@@ -71,11 +75,19 @@ def file_name(model: str) -> str:
 
 
 def evaluate(
-    spec: "Spec", folder: Path, opens: "Opens | None" = None, *, cache: Path | None, quiet: bool,
-    workers: "Workers", full: bool = False, then: "Callable[[], object]" = lambda: None,
+    spec: "Spec",
+    folder: Path,
+    opens: "Opens | None" = None,
+    *,
+    cache: Path | None,
+    quiet: bool,
+    workers: "Workers",
+    full: bool = False,
+    then: "Callable[[], object]" = lambda: None,
     hooks: "Mapping[str, Hook]" = MappingProxyType({}),
-) -> "tuple[Evaluated, Path]":  # fmt: skip
-    """Evaluate, frozen or in closed loop, with a progress bar; write the run and its page, `full` or not.
+) -> "tuple[Evaluated, Path]":
+    """Evaluate, frozen or in closed loop, with a progress bar;
+    write the run and its page, `full` or not.
 
     `then` adds files to the run; a run that is stopped there resumes there. `hooks` follow it.
     """
@@ -92,10 +104,14 @@ def evaluate(
         progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
     with following(hooks, folder, spec.record()) as followers:
         with progress as done:
-            run = evaluated(spec, folder, followers.counting(done), cache, done.more, workers, opens)
+            run = evaluated(
+                spec, folder, followers.counting(done), cache, done.more, workers, opens
+            )
         dataset = dataset and walked(dataset, run)
         with work.going_on(folder):
-            page = write([folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full)
+            page = write(
+                [folder], quiet=quiet, dataset=dataset, workers=workers if dataset else 1, full=full
+            )
             then()
         work.tidy(folder)
         followers.end(run)
@@ -105,18 +121,26 @@ def evaluate(
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
     """Return the episodes that a run came to, which may have stopped early."""
     numbers = dataset.episodes[: run.manifest.world.episodes]
-    return dataset if len(numbers) == len(dataset.episodes) else dataset.of_episodes(frozenset(numbers))
+    return (
+        dataset
+        if len(numbers) == len(dataset.episodes)
+        else dataset.of_episodes(frozenset(numbers))
+    )
 
 
 def default_out(spec: "Spec") -> Path:
-    """Return the first folder of the run's name under reports/ that is free, or where this was stopped."""
+    """Return the first folder of the run's name under reports/ that is free,
+    or where this was stopped.
+    """
     from harness.evaluate.lifecycle import resumable
 
     return free_folder([spec], spec.source.name, lambda folder: resumable(spec, folder))
 
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
-    """Return the first folder of a name under reports/ that is not there, or in which this goes on."""
+    """Return the first folder of a name under reports/ that is not there,
+    or in which this goes on.
+    """
     ego, *helpers = specs[0].agents
     prompts = "-".join(dict.fromkeys(spec.ego.prompt.version for spec in specs))
     name = f"{file_name(ego.card.name)}-{prompts}{_mode(ego)}"
@@ -127,7 +151,8 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
 
 
 def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
-    """Return the first under reports/ of this name, or of this name with a number, that can be used.
+    """Return the first under reports/ of this name, or of this name with a number,
+    that can be used.
 
     On stderr it says of a number that it was needed.
     """
@@ -135,7 +160,9 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
     folders = (named if n == 1 else named.with_name(f"{name}-{n}") for n in count(1))
     folder = next(filter(usable, folders))
     if folder != named:
-        typer.echo(f"{printable(named)} is there already; this goes to {printable(folder)}", err=True)
+        typer.echo(
+            f"{printable(named)} is there already; this goes to {printable(folder)}", err=True
+        )
     return folder
 
 
@@ -154,14 +181,18 @@ class RunGroup:
 
         if (out / self.marker).is_file():
             raise UserError(
-                f"--out {printable(out)} already holds {self.what}; choose another folder or delete it"
+                f"--out {printable(out)} already holds {self.what}; choose another folder or "
+                "delete it"
             )
         if out.exists() and not out.is_dir():
             raise UserError(f"--out {printable(out)} is no folder; choose an empty or a new one")
         ours = {*self.others, *self.specs}
-        if out.is_dir() and any(path.name not in ours and path.name[0] != "." for path in out.iterdir()):
+        if out.is_dir() and any(
+            path.name not in ours and path.name[0] != "." for path in out.iterdir()
+        ):
             raise UserError(
-                f"--out {printable(out)} is a folder with other files in it; choose an empty or a new one"
+                f"--out {printable(out)} is a folder with other files in it; choose an empty or a "
+                "new one"
             )
         for name, spec in self.specs.items():
             (finished if (out / name / "run.json").is_file() else unfinished)(spec, out / name)
@@ -172,7 +203,9 @@ class RunGroup:
             self.check(out)
         except UserError:
             return False
-        return not any(work.held(run) for run in map(out.joinpath, self.specs) if (run / WORK).is_dir())
+        return not any(
+            work.held(run) for run in map(out.joinpath, self.specs) if (run / WORK).is_dir()
+        )
 
 
 def _mode(agent: "Agent") -> str:
@@ -181,7 +214,9 @@ def _mode(agent: "Agent") -> str:
 
 
 def as_mapping(run: "Run") -> dict[str, Any]:
-    """A finished run for machines: its folder and manifest, what is said of it, the rows of its summary."""
+    """A finished run for machines: its folder and manifest, what is said of it,
+    the rows of its summary.
+    """
     from harness.report.findings import FIRST, LAST, Kind, findings
 
     variant = msgspec.to_builtins(run.manifest.variant)
@@ -195,13 +230,16 @@ def as_mapping(run: "Run") -> dict[str, Any]:
 
 
 def show(
-    done: "Evaluated", scenes: str, columns: Sequence[Column], notes: Sequence[str],
+    done: "Evaluated",
+    scenes: str,
+    columns: Sequence[Column],
+    notes: Sequence[str],
     beside: "Mapping[str, Mapping[str, Score]] | None" = None,
-) -> None:  # fmt: skip
+) -> None:
     """Print a run's table, a row a condition, with what it was run on and what to know about it.
 
-    Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know their
-    dangers has a table of balanced success before it.
+    Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know
+    their dangers has a table of balanced success before it.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
@@ -210,7 +248,9 @@ def show(
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
     names = [point["name"] for point in m.conditions]
     text = console()
-    text.print(f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}")
+    text.print(
+        f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}"
+    )
     if m.helpers:
         text.print(f"helpers: {printable(m.variant.helpers)}")
     run = read(done.out)
@@ -226,7 +266,10 @@ def show(
     for shown in tables:
         table(
             ("condition", *(column.head for column in shown)),
-            [(name, *(c.cell(scores.get(c.metric)) for c in shown)) for name, scores in rows.items()],
+            [
+                (name, *(c.cell(scores.get(c.metric)) for c in shown))
+                for name, scores in rows.items()
+            ],
         )
         if shown is not columns:
             of_each = " and ".join(str(half.n) for half in halves if half)
@@ -239,7 +282,9 @@ def show(
 
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
     """Print success by who can tell of the danger, where layouts have declared witnesses."""
-    known = {name: metric for name, metric in BY_WITNESSES.items() if (conditions[0], metric) in figures}
+    known = {
+        name: metric for name, metric in BY_WITNESSES.items() if (conditions[0], metric) in figures
+    }
     if known.keys() <= {"no danger"}:
         return
     for start in range(0, len(conditions), MOST_BESIDE):
@@ -249,10 +294,14 @@ def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequenc
             ("success %", "n", *some),
             [
                 (
-                    name, str(figures[some[0], metric].n),
-                    *(Column("", metric, interval=True).cell(figures.get((c, metric))) for c in some),
+                    name,
+                    str(figures[some[0], metric].n),
+                    *(
+                        Column("", metric, interval=True).cell(figures.get((c, metric)))
+                        for c in some
+                    ),
                 )
                 for name, metric in known.items()
             ],
-        )  # fmt: skip
+        )
     typer.echo("seen by: helpers, at the first decision; with a radio: it tells of itself\n")

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False) -> None:
     """List runs and studies, newest first.
 
-    Each has the success of its best condition that no warning of its page is about, balanced over danger and
-    none where that leads.
+    Each has the success of its best condition that no warning of its page is about,
+    balanced over danger and none where that leads.
     """
     from harness.runs.listing import UNREAD, runs
 
@@ -42,7 +42,9 @@ def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False)
         typer.echo(f"  {kind}{printable(parts, left):<{left}} {outcome}".rstrip())
         if run.unread is not None and run.unread >= UNREAD:
             share = "none" if run.unread == 1 else f"only {100 * (1 - run.unread):.1f} %"
-            typer.echo(f"{'':8}{share} of the ego's answers could be read: it drives by the fallback")
+            typer.echo(
+                f"{'':8}{share} of the ego's answers could be read: it drives by the fallback"
+            )
         if run.tags:
             typer.echo(f"{'':8}{printable('tags: ' + ', '.join(run.tags), WIDTH - 8)}")
     if not listed:
@@ -55,7 +57,9 @@ def _outcome(run: "Listed") -> str:
     if run.success is None:
         return ""
     what = " balanced" if run.metric == BALANCED else ""
-    return f"{printable(run.condition, 24)}{what} {PERCENT.interval(run.success, run.low, run.high)} %"
+    return (
+        f"{printable(run.condition, 24)}{what} {PERCENT.interval(run.success, run.low, run.high)} %"
+    )
 
 
 def check(
@@ -66,8 +70,9 @@ def check(
 ) -> None:
     """Compute runs again from their own answers; compare each number.
 
-    No model is asked; rule-based drivers are. Of a driven run, the tables are compared with each other, and
-    three episodes are driven again with their recorded actions. Exit code 1 means that a number differs.
+    No model is asked; rule-based drivers are. Of a driven run, the tables are compared with each
+    other, and three episodes are driven again with their recorded actions. Exit code 1 means that a
+    number differs.
     """
     silent = as_json or quiet
     lines = [_checked(run, dataset, silent) for run in _runs_in(runs)]
@@ -101,7 +106,9 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
     if run.world == "frozen":
         reading = bar(f"reading {printable(path.name, 30)}", quiet=silent, grows=True)
         with tempfile.TemporaryDirectory(prefix="harness-") as folder, reading as progress:
-            wrong, lacking = differences(run, dataset_of(run, dataset), Path(folder) / "run", progress)
+            wrong, lacking = differences(
+                run, dataset_of(run, dataset), Path(folder) / "run", progress
+            )
         open_points += lacking
         how = "computed again from its answers"
     else:
@@ -121,9 +128,14 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
         for line in (*wrong, *open_points):
             echo_text(f"  {line}")
     return {
-        "run": str(path), "world": run.world, "equal": not wrong, "figures": len(run.scores),
-        "decisions": len(run.decisions), "differences": wrong, "unchecked": open_points,
-    }  # fmt: skip
+        "run": str(path),
+        "world": run.world,
+        "equal": not wrong,
+        "figures": len(run.scores),
+        "decisions": len(run.decisions),
+        "differences": wrong,
+        "unchecked": open_points,
+    }
 
 
 def _checked_means(path: Path, silent: bool) -> dict[str, object]:
@@ -135,14 +147,23 @@ def _checked_means(path: Path, silent: bool) -> dict[str, object]:
     wrong = list(of_suite(suite))
     if not silent:
         means = amount(len(suite.stated), "mean")
-        typer.echo(f"{printable(path)}: {'not ' * bool(wrong)}equal: {means}, computed again from its runs")
+        typer.echo(
+            f"{printable(path)}: {'not ' * bool(wrong)}equal: {means}, computed again from its runs"
+        )
         for difference in wrong:
             echo_text(f"  {difference}")
-    return {"suite": str(path), "equal": not wrong, "figures": len(suite.stated), "differences": wrong}
+    return {
+        "suite": str(path),
+        "equal": not wrong,
+        "figures": len(suite.stated),
+        "differences": wrong,
+    }
 
 
 def merge(
-    folders: list[Path] = typer.Argument(help="Folders of all shards, in any order.", metavar="FOLDER..."),
+    folders: list[Path] = typer.Argument(
+        help="Folders of all shards, in any order.", metavar="FOLDER..."
+    ),
     out: Path = typer.Option(..., help="Folder to write the whole to."),
     audit: bool = typer.Option(
         True, help="Audit a merged dataset of 100 layouts or more, as `harness dataset build` does."
@@ -151,7 +172,9 @@ def merge(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Merge the shards of a run or a dataset. The result is byte for byte what one unsplit run writes."""
+    """Merge the shards of a run or a dataset.
+    The result is byte for byte what one unsplit run writes.
+    """
     from harness.core.shards import read
 
     who, silent = options.workers_of(workers), as_json or quiet
@@ -163,7 +186,9 @@ def merge(
         if as_json:
             echo_json(manifest)
         elif not quiet:
-            typer.echo(f"wrote {printable(out)}: {dataset_size(manifest['episodes'], manifest['nodes'])}")
+            typer.echo(
+                f"wrote {printable(out)}: {dataset_size(manifest['episodes'], manifest['nodes'])}"
+            )
         return
     from harness.cli.report import write
     from harness.evaluate.run import merge

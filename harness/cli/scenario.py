@@ -22,10 +22,11 @@ def list_scenarios(as_json: options.Json = False) -> None:
     from harness.world import scenarios
 
     echo_each(
-        resources.each(scenarios.names(), scenarios.get), as_json,
+        resources.each(scenarios.names(), scenarios.get),
+        as_json,
         lambda scenario: {"summary": scenario.summary},
         lambda name, scenario: typer.echo(f"{name}: {scenario.summary}"),
-    )  # fmt: skip
+    )
 
 
 def show(name: options.Scenario, as_json: options.Json = False) -> None:
@@ -38,14 +39,18 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
         meanings = attributes(type(scenario.parameters))
-        echo_json({
-            "name": name, "description": description, "actions": actions,
-            "parameters": {
-                key: {"value": value, "meaning": meanings[key]}
-                for key, value in asdict(scenario.parameters).items()
-            },
-            "answer_schema": {role: answer_schema(role, actions, name) for role in ROLES},
-        })  # fmt: skip
+        echo_json(
+            {
+                "name": name,
+                "description": description,
+                "actions": actions,
+                "parameters": {
+                    key: {"value": value, "meaning": meanings[key]}
+                    for key, value in asdict(scenario.parameters).items()
+                },
+                "answer_schema": {role: answer_schema(role, actions, name) for role in ROLES},
+            }
+        )
         return
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     echo_fields(scenario.parameters)
@@ -90,7 +95,9 @@ def drive(
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
-    """Return the scenario. Raises UserError for none, or for layouts that cannot be driven together."""
+    """Return the scenario. Raises UserError for none,
+    or for layouts that cannot be driven together.
+    """
     from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios
 
@@ -106,11 +113,21 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     if all("balanced" in rates for rates in outcomes.values()):
         table(
             ("driver", "balanced success % [95 % CI]", "with a danger", "without"),
-            [(driver, *(shown(rates[half]) for half in halves)) for driver, rates in outcomes.items()],
+            [
+                (driver, *(shown(rates[half]) for half in halves))
+                for driver, rates in outcomes.items()
+            ],
         )
         n_dangerous, n_harmless = (next(iter(outcomes.values()))[half].n for half in halves[1:])
         console().print(f"balanced: mean of both, of {n_dangerous} and {n_harmless} episodes\n")
-    heads = ("driver", "success % [95 % CI]", "collision %", "late %", "time-out %", "other crashes")
+    heads = (
+        "driver",
+        "success % [95 % CI]",
+        "collision %",
+        "late %",
+        "time-out %",
+        "other crashes",
+    )
     rows = []
     for driver, rates in outcomes.items():
         percent = (f"{100 * rates[k].value:.1f}" for k in ("collision", "late", "time_out"))
@@ -118,32 +135,52 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     table(heads, rows)
     off_road = sum(round(rates["off_road"].value * episodes) for rates in outcomes.values())
     console().print(
-        f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: {off_road}"
+        f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: "
+        f"{off_road}"
     )
 
 
 def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     policies, seconds = outcomes["policies"], Unit("s", 2)
     table(
-        ("driver of all agents", "success % [95 % CI]", "less than joint", "arrived %", "met %", "stuck %"),
+        (
+            "driver of all agents",
+            "success % [95 % CI]",
+            "less than joint",
+            "arrived %",
+            "met %",
+            "stuck %",
+        ),
         [
-            (policy, shown(of["success"]), shown(of["less_than_joint"], sign="+"),
-             *(f"{100 * of[k].value:.1f}" for k in ("arrived", "met", "stuck")))
+            (
+                policy,
+                shown(of["success"]),
+                shown(of["less_than_joint"], sign="+"),
+                *(f"{100 * of[k].value:.1f}" for k in ("arrived", "met", "stuck")),
+            )
             for policy, of in policies.items()
         ],
-    )  # fmt: skip
+    )
     table(
         ("driver of all agents", "lost s, in sum", "lost s, the most", "price of anarchy", "n"),
         [
-            (policy, *(shown(of[k], seconds) for k in ("lost_s", "most_lost_s")),
-             shown(of["anarchy"], Unit(decimals=3)), str(of["anarchy"].n))
+            (
+                policy,
+                *(shown(of[k], seconds) for k in ("lost_s", "most_lost_s")),
+                shown(of["anarchy"], Unit(decimals=3)),
+                str(of["anarchy"].n),
+            )
             for policy, of in policies.items()
         ],
-    )  # fmt: skip
+    )
     table(
         ("driver of all agents", "best decisions %", "arrival given away %", "regret s"),
         [
-            (policy, *(shown(of[k]) for k in ("best_decisions", "gave_away")), shown(of["regret_s"], seconds))
+            (
+                policy,
+                *(shown(of[k]) for k in ("best_decisions", "gave_away")),
+                shown(of["regret_s"], seconds),
+            )
             for policy, of in policies.items()
         ],
     )
@@ -156,7 +193,8 @@ def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     text.print(f"without a joint plan: {_seeds(outcomes['unsolved'])}")
     if inexact := outcomes["inexact"]:
         text.print(
-            f"joint is the best found, and the best plan in {episodes - len(inexact)} of {episodes} "
+            f"joint is the best found, and the best plan in {episodes - len(inexact)} of "
+            f"{episodes} "
             f"episodes; not searched to the end, or a driver did better: {_seeds(inexact)}"
         )
     else:

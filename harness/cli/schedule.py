@@ -13,7 +13,8 @@ from harness.core.errors import UserError, printable, unknown
 from harness.runs.settings import parse_seeds
 
 TrainRuns = typer.Argument(
-    help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).", metavar="RUN..."
+    help="One or more folders of finished runs on train layouts (seeds 100000 to 199999).",
+    metavar="RUN...",
 )
 
 
@@ -22,7 +23,9 @@ def learn(
     tune: list[Path] = typer.Option(
         ..., help="Run on tune layouts (seeds 0 to 99999), to choose the threshold on. Repeatable."
     ),
-    condition: str = typer.Option("6g:max_helpers=1", help="Operating point to learn the schedule for."),
+    condition: str = typer.Option(
+        "6g:max_helpers=1", help="Operating point to learn the schedule for."
+    ),
     out: Path = typer.Option(
         ..., help="File to write; schedules/NAME.toml makes it usable as schedule NAME."
     ),
@@ -49,26 +52,33 @@ def learn(
         train, tune_runs = (
             [ReplayedRun(run, progress=progress, models=own) for run in of] for of in (runs, tune)
         )
-        progress.more(sum(each.dataset.scenario.parameters.decisions for each in (*train, *tune_runs)))
+        progress.more(
+            sum(each.dataset.scenario.parameters.decisions for each in (*train, *tune_runs))
+        )
         schedule = run_learn(train, tune_runs, point, out, command, progress)
     if not quiet:
-        typer.echo(f"wrote {printable(out)}: threshold {schedule.threshold:g}, the best on tune layouts")
+        typer.echo(
+            f"wrote {printable(out)}: threshold {schedule.threshold:g}, the best on tune layouts"
+        )
 
 
 def compare(
     runs: options.Runs,
     tune: list[Path] = typer.Option(
         [],
-        help="Run on tune layouts (seeds 0 to 99999), to choose each schedule's settings on. Give one for "
+        help="Run on tune layouts (seeds 0 to 99999), to choose each schedule's settings on. Give "
+        "one for "
         "each RUN, in the same order.",
     ),
     condition: str = typer.Option("6g", help="Operating point to play each schedule in."),
     budget: float = typer.Option(
         0.5,
-        help="Most messages that a chosen setting may take, as a share of what the paper's schedule takes.",
+        help="Most messages that a chosen setting may take, as a share of what the paper's "
+        "schedule takes.",
     ),
     schedule: list[str] | None = typer.Option(
-        None, help="Schedule to compare, such as entropy, margin or learnt. Repeatable. Default: all."
+        None,
+        help="Schedule to compare, such as entropy, margin or learnt. Repeatable. Default: all.",
     ),
     seeds: options.RunSeeds = None,
     latency: options.RunLatency = "run",
@@ -83,8 +93,8 @@ def compare(
 
     The bounds are asking nobody and an oracle, which knows how every course ends.
 
-    The model is asked only about decision points that the run did not reach; the run's folder keeps those
-    answers.
+    The model is asked only about decision points that the run did not reach;
+    the run's folder keeps those answers.
     """
     from harness.coordination.schedules import SCHEDULES
     from harness.studies.replayed_run import ReplayedRun
@@ -103,7 +113,8 @@ def compare(
     with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed, tuned = (
-            [ReplayedRun(run, latency, progress, models=own) for run in folders] for folders in (runs, tune)
+            [ReplayedRun(run, latency, progress, models=own) for run in folders]
+            for folders in (runs, tune)
         )
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "schedules"

@@ -1,4 +1,6 @@
-"""Changes to typer: commands load when they are named, and plain values are read without pydantic."""
+"""Changes to typer: commands load when they are named,
+and plain values are read without pydantic.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +23,9 @@ DIGITS = 18  # most of a number that is read here
 
 
 class Stopped(Exception):
-    """A command was interrupted, of which typer would say nothing; the cause is the KeyboardInterrupt."""
+    """A command was interrupted, of which typer would say nothing;
+    the cause is the KeyboardInterrupt.
+    """
 
 
 class Branch(Mapping[str, Any]):
@@ -54,7 +58,9 @@ class Branch(Mapping[str, Any]):
 
 
 def _below(path: str, table: Mapping[str, str]) -> dict[str, str]:
-    """Return the names that may follow a path in a table of commands, each with what is typed up to it."""
+    """Return the names that may follow a path in a table of commands,
+    each with what is typed up to it.
+    """
     depth = len(path.split())
     paths = [words for words in map(str.split, table) if words[:depth] == path.split()]
     return {words[depth]: " ".join(words[: depth + 1]) for words in paths}
@@ -66,12 +72,16 @@ def _command(path: str, place: str) -> Any:
     what, built_in = f"command {path} ({printable(place)})", place.startswith("harness.")
     with worded(what, built_in):
         called = getattr(import_module(module), function or "command")
-        app.command(path.split()[-1], cls=Command)(called if built_in else _of_package(called, what))
+        app.command(path.split()[-1], cls=Command)(
+            called if built_in else _of_package(called, what)
+        )
         return get_command(app)
 
 
 def _of_package(called: Callable[..., Any], what: str) -> Callable[..., Any]:
-    """Return a package's command, whose errors are one line; it may end with an exit code as commands do."""
+    """Return a package's command, whose errors are one line;
+    it may end with an exit code as commands do.
+    """
 
     @wraps(called)
     def calling(*args: Any, **kwargs: Any) -> Any:
@@ -82,7 +92,9 @@ def _of_package(called: Callable[..., Any], what: str) -> Callable[..., Any]:
         except Exception as error:
             if type(error).__module__.partition(".")[0] in ("click", "typer"):
                 raise
-            raise UserError(f"{what} fails ({one_line(error)}); repair or uninstall its package") from error
+            raise UserError(
+                f"{what} fails ({one_line(error)}); repair or uninstall its package"
+            ) from error
 
     return calling
 
@@ -96,7 +108,9 @@ class Command(TyperCommand):
         for parameter in self.get_params(ctx):
             if record := parameter.get_help_record(ctx):
                 usual = "Options" if parameter.param_type_name == "option" else "Arguments"
-                panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
+                panels.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(
+                    record
+                )
         for panel, rows in panels.items():
             if rows:
                 with formatter.section(panel):
@@ -104,16 +118,22 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """A group of the table's commands; its help lists them in one column, and the first screen in panels."""
+    """A group of the table's commands; its help lists them in one column,
+    and the first screen in panels.
+    """
 
     def __init__(self, path: str = "", **attributes: Any) -> None:
         below: Any = Branch(path)
         attributes |= {"commands": below, "no_args_is_help": True, "rich_markup_mode": None}
-        super().__init__(**{"help": GROUPS.get(path) or (groups().get(path) if path else None), **attributes})
+        super().__init__(
+            **{"help": GROUPS.get(path) or (groups().get(path) if path else None), **attributes}
+        )
         self.path = path
 
     def invoke(self, ctx: Any) -> Any:
-        """Invoke the command. Raises Stopped if it is interrupted, and UserError if a package ends it."""
+        """Invoke the command. Raises Stopped if it is interrupted,
+        and UserError if a package ends it.
+        """
         try:
             return super().invoke(ctx)
         except BaseException as error:
@@ -128,11 +148,16 @@ class Group(TyperGroup):
         old, new = ("", "") if self.path else respelt(args)
         if new and old not in short() and not ctx.resilient_parsing:
             echo(
-                f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0",
+                f"harness: `harness {old}` is now `harness {new}`; the old spelling works until "
+                "0.4.0",
                 err=True,
             )
         args = new.split() + args[len(old.split()) :]
-        if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
+        if (
+            args[0] not in self.commands
+            and not args[0].startswith("-")
+            and not ctx.resilient_parsing
+        ):
             from difflib import get_close_matches
 
             typed = f"{self.path} {args[0]}".strip()
@@ -144,11 +169,16 @@ class Group(TyperGroup):
             }
             near = get_close_matches(args[0], [*self.commands, *last])
             meant = dict.fromkeys(
-                f"{self.path} {name}".strip() if name in self.commands else last[name] for name in near
+                f"{self.path} {name}".strip() if name in self.commands else last[name]
+                for name in near
             )
             ctx.fail(
                 f"No such command {args[0]!r}"
-                + (f" (did you mean {', '.join(f'`harness {words}`' for words in meant)}?)" if meant else "")
+                + (
+                    f" (did you mean {', '.join(f'`harness {words}`' for words in meant)}?)"
+                    if meant
+                    else ""
+                )
             )
         return super().resolve_command(ctx, args)
 
@@ -161,7 +191,10 @@ class Group(TyperGroup):
                 with formatter.section(panel):
                     formatter.write_dl(
                         [
-                            (f"{name:<{width}}", self._short_help(name, formatter.width - width - 6))
+                            (
+                                f"{name:<{width}}",
+                                self._short_help(name, formatter.width - width - 6),
+                            )
                             for name in shown
                         ]
                     )
@@ -174,7 +207,9 @@ class Group(TyperGroup):
 
 
 def respelt(args: list[str]) -> tuple[str, str]:
-    """Return the old or short spelling with which arguments begin, and what it stands for; empty if none."""
+    """Return the old or short spelling with which arguments begin, and what it stands for;
+    empty if none.
+    """
     spelt = [" ".join(args[:n]) for n in (2, 1)]
     for typed in spelt:
         if typed in OLD:
@@ -199,8 +234,8 @@ def _never(stream: object) -> bool:
 def hasten(command: Any) -> None:
     """Have a command read plain values without pydantic.
 
-    Typer converts every value with pydantic, a missing one too, and loading that takes a tenth of a second.
-    What is not plainly right is left to typer, which words the error.
+    Typer converts every value with pydantic, a missing one too, and loading that takes a tenth of a
+    second. What is not plainly right is left to typer, which words the error.
     """
     for parameter in command.get_params(Context(command)):  # `--help` is one
         if hasattr(parameter, "type_descriptor"):
@@ -219,7 +254,9 @@ def _value(parameter: Any, by_typer: Callable[[Any, Any], Any], context: Any, va
 
 
 def plain(annotation: Any, value: Any) -> Any:
-    """A value as its type has it, the same as typer reads it; `UNREAD` where that takes typer to say."""
+    """A value as its type has it, the same as typer reads it;
+    `UNREAD` where that takes typer to say.
+    """
     if get_origin(annotation) is list and isinstance(value, list | tuple):
         items = [plain(get_args(annotation)[0], item) for item in value]
         return UNREAD if UNREAD in items else items

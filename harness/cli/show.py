@@ -44,7 +44,9 @@ def echo_answer(study: "Study") -> None:
 
 
 def show(study: "Study") -> None:
-    """Print a study: its outcome, caveats, the tables that a terminal has room for, and how it was made."""
+    """Print a study: its outcome, caveats, the tables that a terminal has room for,
+    and how it was made.
+    """
     for text in (study.title, *study.headline, *study.caveats):
         typer.echo(fill(printable(text, LONGEST), WIDTH))
     for each in study.tables:

@@ -38,19 +38,27 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     first = specs[0]
     if first.settings.latency == MEASURED:
         raise UserError(
-            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; measure "
+            f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; "
+            "measure "
             "on one dataset, and give the seconds that its run.json has"
         )
     for agent in first.agents:
         if not agent.can.closed_loop:
             name = printable(agent.card.name)
-            raise UserError(f"--model {name}: a replay has the answers of one run; replay its dataset")
+            raise UserError(
+                f"--model {name}: a replay has the answers of one run; replay its dataset"
+            )
 
 
 def evaluate(
-    suite: "Suite", specs: "Sequence[Spec]", datasets: "Sequence[Dataset]", out: Path | None,
-    evaluated: Callable[..., Any], quiet: bool, as_json: bool,
-) -> Path:  # fmt: skip
+    suite: "Suite",
+    specs: "Sequence[Spec]",
+    datasets: "Sequence[Dataset]",
+    out: Path | None,
+    evaluated: Callable[..., Any],
+    quiet: bool,
+    as_json: bool,
+) -> Path:
     """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means.
 
     Returns the suite's folder.
@@ -90,7 +98,8 @@ def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
         "suite": done.name,
         "folder": str(done.path),
         "families": {
-            family: {**as_mapping(run), "drivers": drivers[family]} for family, run in done.runs.items()
+            family: {**as_mapping(run), "drivers": drivers[family]}
+            for family, run in done.runs.items()
         },
         "mean": {"summary": msgspec.to_builtins(done.scores), "drivers": drivers[lines[-1].name]},
     }
@@ -105,7 +114,9 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     from harness.world.drivers import ALWAYS
 
     text, m = console(), done.variant
-    text.print(f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}")
+    text.print(
+        f"{printable(m.model, 30)} · prompt {m.prompt} · {m.answer} · suite {printable(done.name)}"
+    )
     for finding in findings(done, Kind.VOID, Kind.CAVEAT):
         text.print(finding.sentence)
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
@@ -117,17 +128,21 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
         ("references, %", *drivers, "n", "seeds"),
         [
             (
-                line.name, *(f"{100 * (line.drivers[d].value or 0.0):.1f}" for d in drivers),
+                line.name,
+                *(f"{100 * (line.drivers[d].value or 0.0):.1f}" for d in drivers),
                 *((str(len(line.run.grid.episodes)), seeds_of(line.run)) if line.run else ("", "")),
             )
             for line in lines
         ],
-    )  # fmt: skip
+    )
     text.print("references are computed from the trees; a run of uniform draws, and may differ")
     text.print(
-        f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the layout "
-        "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family the same "
-        "weight, and its interval is about other episodes of these families, not about other families"
+        f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the "
+        "layout "
+        "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family "
+        "the same "
+        "weight, and its interval is about other episodes of these families, not about other "
+        "families"
     )
     for finding in findings(done, *LAST):
         text.print(finding.sentence)

@@ -17,21 +17,27 @@ def command(
     runs: options.Runs,
     over: list[str] | None = typer.Option(
         None,
-        help="Setting to vary: tau (nats), loss (0 to 1), size (vehicles), latency (ms), window (ms), "
-        "consensus, attack, or any other setting of an operating point by its name. Repeatable: every "
+        help="Setting to vary: tau (nats), loss (0 to 1), size (vehicles), latency (ms), window "
+        "(ms), "
+        "consensus, attack, or any other setting of an operating point by its name. Repeatable: "
+        "every "
         "combination of their values is played. Default: the paper's panels.",
     ),
     grid: list[str] | None = typer.Option(
         None,
-        help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same order. "
+        help="Values to try: 0,10,20 or from:to:step. Give one --grid for each --over, in the same "
+        "order. "
         "Default: the axis's usual values.",
     ),
     apart: bool = typer.Option(
-        False, "--apart", help="Vary one setting at a time, each in a panel of its own, and combine none."
+        False,
+        "--apart",
+        help="Vary one setting at a time, each in a panel of its own, and combine none.",
     ),
     condition: list[str] = typer.Option(
         ["6g"],
-        help="Operating point to vary, or one with changed settings: 6g:on_demand=true. Repeatable.",
+        help="Operating point to vary, or one with changed "
+        "settings: 6g:on_demand=true. Repeatable.",
     ),
     seeds: options.RunSeeds = None,
     latency: options.RunLatency = "run",
@@ -56,11 +62,15 @@ def command(
     from harness.studies.sweep import folder_of, panels_over, run_sweep
 
     if proxy and PROXY not in SOURCES:
-        raise UserError("--proxy: no extension that is installed has the calibrated proxy; leave it out")
+        raise UserError(
+            "--proxy: no extension that is installed has the calibrated proxy; leave it out"
+        )
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         replayed = [ReplayedRun(run, latency, progress, not no_model, dataset, own) for run in runs]
-        panels = panels_over(replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart)
+        panels = panels_over(
+            replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart
+        )
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_of(runs[0], panels)
         sources: list[Source] = [*replayed, *([SOURCES[PROXY]] if proxy else [])]

@@ -34,9 +34,14 @@ def echo_wrong(name: str, error: UserError) -> None:
 def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
     """Print what a dry run counted of prompts, by role, or that there was nothing to count with."""
     for role, s in (counted or {}).items():
-        typer.echo(f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})")
+        typer.echo(
+            f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})"
+        )
     if not counted:
-        typer.echo("prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or GGUF)")
+        typer.echo(
+            "prompt tokens not counted: no tokenizer here; give --tokenizer (tokenizer.json or "
+            "GGUF)"
+        )
 
 
 def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
@@ -45,21 +50,29 @@ def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
         prompts = each["prompts"]
         read = "prompts not counted" if prompts is None else f"{times * prompts:.4g} for prompts"
         typer.echo(
-            f"cost of {printable(model, 40)}, {each['currency']}: {read}, {times * each['answers']:.4g} for "
+            f"cost of {printable(model, 40)}, {each['currency']}: {read}, "
+            f"{times * each['answers']:.4g} for "
             "answers of the greatest length"
         )
 
 
 def echo_each(
-    things: Mapping[str, Thing | UserError], as_json: bool, plain: Callable[[Thing], dict[str, Any]],
+    things: Mapping[str, Thing | UserError],
+    as_json: bool,
+    plain: Callable[[Thing], dict[str, Any]],
     show: Callable[[str, Thing], None],
-) -> None:  # fmt: skip
-    """Print a list of things by name, and of one that cannot be used why; as JSON, `plain` values of each."""
+) -> None:
+    """Print a list of things by name, and of one that cannot be used why;
+    as JSON, `plain` values of each.
+    """
     if as_json:
-        echo_json([
-            {"name": name} | ({"error": str(each)} if isinstance(each, UserError) else plain(each))
-            for name, each in things.items()
-        ])  # fmt: skip
+        echo_json(
+            [
+                {"name": name}
+                | ({"error": str(each)} if isinstance(each, UserError) else plain(each))
+                for name, each in things.items()
+            ]
+        )
         return
     for name, each in things.items():
         if isinstance(each, UserError):
@@ -69,7 +82,9 @@ def echo_each(
 
 
 def echo_json(value: Any, indent: int | None = 1) -> None:
-    """Print JSON. Of an estimate it has the value, the interval and n; an unknown number is null."""
+    """Print JSON. Of an estimate it has the value, the interval and n;
+    an unknown number is null.
+    """
     typer.echo(json.dumps(value, indent=indent, default=_plain))
 
 
@@ -78,7 +93,9 @@ def _plain(value: Any) -> Any:
         return as_mapping(value)
     if is_dataclass(value):
         values = {field.name: getattr(value, field.name) for field in fields(value)}
-        return {k: None if isinstance(v, float) and not isfinite(v) else v for k, v in values.items()}
+        return {
+            k: None if isinstance(v, float) and not isfinite(v) else v for k, v in values.items()
+        }
     return value.tolist()
 
 
@@ -102,8 +119,8 @@ def console() -> "Console":
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print columns, the first aligned left and the others right.
 
-    They are two spaces apart, or one where a name needs the room. A name that leaves no room for its row even
-    so stands above it; heads longer than `HEAD` are folded.
+    They are two spaces apart, or one where a name needs the room. A name that leaves no room for
+    its row even so stands above it; heads longer than `HEAD` are folded.
     """
     from rich.cells import cell_len, chop_cells
 
@@ -115,14 +132,19 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     names, *values = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
     widths = [max(column) for column in values]
     rooms = {gap: WIDTH - sum(widths) - gap * len(widths) for gap in (2, 1)}
-    gap, room = max(rooms.items(), key=lambda of: (sum(length <= of[1] for length in names), of[1] >= 0))
+    gap, room = max(
+        rooms.items(), key=lambda of: (sum(length <= of[1] for length in names), of[1] >= 0)
+    )
     first = max((length for length in names if length <= room), default=0)
     for (name, *cells), length in zip(lines, names, strict=True):
         if length > room:
             for piece in chop_cells(name, WIDTH):
                 typer.echo(piece)
             name, length = "", 0
-        figures = (f"{' ' * (gap + w - cell_len(cell))}{cell}" for w, cell in zip(widths, cells, strict=True))
+        figures = (
+            f"{' ' * (gap + w - cell_len(cell))}{cell}"
+            for w, cell in zip(widths, cells, strict=True)
+        )
         typer.echo(f"{name}{' ' * (first - length)}{''.join(figures)}".rstrip())
 
 
@@ -147,6 +169,10 @@ def echo_fields(record: Any) -> None:
     meanings = attributes(type(record))
     for name, value in asdict(record).items():
         values = value if isinstance(value, tuple) else (value,)
-        shown = (f"{v:g}" if type(v) in (int, float) else printable(str(v).lower(), 60) for v in values)
+        shown = (
+            f"{v:g}" if type(v) in (int, float) else printable(str(v).lower(), 60) for v in values
+        )
         typer.echo(f"{name} = {', '.join(shown)}")
-        typer.echo(fill(meanings.get(name, ""), 80, initial_indent="    ", subsequent_indent="    "))
+        typer.echo(
+            fill(meanings.get(name, ""), 80, initial_indent="    ", subsequent_indent="    ")
+        )

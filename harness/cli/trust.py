@@ -25,21 +25,27 @@ def command(
     ),
     model: str | None = typer.Option(
         None,
-        help="Model to evaluate first, on the default dataset, instead of RUN. With RUN: the run's model, "
+        help="Model to evaluate first, on the default dataset, instead of RUN. With RUN: the run's "
+        "model, "
         "where it is none of your cards.",
     ),
     prompt: options.ScenarioPrompt = None,
     attacks: str = typer.Option(
         "all",
-        help="Attacks, separated by commas: liar, stuck, stale, replay, spoof, sybil, flood, brake, silent, "
-        "overconfident, random, injection, jump or absent; on objects ghost, hide or shift. + combines some, "
+        help="Attacks, separated by commas: liar, stuck, stale, "
+        "replay, spoof, sybil, flood, brake, "
+        "silent, "
+        "overconfident, random, injection, jump or absent; on objects ghost, hide or shift. + "
+        "combines some, "
         "and a colon changes a setting: liar+spoof,stale:decisions=2. all: the usual "
         "ones that the condition allows.",
     ),
     rules: str = typer.Option(
         "all",
-        help="Consensus rules, separated by commas: linear, log-pool, median, trimmed-mean, trimmed-heads, "
-        "geometric-median, centred-clipping, bayes or trust; linear:weight_cap=0.3 changes a setting.",
+        help="Consensus rules, separated by commas: linear, log-pool, median, trimmed-mean, "
+        "trimmed-heads, "
+        "geometric-median, centred-clipping, bayes or trust; linear:weight_cap=0.3 changes a "
+        "setting.",
     ),
     share: str = typer.Option(
         "0,1/3,2/3", help="Shares of the helpers that attack, 0 to 1; 0 is always played as well."
@@ -52,15 +58,16 @@ def command(
     ),
     no_model: options.NoModel = False,
     out: Path | None = typer.Option(
-        None, help="Folder to write. Default: RUN/trust, or reports/trust-<model>-<prompt>-<dataset>."
+        None,
+        help="Folder to write. Default: RUN/trust, or reports/trust-<model>-<prompt>-<dataset>.",
     ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Play every attack against every consensus rule.
 
-    The model is asked only where the run has no answer. If the study is stopped, the same command continues
-    it.
+    The model is asked only where the run has no answer.
+    If the study is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
@@ -76,7 +83,9 @@ def command(
         shares_of(share),
     )
     if (run is None and model is None) or (run and prompt):
-        raise UserError("give either RUN, the folder of a finished run, or --model, with its --prompt")
+        raise UserError(
+            "give either RUN, the folder of a finished run, or --model, with its --prompt"
+        )
     with bar("rules under attack", quiet=as_json or quiet, grows=True) as progress:
         if run is None:
             assert model is not None
@@ -90,7 +99,9 @@ def command(
         draws = parse_seeds(seeds) if seeds else replayed.seeds
         where = out or run / "trust"
         with work.going_on(where):
-            bench = run_bench(replayed, condition, rule_names, attack_names, shares, draws, where, progress)
+            bench = run_bench(
+                replayed, condition, rule_names, attack_names, shares, draws, where, progress
+            )
     finish(trust_study(bench), where, as_json, quiet)
 
 

@@ -12,7 +12,8 @@ GROUP = "swarmdrive.parts"
 
 
 def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
-    """Return the parts of all extensions by name, those that ship first; `taken` are others' settings.
+    """Return the parts of all extensions by name, those that ship first;
+    `taken` are others' settings.
 
     Of each part that does not work a line on stderr says what is wrong with it.
     """
@@ -37,6 +38,8 @@ def _check(what: str, kind: object, taken: Collection[str]) -> None:
     if not (isinstance(kind, type) and issubclass(kind, Part)):
         raise UserError(f"{what} is no subclass of Part; repair its package")
     if lost := [key for key in kind.__struct_fields__ if key in taken]:
-        raise UserError(f"{what} has setting {lost[0]}, which another part has; give it another name")
+        raise UserError(
+            f"{what} has setting {lost[0]}, which another part has; give it another name"
+        )
     if kind.behind not in taken:
         raise UserError(f"{what} stands behind {printable(kind.behind)!r}, which is no setting")

@@ -1,11 +1,12 @@
-"""Attacks: helpers that lie or fail, so that the channel carries something else than what they intend.
+"""Attacks: helpers that lie or fail, so that the channel carries something else than what they
+intend.
 
-An attack stands between a helper's answer and the channel. `benchmarks/measured/trust.md` maps each to the
-classes of ETSI TS 103 759 and to the names of VeReMi and F2MD.
+An attack stands between a helper's answer and the channel. `benchmarks/measured/trust.md` maps each
+to the classes of ETSI TS 103 759 and to the names of VeReMi and F2MD.
 
-One attack is a name and its settings, `spoof:share=1/3:distance_m=3`. Several at once are joined by `+`; they
-have the same attackers, as far as their shares go. To add an attack, write a class here, or an entry point in
-the group `swarmdrive.attacks`.
+One attack is a name and its settings, `spoof:share=1/3:distance_m=3`. Several at once are joined by
+`+`; they have the same attackers, as far as their shares go. To add an attack, write a class here,
+or an entry point in the group `swarmdrive.attacks`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,9 @@ from harness.core.plugins import Plugins
 from harness.world.scene_graph import Node, SceneGraph
 
 MOST_VOICES = 16
-Share = Annotated[float, Meta(ge=0, le=1, description="a share of the helpers from 0 to 1, such as 1/3")]
+Share = Annotated[
+    float, Meta(ge=0, le=1, description="a share of the helpers from 0 to 1, such as 1/3")
+]
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class Turn:
     truth: Intents  # what every vehicle intends and knows
     attackers: Bools  # who attacks, `(n, H)`
     first: Floats  # what each helper intended at the episode's first step, `(n, H, A)`
-    # what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such step
+    # what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such
+    # step
     past: Floats
     uniforms: Floats  # draws in [0, 1) for this step, `(n, H)`
 
@@ -51,13 +55,17 @@ class Attack:
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
     in_words: ClassVar[bool] = False  # whether it writes words of its own
     in_objects: ClassVar[bool] = False  # whether it changes the objects that a message lists
-    adds: ClassVar[bool] = False  # whether it adds voices or objects, which no other attack then changes
-    risk: ClassVar[str] = ""  # the risk that it states there, without reasons; empty leaves both as they are
+    # whether it adds voices or objects, which no other attack then changes
+    adds: ClassVar[bool] = False
+    # the risk that it states there, without reasons; empty leaves both as they are
+    risk: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
         if "by_moment" in vars(cls):
             warn(
-                f"{cls.__name__}.by_moment is now by_scene; it works until 0.4.0", FutureWarning, stacklevel=2
+                f"{cls.__name__}.by_moment is now by_scene; it works until 0.4.0",
+                FutureWarning,
+                stacklevel=2,
             )
             cls.by_scene = vars(cls)["by_moment"]
 
@@ -67,14 +75,17 @@ class Attack:
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        """Return what is sent and claimed instead; `sent` is the truth as earlier attacks have changed it.
+        """Return what is sent and claimed instead;
+        `sent` is the truth as earlier attacks have changed it.
 
         By default its intent and its claims stay true.
         """
         return sent
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return an attacker's message as a fusion prompt shows it (`in_text`), except for its intent."""
+        """Return an attacker's message as a fusion prompt shows it (`in_text`),
+        except for its intent.
+        """
         return {**message, "evidence": "", "risk": self.risk} if self.risk else dict(message)
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
@@ -85,18 +96,27 @@ class Attack:
         return graph
 
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
-        """Return `sent` with these intents `(n, H, A)` for the attackers; a NaN row changes nothing."""
+        """Return `sent` with these intents `(n, H, A)` for the attackers;
+        a NaN row changes nothing.
+        """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
 
     def claim(
-        self, sent: Intents, turn: Turn, to_zone_m: Floats | float, to_ego_m: Floats, claims: Claims | None
+        self,
+        sent: Intents,
+        turn: Turn,
+        to_zone_m: Floats | float,
+        to_ego_m: Floats,
+        claims: Claims | None,
     ) -> Intents:
         """Return `sent` with these distances, `(n, H)`, and claims for the attackers."""
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
             sent,
-            distance_m=np.concatenate([ego_m, np.where(turn.attackers, to_zone_m, helpers_m)], axis=1),
+            distance_m=np.concatenate(
+                [ego_m, np.where(turn.attackers, to_zone_m, helpers_m)], axis=1
+            ),
             range_m=np.where(turn.attackers, to_ego_m, sent.range_m),
             claims=claims,
         )
@@ -106,8 +126,8 @@ class Attack:
 class Liar(Attack):
     """Says the opposite of what it intends, from a true place."""
 
-    # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution with the
-    # largest probability where the smallest was, and so on
+    # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
+    # with the largest probability where the smallest was, and so on
     says: Literal["one-hot", "permuted"] = "one-hot"
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
@@ -148,7 +168,9 @@ class Stale(Attack):
 
 @dataclass(frozen=True)
 class Replay(Attack):
-    """Says under its own name what the next helper sent at the last step; at the first, the truth."""
+    """Says under its own name what the next helper sent at the last step;
+    at the first, the truth.
+    """
 
     @property
     def steps(self) -> int:
@@ -196,9 +218,11 @@ class Overconfident(Attack):
 
 @dataclass(frozen=True)
 class Spoof(Attack):
-    """Claims a place on the ego's way, just before the conflict zone; Eq. 2 gives weight by that claim.
+    """Claims a place on the ego's way, just before the conflict zone; Eq.
+    2 gives weight by that claim.
 
-    Alone, it says the truth from a false place. With `liar`, it is the worst case for a weighted rule.
+    Alone, it says the truth from a false place.
+    With `liar`, it is the worst case for a weighted rule.
     """
 
     # claimed distance to the centroid of the conflict zone
@@ -217,7 +241,9 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Claims another place at each step, some way from its true one in a direction that is drawn anew."""
+    """Claims another place at each step,
+    some way from its true one in a direction that is drawn anew.
+    """
 
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # the distance from the true place
     needs: ClassVar[tuple[str, ...]] = ("claims",)
@@ -234,7 +260,9 @@ class Jump(Attack):
 
 @dataclass(frozen=True)
 class Silent(Attack):
-    """Does not answer when it matters: if its intent differs from the ego's. Its slot stays empty."""
+    """Does not answer when it matters: if its intent differs from the ego's.
+    Its slot stays empty.
+    """
 
     by_scene: ClassVar[bool] = True
 
@@ -335,7 +363,9 @@ class Shift(_OfObjects):
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
         """Return the graph with moved nodes."""
-        moved = tuple(structs.replace(n, left_m=round(n.left_m + self.offset_m, 1)) for n in graph.nodes)
+        moved = tuple(
+            structs.replace(n, left_m=round(n.left_m + self.offset_m, 1)) for n in graph.nodes
+        )
         return structs.replace(graph, nodes=moved)
 
 
@@ -353,17 +383,31 @@ ATTACKS: Plugins[Attack] = Plugins(
     "swarmdrive.attacks",
     Attack,
     {
-        "liar": Liar(), "stuck": Stuck(), "stale": Stale(), "replay": Replay(), "spoof": Spoof(),
-        "sybil": Sybil(), "flood": Flood(), "brake": FeignedBraking(), "silent": Silent(),
-        "overconfident": Overconfident(), "random": RandomIntent(), "injection": Injection(), "jump": Jump(),
-        "absent": Absent(), "ghost": Ghost(), "hide": Hide(), "shift": Shift(),
+        "liar": Liar(),
+        "stuck": Stuck(),
+        "stale": Stale(),
+        "replay": Replay(),
+        "spoof": Spoof(),
+        "sybil": Sybil(),
+        "flood": Flood(),
+        "brake": FeignedBraking(),
+        "silent": Silent(),
+        "overconfident": Overconfident(),
+        "random": RandomIntent(),
+        "injection": Injection(),
+        "jump": Jump(),
+        "absent": Absent(),
+        "ghost": Ghost(),
+        "hide": Hide(),
+        "shift": Shift(),
     },
-)  # fmt: skip
+)
 
 
 @lru_cache(maxsize=256)
 def attacks_of(text: str) -> tuple[Attack, ...]:
-    """Return the attacks that a text such as `liar:share=1/3+spoof` names; those that add come last.
+    """Return the attacks that a text such as `liar:share=1/3+spoof` names;
+    those that add come last.
 
     Raises UserError for an unknown attack or setting.
     """
@@ -372,12 +416,15 @@ def attacks_of(text: str) -> tuple[Attack, ...]:
 
 
 def in_question(text: str, words: bool, objects: bool) -> str:
-    """Return the attacks in such a text that change what the ego is asked, without shares, joined by `&`.
+    """Return the attacks in such a text that change what the ego is asked, without shares,
+    joined by `&`.
 
-    Those that change `words` and those that change `objects`, as far as either is shown, in the order in
-    which they act.
+    Those that change `words` and those that change `objects`, as far as either is shown,
+    in the order in which they act.
     """
-    named = sorted((part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds)
+    named = sorted(
+        (part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds
+    )
     shown = []
     for name, *settings in named:
         if (words and ATTACKS[name].in_text) or (objects and ATTACKS[name].in_objects):
@@ -389,14 +436,18 @@ def in_question(text: str, words: bool, objects: bool) -> str:
 def _attack(text: str) -> Attack:
     name, *settings = text.split(":")
     if name not in ATTACKS:
-        raise unknown("attack", name, ATTACKS, "; as in liar:share=1/3+spoof:share=1/3:distance_m=3")
+        raise unknown(
+            "attack", name, ATTACKS, "; as in liar:share=1/3+spoof:share=1/3:distance_m=3"
+        )
     pairs = [setting.partition("=")[::2] for setting in settings]
     values = {key: _decimal(value) for key, value in pairs}
     if len(values) < len(pairs):
         raise UserError(f"attack {printable(text)}: a setting is given twice; give it once")
     default = ATTACKS[name]
     if "share" not in settable(default):
-        raise UserError(f"attack {printable(name)} has no share; fix or uninstall the package that has it")
+        raise UserError(
+            f"attack {printable(name)} has no share; fix or uninstall the package that has it"
+        )
     return changed(default, values, f"attack {name}")
 
 
@@ -422,7 +473,9 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 
 
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
-    """Return `sent` with further voices of the `talkers` after all others; `voice_of` has their owners."""
+    """Return `sent` with further voices of the `talkers` after all others;
+    `voice_of` has their owners.
+    """
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[
         :, : int(np.max(np.sum(talkers, axis=-1), initial=0))
@@ -439,8 +492,12 @@ def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
     claims = widened.claims
     if claims is not None:
         is_own, xy_m = np.arange(index.shape[1]) < helpers, claims.xy_m[:, 1:]
-        farther = 1 + shift_m[:, None] / np.maximum(np.linalg.norm(xy_m, axis=-1, keepdims=True), 1e-9)
-        claims = claims.moved(present & ~is_own, xy_m * farther).moved(~present, np.full_like(xy_m, np.nan))
+        farther = 1 + shift_m[:, None] / np.maximum(
+            np.linalg.norm(xy_m, axis=-1, keepdims=True), 1e-9
+        )
+        claims = claims.moved(present & ~is_own, xy_m * farther).moved(
+            ~present, np.full_like(xy_m, np.nan)
+        )
         # No sensor sees a further voice, since no vehicle stands there.
         claims = replace(claims, sensed_m=np.where(is_own, claims.sensed_m, np.nan))
     return replace(

@@ -14,14 +14,16 @@ from harness.core.arrays import Bools, Floats, Ints
 class Claims:
     """The claimed places and speeds of H helpers, and what the ego can check them against."""
 
-    # claimed place, m to the east and to the south of the centroid of the conflict zone, `(..., 1+H, 2)`, the
-    # ego first; NaN for a helper that is absent
+    # claimed place, m to the east and to the south of the centroid of the conflict zone, `(...,
+    # 1+H, 2)`, the ego first; NaN for a helper that is absent
     xy_m: Floats
     speed_mps: Floats  # claimed speed, `(..., H)`
     time_s: Floats  # time of the claim since the start of the episode, `(...)`
-    # standard deviation on each axis by which the beacons' declared noise moves a true place, `(...)`
+    # standard deviation on each axis by which the beacons' declared noise moves a true place,
+    # `(...)`
     error_m: Floats
-    # the helper's distance to that centroid by the ego's own sensors, `(..., H)`; NaN if they do not see it
+    # the helper's distance to that centroid by the ego's own sensors, `(..., H)`; NaN if they do
+    # not see it
     sensed_m: Floats
     # the map: returns metres from places `(..., 2)` to the middle of the nearest lane
     from_road_m: Callable[[Floats], Floats]
@@ -34,9 +36,13 @@ class Claims:
     def take(self, at: Any) -> "Claims":
         """Return the claims at these indices of the leading dimension."""
         return Claims(
-            self.xy_m[at], self.speed_mps[at], self.time_s[at], self.error_m[at], self.sensed_m[at],
+            self.xy_m[at],
+            self.speed_mps[at],
+            self.time_s[at],
+            self.error_m[at],
+            self.sensed_m[at],
             self.from_road_m,
-        )  # fmt: skip
+        )
 
     def of_helpers(self, places: Ints) -> "Claims":
         """Return the claims of the helpers at these indices, `(..., H')`; one may be repeated."""
@@ -51,4 +57,6 @@ class Claims:
     def moved(self, movers: Bools, xy_m: Floats) -> "Claims":
         """Return the claims with some helpers, `(..., H)`, moved to other places, `(..., H, 2)`."""
         ego, helpers = np.split(self.xy_m, [1], axis=-2)
-        return replace(self, xy_m=np.concatenate([ego, np.where(movers[..., None], xy_m, helpers)], axis=-2))
+        return replace(
+            self, xy_m=np.concatenate([ego, np.where(movers[..., None], xy_m, helpers)], axis=-2)
+        )

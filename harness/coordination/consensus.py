@@ -1,7 +1,7 @@
 """Consensus rules: how intents become one policy. Vehicle 0 is the ego and is always heard.
 
-A rule without memory is one function of (p, weights); a rule with memory is a class with `start` and `fuse`.
-`rules.py` lists all rules.
+A rule without memory is one function of (p, weights);
+a rule with memory is a class with `start` and `fuse`. `rules.py` lists all rules.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,17 @@ class Messages:
     intents: Floats
     weights: Floats  # paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard
     heard: Bools  # which replies came in time, `(..., H)`
-    # when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This is also a
-    # message's age, since every vehicle sees the scene at 0
+    # when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This is
+    # also a message's age, since every vehicle sees the scene at 0
     arrival_s: Floats
-    # distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its operating point
-    # declares, if it declares one
+    # distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its operating
+    # point declares, if it declares one
     distance_m: Floats
     range_m: Floats  # distance to the ego, `(..., H)`
     # what helpers claim about themselves, for a rule whose `needs` names it; else None
     claims: Claims | None = None
-    # what agents say of themselves, for a rule whose `needs` names it; `intents` are then plans. Else None
+    # what agents say of themselves, for a rule whose `needs` names it; `intents` are then plans.
+    # Else None
     plans: Plans | None = None
 
 
@@ -40,10 +41,11 @@ class Fused(NamedTuple):
     """The result of a rule."""
 
     policy: Floats  # the distributions after fusion, `(..., A)`
-    weights: Floats  # each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights
+    # each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights
+    weights: Floats
     state: Floats  # the rule's memory at the next step, `(..., K)`; K may be 0
-    # how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it treats the
-    # helper as an attacker. NaN for a helper not heard. None if the rule rates no trust
+    # how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it
+    # treats the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust
     trust: Floats | None = None
 
 
@@ -51,10 +53,10 @@ class Fused(NamedTuple):
 class Rule(Protocol):
     """A pure function of arrays, with its own memory for each episode.
 
-    The steps of an episode are fused in order, each from the state that the last one left. This includes
-    steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns. A rule
-    that uses `Messages.claims` has `needs = ("claims",)`. One that has `needs = ("plans",)` reads what agents
-    are themselves going to do, and no other rule does.
+    The steps of an episode are fused in order, each from the state that the last one left. This
+    includes steps in which the ego hears nobody; there it acts on its own intent, whatever the rule
+    returns. A rule that uses `Messages.claims` has `needs = ("claims",)`. One that has `needs =
+    ("plans",)` reads what agents are themselves going to do, and no other rule does.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
@@ -80,15 +82,16 @@ class Pool:
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
-    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2); 0 for a helper not heard.
+    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2);
+    0 for a helper not heard.
 
     If no helper is heard, the ego's weight is exactly 1: the paper's fall-back to its own intent.
 
     Args:
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
         heard: which helpers' replies are fused, `(..., H)`.
-        min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle in the
-            zone would otherwise outvote all others.
+        min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle
+            in the zone would otherwise outvote all others.
     """
     voices = np.insert(heard, 0, True, axis=-1)
     closeness = np.where(voices, 1.0 / np.maximum(distance_m, min_distance_m), 0.0)
@@ -113,7 +116,8 @@ def capped(weights: Floats, most: float) -> Floats:
 
 
 def linear_pool(p: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
+    """Return the weighted mean of intents,
+    `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
 
     Args:
         p: intents, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
@@ -124,7 +128,8 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 
 
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
-    """Return the weighted geometric mean of intents, `(..., A)` (logarithmic opinion pool, Genest 1984).
+    """Return the weighted geometric mean of intents,
+    `(..., A)` (logarithmic opinion pool, Genest 1984).
 
     A probability below `floor` counts as `floor`, so that one rounded 0 is no veto.
     """
@@ -137,8 +142,9 @@ def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
 def median(p: Floats, weights: Floats) -> Floats:
     """Return the weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    If exactly half of the weight lies on either side, it is the mean of the two values in the middle. All
-    medians are 0 if each vehicle is sure of another action; then the linear pool replaces them.
+    If exactly half of the weight lies on either side, it is the mean of the two values in the
+    middle. All medians are 0 if each vehicle is sure of another action; then the linear pool
+    replaces them.
     """
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
@@ -149,8 +155,8 @@ def median(p: Floats, weights: Floats) -> Floats:
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
     """Return the weighted mean of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    The lowest and the highest quarter of the weight are left out. The rule lies between the median, which
-    leaves out all but the middle, and the linear pool, which leaves out nothing.
+    The lowest and the highest quarter of the weight are left out. The rule lies between the median,
+    which leaves out all but the middle, and the linear pool, which leaves out nothing.
     """
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)
@@ -159,10 +165,15 @@ def trimmed_mean(p: Floats, weights: Floats) -> Floats:
 
 
 def _sorted(p: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Return each action's probabilities in order, `(..., 1+H, A)`, and the weight up to and with each."""
-    heard = np.where(weights[..., None] > 0, p, np.inf)  # helpers not heard come last, with weight 0
+    """Return each action's probabilities in order, `(..., 1+H, A)`,
+    and the weight up to and with each.
+    """
+    # helpers not heard come last, with weight 0
+    heard = np.where(weights[..., None] > 0, p, np.inf)
     order = np.argsort(heard, axis=-2, kind="stable")
-    below = np.cumsum(np.take_along_axis(np.broadcast_to(weights[..., None], p.shape), order, -2), axis=-2)
+    below = np.cumsum(
+        np.take_along_axis(np.broadcast_to(weights[..., None], p.shape), order, -2), axis=-2
+    )
     values = np.take_along_axis(heard, order, -2)
     return np.where(np.isinf(values), 0.0, values), below
 

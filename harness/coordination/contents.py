@@ -1,9 +1,11 @@
-"""Define what a helper's message holds: its intent, its words, the objects that it lists, or the whole truth.
+"""Define what a helper's message holds:
+its intent, its words, the objects that it lists, or the whole truth.
 
-What a message holds besides an intent is for the ego's model, which is asked once more: with the helpers'
-words in its prompt, or with a scene graph that their objects make larger. A list of objects needs no model:
-it can leave as soon as the request is there, while an intent and words wait for the helper's inference.
-Where several vehicles decide, a message can hold its sender's own plan, which costs no further inference.
+What a message holds besides an intent is for the ego's model, which is asked once more: with the
+helpers' words in its prompt, or with a scene graph that their objects make larger. A list of
+objects needs no model: it can leave as soon as the request is there, while an intent and words wait
+for the helper's inference. Where several vehicles decide, a message can hold its sender's own plan,
+which costs no further inference.
 """
 
 from typing import Final, Literal, NamedTuple
@@ -19,8 +21,8 @@ class Content(NamedTuple):
     """What a message holds."""
 
     intent: bool  # whether it holds the helper's intent, with the words beside it
-    # what extends the ego's graph before its model is asked again: the `objects` of those who were heard, or
-    # the `truth`, which no message can hold; empty where it is not asked again
+    # what extends the ego's graph before its model is asked again: the `objects` of those who were
+    # heard, or the `truth`, which no message can hold; empty where it is not asked again
     graph: Literal["", "objects", "truth"] = ""
     words: bool = False  # whether it holds the helper's words and nothing else
     # whether it holds what its sender is itself going to do: the answer that it gave as an agent
@@ -45,8 +47,8 @@ CONTENTS = {
     OBJECTS: Content(intent=False, graph=OBJECTS),
     # the ego's answer to the larger graph is fused with the helpers' intents
     "both": Content(intent=True, graph=OBJECTS),
-    # perfect sharing: an ego that hears anybody sees everything, without noise. It is no bound, since a
-    # model may misread the truth, and plans on its own view again where it does not ask
+    # perfect sharing: an ego that hears anybody sees everything, without noise. It is no bound,
+    # since a model may misread the truth, and plans on its own view again where it does not ask
     "oracle": Content(intent=False, graph=TRUTH),
 }
 # What messages of one ego's helpers hold; a plan is sent by agents alone.

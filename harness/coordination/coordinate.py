@@ -1,9 +1,10 @@
 """Make cooperative decisions, from seeing to acting, for any number of scenes at once.
 
-First comes the exchange of messages (its timeline is in `exchange.py`), then fusion. A consensus rule is
-arithmetic and takes no time. `ego-prompt` makes a fusion call: after the exchange the ego's model answers
-with the messages in its prompt, and the decision takes that much longer; so does a content that makes the
-ego's scene graph larger. An ego that has heard nobody acts on its own intent at once.
+First comes the exchange of messages (its timeline is in `exchange.py`), then fusion. A consensus
+rule is arithmetic and takes no time. `ego-prompt` makes a fusion call: after the exchange the ego's
+model answers with the messages in its prompt, and the decision takes that much longer; so does a
+content that makes the ego's scene graph larger. An ego that has heard nobody acts on its own intent
+at once.
 """
 
 from collections.abc import Callable
@@ -31,10 +32,11 @@ from harness.core.arrays import (
 from harness.core.strangers import worded
 from harness.radio.channel import Draws
 
-# From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if it failed
-# or nobody was heard, and the seconds `(...)` that it took.
+# From who was heard, `(..., H)`, to the fusion call's answer: the ego's intent `(..., A)`, NaN if
+# it failed or nobody was heard, and the seconds `(...)` that it took.
 FusionCall = Callable[[Bools], tuple[Floats, Floats]]
-# From where several actions are the likeliest, `(...)`, to a draw in [0, 1) for each such decision, `(k,)`.
+# From where several actions are the likeliest, `(...)`, to a draw in [0, 1) for each such decision,
+# `(k,)`.
 TieDraws = Callable[[Bools], Floats]
 
 TIES = ("drawn", "first")  # how a tie between the likeliest actions falls, the default first
@@ -45,9 +47,10 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 class FusionInputs:
     """What fusion needs beyond the messages."""
 
-    call: FusionCall | None = None  # the fusion call; required if the point's consensus is `ego-prompt`
-    # the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the episode's last
-    # step. None at the first step
+    # the fusion call; required if the point's consensus is `ego-prompt`
+    call: FusionCall | None = None
+    # the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the
+    # episode's last step. None at the first step
     state: Floats | None = None
     # the draws that decide between actions that are equally likely; None takes the first of them
     ties: TieDraws | None = None
@@ -57,20 +60,23 @@ class FusionInputs:
 class Coordination(Exchange):
     """What happened in each decision. Times are seconds from the start of the decision."""
 
-    weights: Floats  # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
+    # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
+    weights: Floats
     fused: Floats  # the policy, `(..., A)`
-    # index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the earlier action,
-    # the more careful one
+    # index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the
+    # earlier action, the more careful one
     action: Ints
-    # whether the fusion call's answer was unusable, so that `fused` is the ego's own intent, `(...)`
+    # whether the fusion call's answer was unusable, so that `fused` is the ego's own intent,
+    # `(...)`
     fusion_failed: Bools
-    # when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`. NaN where the ego's
-    # inference time is unknown
+    # when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`. NaN where
+    # the ego's inference time is unknown
     latency_s: Floats
     deadline_missed: Bools  # whether that is after the window, `(...)`
     # the rule's memory at the episode's next step, `(..., K)`; K is 0 for a rule without memory
     state: Floats
-    trust: Floats  # how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`)
+    # how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`)
+    trust: Floats
 
     @property
     def fusion_s(self) -> Floats:
@@ -81,7 +87,9 @@ class Coordination(Exchange):
 def coordinate(
     point: OperatingPoint, intents: Intents, draws: Draws, fusion: FusionInputs | None = None
 ) -> Coordination:
-    """Run trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions each."""
+    """Run trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions
+    each.
+    """
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 
 
@@ -100,7 +108,9 @@ def fuse(
     heard_any = any_of(heard.on_time)
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
-    answers = point.has_fusion_call and (point.fusion.consensus == EGO_PROMPT or not point.content.intent)
+    answers = point.has_fusion_call and (
+        point.fusion.consensus == EGO_PROMPT or not point.content.intent
+    )
     if point.has_fusion_call:
         if fusion.call is None:
             raise ValueError(f"operating point {point.name} needs a fusion call")
@@ -118,9 +128,15 @@ def fuse(
         if point.has_fusion_call:  # the ego's own intent is its answer to the larger graph
             p[..., 0, :] = fused
         messages = Messages(
-            p, weights, heard.on_time, heard.arrival_s, distance_m, intents.range_m, intents.claims,
+            p,
+            weights,
+            heard.on_time,
+            heard.arrival_s,
+            distance_m,
+            intents.range_m,
+            intents.claims,
             intents.plans,
-        )  # fmt: skip
+        )
         name = point.fusion.consensus
         fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
@@ -142,8 +158,8 @@ def fuse(
 def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
     """Let a rule fuse, from its memory at the episodes' first step if `state` is None.
 
-    A package's rule cannot write to what it gets, nor later to what it returns. Raises UserError if it fails,
-    or if what it returns where somebody was heard is no distribution.
+    A package's rule cannot write to what it gets, nor later to what it returns. Raises UserError if
+    it fails, or if what it returns where somebody was heard is no distribution.
     """
     *batch, vehicles, actions = messages.intents.shape
     with worded(f"rule {name}", built_in=name in RULES.built_in):

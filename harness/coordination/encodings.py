@@ -1,12 +1,11 @@
 """Compute the sizes of requests and replies by how messages are encoded.
 
-    json  compact JSON without a signature or headers, the paper's profiles' default
-    etsi  CPMs, and containers of our own for intents and requests, in PER; signed, with a digest of the
-          certificate, which beacons carry now and then
-    sae   SDSMs, and the same
+    json  compact JSON without a signature or headers, the paper's profiles' default etsi  CPMs, and
+    containers of our own for intents and requests, in PER; signed, with a digest of the
+    certificate, which beacons carry now and then sae   SDSMs, and the same
 
-The background's packets are then CAMs or BSMs. Under a physical radio the headers of network and transport
-count as well; those of the radio are its own.
+The background's packets are then CAMs or BSMs. Under a physical radio the headers of network and
+transport count as well; those of the radio are its own.
 """
 
 import numpy as np
@@ -31,12 +30,20 @@ def reply_bits(encoding: str, content: Content, intents: Intents, headers: bool)
     elif content.asks_helpers or content.plan:
         holds_intent = content.intent or content.plan
         counts = Counts(actions=intents.own.shape[-1] * holds_intent, text_bytes=text_bytes)
-        bits += intents.payload_bits if encoding == JSON else _packet(encoding, "intent", counts, headers)
+        bits += (
+            intents.payload_bits
+            if encoding == JSON
+            else _packet(encoding, "intent", counts, headers)
+        )
     if content.graph:
         assert intents.object_bits is not None
         assert intents.objects is not None
         counts = Counts(objects=intents.objects)
-        bits += intents.object_bits if encoding == JSON else _packet(encoding, "objects", counts, headers)
+        bits += (
+            intents.object_bits
+            if encoding == JSON
+            else _packet(encoding, "objects", counts, headers)
+        )
     return bits
 
 
@@ -46,7 +53,9 @@ def request_bits(encoding: str, helpers: int, headers: bool) -> float:
 
 
 def beacon_bytes(encoding: str, rate_hz: float) -> int:
-    """Return the mean size of a vehicle's beacons by an encoding that is not `json`, at so many a second."""
+    """Return the mean size of a vehicle's beacons by an encoding that is not `json`,
+    at so many a second.
+    """
     return messages.beacon_bytes(_standard(encoding), rate_hz)
 
 

@@ -3,21 +3,23 @@
 In seconds from the start of the decision:
 
     0                     every vehicle sees the scene; the ego and its helpers infer in parallel
-    inference_s[0]        the ego has its own intent. If it is sure enough, or has nobody to ask, it acts now.
-                          If it is unsure, it broadcasts one request to the nearest helpers in its radius
-    heard                 the request was on air, and the helpers have it, each after its own link's latency
-                          if the channel has one. Only now do they infer, if they infer on demand
-    ready                 a helper has the request and its own intent, and its reply can leave:
+    inference_s[0]        the ego has its own intent. If it is sure enough, or has nobody to ask, it
+    acts now. If it is unsure, it broadcasts one request to the nearest helpers in its radius heard
+    the request was on air, and the helpers have it, each after its own link's latency if the
+    channel has one. Only now do they infer, if they infer on demand ready                 a helper
+    has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
-    + slots               replies are on air, one after another or at once, as the profile says; a slot is
+    + slots               replies are on air, one after another or at once,
+    as the profile says; a slot is
                           nominal latency + payload / bandwidth + jitter, twice over a roadside edge
     arrival_s[h]          the end of the helper's slot if request and reply arrived; else inf
     window_s              what has arrived by now is fused
     exchange_s            the end of the last slot: the ego also waits for a lost or late reply
 
-The nominal latency of a slot covers the way of the request, but not its time on air. Like the paper, this
-counts the whole exchange as the decision's latency even if it outlasts the window. Everything here is a pure
-function of arrays, for any number of decisions; the ego is vehicle 0, helpers are 1..H.
+The nominal latency of a slot covers the way of the request, but not its time on air. Like the
+paper, this counts the whole exchange as the decision's latency even if it outlasts the window.
+Everything here is a pure function of arrays, for any number of decisions; the ego is vehicle 0,
+helpers are 1..H.
 """
 
 from collections.abc import Callable
@@ -43,31 +45,36 @@ from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 
 @dataclass(frozen=True)
 class Exchange:
-    """What was sent and heard in each decision. Times are seconds from the start of the decision."""
+    """What was sent and heard in each decision.
+    Times are seconds from the start of the decision.
+    """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
-    own_failed: Bools  # whether the ego's answer was unusable, so that `own` is the fallback, `(...)`
+    # whether the ego's answer was unusable, so that `own` is the fallback, `(...)`
+    own_failed: Bools
     entropy_nats: Floats  # entropy of `own`, `(...)`
-    # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if the entropy
-    # is above tau. Without a channel, or with nobody in the radius, it asks nobody
+    # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if
+    # the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody
     triggered: Bools
     asked: Bools  # which helpers are asked; each has a scheduled reply, `(..., H)`
-    # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or not, or on
-    # demand those that are asked. None without a channel, or where messages hold no intents
+    # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
+    # not, or on demand those that are asked. None without a channel, or where messages hold no
+    # intents
     infers: Bools
-    # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that asks for
-    # the ego; 0 if nobody is asked
+    # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that
+    # asks for the ego; 0 if nobody is asked
     requests: Ints
     request_bits: Floats  # size of the requests, `(...)`; 0 if nobody is asked
-    reply_bits: Floats  # size of all scheduled replies, and of the policy that a unit sends, `(...)`
-    # total time on air of the request and the scheduled replies, `(...)`; NaN if the channel model does not
-    # have it
+    # size of all scheduled replies, and of the policy that a unit sends, `(...)`
+    reply_bits: Floats
+    # total time on air of the request and the scheduled replies, `(...)`; NaN if the channel model
+    # does not have it
     airtime_s: Floats
-    # packet loss, the probability that one transmission was lost, `(...)`: the mean over the helpers asked if
-    # links differ; NaN without a channel
+    # packet loss, the probability that one transmission was lost, `(...)`: the mean over the
+    # helpers asked if links differ; NaN without a channel
     loss: Floats
-    # whether the helper was asked, and request and reply arrived, `(..., H)`; if a unit fuses, its policy
-    # must have arrived, too
+    # whether the helper was asked, and request and reply arrived, `(..., H)`; if a unit fuses, its
+    # policy must have arrived, too
     delivered: Bools
     arrival_s: Floats  # end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked
     on_time: Bools  # whether it arrived within the window and so is fused, `(..., H)`
@@ -81,7 +88,9 @@ class Exchange:
 
     @cached_property
     def messages(self) -> Ints:
-        """The number of scheduled replies of all rounds, `(...)`; like the paper, without requests."""
+        """The number of scheduled replies of all rounds, `(...)`;
+        like the paper, without requests.
+        """
         return count_of(self.asked) + self.repeats
 
     @cached_property
@@ -101,11 +110,14 @@ class Exchange:
         return np.where(asked > 0, self.lost / np.maximum(asked, 1), np.nan)
 
 
-def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None) -> Exchange:
-    """Run schedule and channel for decisions `(...)` with up to H helpers. An unknown time counts as 0.
+def exchange(
+    point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None
+) -> Exchange:
+    """Run schedule and channel for decisions `(...)` with up to H helpers.
+    An unknown time counts as 0.
 
-    If `asked`, `(..., H)`, is given, these of the helpers in the radius are asked instead of those that the
-    point's schedule chooses.
+    If `asked`, `(..., H)`, is given, these of the helpers in the radius are asked instead of those
+    that the point's schedule chooses.
     """
     own_failed, known = _base_knowledge(point, intents)
     in_radius = known.may_ask
@@ -119,7 +131,8 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
     delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
     loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
     one_loss = loss.shape[-1] == 1
-    in_turn = point.radio.profile is None or point.ask.on_demand  # else they infer before they are asked
+    # else they infer before they are asked
+    in_turn = point.radio.profile is None or point.ask.on_demand
     return Exchange(
         own=known.own,
         own_failed=own_failed,
@@ -130,9 +143,12 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
         & (outcome.asked if in_turn else intents.range_m <= point.ask.radius_m),
         requests=outcome.requests,
         request_bits=outcome.request_bits,
-        reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1) + outcome.policy_bits,
+        reply_bits=np.sum(np.where(outcome.asked, intents.payload_bits, 0.0), axis=-1)
+        + outcome.policy_bits,
         airtime_s=outcome.airtime_s,
-        loss=loss[..., 0] if one_loss else known_mean(np.where(outcome.asked, loss, np.nan), axis=-1),
+        loss=loss[..., 0]
+        if one_loss
+        else known_mean(np.where(outcome.asked, loss, np.nan), axis=-1),
         delivered=delivered,
         arrival_s=arrival_s,
         on_time=outcome.fused & (arrival_s <= point.fusion.window_s),
@@ -142,11 +158,13 @@ def exchange(point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools
 
 
 def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
-    """Return the helpers whose answers decide what happens, `(..., H)`; an unasked one counts as valid.
+    """Return the helpers whose answers decide what happens, `(..., H)`;
+    an unasked one counts as valid.
 
-    Once none of them is unasked, the answers of all others change nothing. They are the helpers that are
-    asked; those in the radius, too, if the channel's load or the schedule depends on who would answer; and
-    all that are present under an attack, which may use what any of them intends now or later.
+    Once none of them is unasked, the answers of all others change nothing. They are the helpers
+    that are asked; those in the radius, too, if the channel's load or the schedule depends on who
+    would answer; and all that are present under an attack, which may use what any of them intends
+    now or later.
     """
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
@@ -158,22 +176,30 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
         return known.may_ask
     asked = _chosen(point, known, intents, draws)
     coupled = getattr(point.channel, "density_coupled", point.physical is None)
-    return any_of(asked)[..., None] & known.may_ask if coupled or point.radio.helper_rounds else asked
+    return (
+        any_of(asked)[..., None] & known.may_ask if coupled or point.radio.helper_rounds else asked
+    )
 
 
 def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
     """Return who is asked by the point's schedule, `(..., H)`."""
     worth = _worth(point, _with_schedule_needs(point, known, intents, draws))
-    with worded(f"schedule {point.ask.schedule}", built_in=point.ask.schedule in SCHEDULES.built_in):
+    with worded(
+        f"schedule {point.ask.schedule}", built_in=point.ask.schedule in SCHEDULES.built_in
+    ):
         return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
 
 
 def _ask_helpers(
     point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
 ) -> tuple[Floats, Consulted, Floats]:
-    """Return when the ego asks, `(..., 1)`, the outcome, and until when it waits at most, `(...)`."""
+    """Return when the ego asks, `(..., 1)`, the outcome,
+    and until when it waits at most, `(...)`.
+    """
     intends = point.radio.helper_rounds and point.content.intent
-    opens_round = triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked)
+    opens_round = (
+        triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked)
+    )
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
 
@@ -183,15 +209,27 @@ def _ask_helpers(
         return np.maximum(helpers_s - request_s, has_request_s)
 
     links = Links(
-        asked, ready(0.0), intents.range_m, intents.payload_bits, in_radius, in_radius & opens_round,
-        point.request_bits, intents.site,
-    )  # fmt: skip
+        asked,
+        ready(0.0),
+        intents.range_m,
+        intents.payload_bits,
+        in_radius,
+        in_radius & opens_round,
+        point.request_bits,
+        intents.site,
+    )
     with worded(f"channel profile {point.radio.profile}", built_in=is_ours(point.channel)):
         if point.radio.edge == FUSION and point.physical and point.unit:
             until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
             remaining_s = until_s - request_s[..., 0]
             outcome = by_unit(
-                point.physical, point.unit, point.radio.edge_delay_s, links, draws, ready, remaining_s
+                point.physical,
+                point.unit,
+                point.radio.edge_delay_s,
+                links,
+                draws,
+                ready,
+                remaining_s,
             )
             return request_s, outcome, until_s
         return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
@@ -226,13 +264,17 @@ def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, Sch
     fallback = np.eye(n_actions)[0] if braking else np.full(n_actions, 1.0 / n_actions)
     own = np.where(failed[..., None], fallback, intents.own)
     in_radius = intents.valid & (intents.range_m <= point.ask.radius_m)
-    return failed, ScheduleInputs(own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m)
+    return failed, ScheduleInputs(
+        own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m
+    )
 
 
 def _with_schedule_needs(
     point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws
 ) -> ScheduleInputs:
-    if (point.needs("outlook") and intents.outlook is None) or (point.needs("lot") and draws.trips is None):
+    if (point.needs("outlook") and intents.outlook is None) or (
+        point.needs("lot") and draws.trips is None
+    ):
         raise UserError(NO_SCENE.format(printable(point.ask.schedule)))
     return replace(
         known,
@@ -250,10 +292,11 @@ IMAGINED = 8  # how many imagined exchanges the ego's expectation averages
 
 
 def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Draws) -> Floats:
-    """Return the probability that a reply arrives in the window, `(..., H)`, over imagined exchanges.
+    """Return the probability that a reply arrives in the window, `(..., H)`,
+    over imagined exchanges.
 
-    These have draws of their own. The transmissions of request and reply count as independent. A second path,
-    over a roadside unit, is left out.
+    These have draws of their own. The transmissions of request and reply count as independent. A
+    second path, over a roadside unit, is left out.
     """
     total = np.zeros(may_ask.shape)
     for n in range(IMAGINED):
@@ -288,12 +331,16 @@ def _ask_directly(
 
 
 def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Return the seconds until each vehicle has its intent, `(..., 1+H)`; the ego's may come from a cloud."""
+    """Return the seconds until each vehicle has its intent, `(..., 1+H)`;
+    the ego's may come from a cloud.
+    """
     ego_s: Floats | float = intents.inference_s[..., 0]
     if point.cloud.round_trip_s is not None:
         ego_s = point.cloud.round_trip_s
     elif point.network:
         if draws.trips is None:
-            raise UserError("round_trip needs layouts, and the paper's study has none; give round_trip_s")
+            raise UserError(
+                "round_trip needs layouts, and the paper's study has none; give round_trip_s"
+            )
         ego_s = ego_s + point.network.round_trip_s(draws.of(".cloud").wait)
     return np.insert(intents.inference_s[..., 1:], 0, ego_s, axis=-1)

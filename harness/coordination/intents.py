@@ -1,4 +1,6 @@
-"""Define `Intents`: what vehicles intend in a set of decisions, and what else coordination needs."""
+"""Define `Intents`: what vehicles intend in a set of decisions,
+and what else coordination needs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,15 +17,17 @@ from harness.radio.channel import Site
 
 @dataclass(frozen=True)
 class Intents:
-    """What every vehicle intends, and what the reply to a request would cost; H helpers, A actions."""
+    """What every vehicle intends, and what the reply to a request would cost;
+    H helpers, A actions.
+    """
 
     own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
     helpers: Floats  # helpers' intents, `(..., H, A)`
-    # whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing, takes no
-    # slot, and may hold NaN in every array
+    # whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing,
+    # takes no slot, and may hold NaN in every array
     valid: Bools
-    # distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a helper is as the
-    # ego knows it, from beacons
+    # distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a helper
+    # is as the ego knows it, from beacons
     distance_m: Floats
     range_m: Floats  # distance to the ego, `(..., H)`, as the ego knows it
     payload_bits: Floats  # size of the reply, `(..., H)`
@@ -31,7 +35,8 @@ class Intents:
     site: Site | None = None  # where the vehicles truly are, if the channel needs it; else None
     # whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is
     silent: Bools | None = None
-    # index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one voice
+    # index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one
+    # voice
     voice_of: Ints | None = None
     # what the ego sees and what helpers would add, if a schedule needs it; else None
     outlook: Outlook | None = None
@@ -42,13 +47,14 @@ class Intents:
     # how many objects each helper lists, `(..., H)`, if messages hold objects; else None
     objects: Floats | None = None
     object_bits: Floats | None = None  # size of these lists as compact JSON, `(..., H)`
-    # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None if the
-    # models of all were
+    # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None
+    # if the models of all were
     unasked: Bools | None = None
-    # what agents say of themselves, if messages hold plans; of the agent alone, `(..., 1)`, until it is known
-    # whom it hears. Else None
+    # what agents say of themselves, if messages hold plans; of the agent alone, `(..., 1)`, until
+    # it is known whom it hears. Else None
     plans: Plans | None = None
-    # size of the agent's own answer as a reply, and bytes of its text, `(...)`, if messages hold plans
+    # size of the agent's own answer as a reply, and bytes of its text, `(...)`, if messages hold
+    # plans
     own_bits: Floats | None = None
     own_text_bytes: Floats | None = None
 
@@ -71,7 +77,9 @@ class Intents:
         return replace(self, **arrays)
 
     def without_models(self) -> "Intents":
-        """Return what helpers send whose messages hold objects alone: whoever is present, and at once."""
+        """Return what helpers send whose messages hold objects alone:
+        whoever is present, and at once.
+        """
         own_s = self.inference_s[..., :1]
         return replace(
             self,
@@ -81,13 +89,16 @@ class Intents:
         )
 
     def with_words(self) -> "Intents":
-        """Return what helpers send whose messages hold words alone: one without words sends nothing."""
+        """Return what helpers send whose messages hold words alone:
+        one without words sends nothing.
+        """
         said = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
         unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
         return replace(self, valid=self.valid & ((said > 0) | unasked))
 
     def planned(self, senders: Ints) -> "Intents":
-        """Return what agents (n,) hear whose messages hold plans, by the row of each sender (n, H) or -1.
+        """Return what agents (n,) hear whose messages hold plans,
+        by the row of each sender (n, H) or -1.
 
         Only whoever decides now, and whose answer could be read, has a plan to send.
         """
@@ -110,7 +121,9 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Concatenate decisions with the same number of vehicles; none has a site, an outlook or claims."""
+        """Concatenate decisions with the same number of vehicles;
+        none has a site, an outlook or claims.
+        """
         arrays = [part.arrays() for part in parts]
         joint: dict[str, Any] = {}
         for name in arrays[0]:
@@ -127,7 +140,9 @@ class Intents:
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
-        """Return the helpers at these indices `(n, H')`, of decisions `(n, H)`; one may be repeated."""
+        """Return the helpers at these indices `(n, H')`, of decisions `(n, H)`;
+        one may be repeated.
+        """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         selected = {
             name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
@@ -148,7 +163,9 @@ class Intents:
     def arrays(self) -> dict[str, Any]:
         """Return the arrays that are not None, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if name not in PARTS and value is not None}
+        return {
+            name: value for name, value in values.items() if name not in PARTS and value is not None
+        }
 
 
 PARTS = ("site", "outlook", "claims", "plans")

@@ -1,4 +1,6 @@
-"""Define operating points: everything a cooperative decision depends on besides the scene and the model."""
+"""Define operating points: everything a cooperative decision depends on besides the scene and the
+model.
+"""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -13,7 +15,18 @@ from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_questio
 from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, TRUTH, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
-from harness.coordination.parts import FUSION, RELAY, Ask, Cloud, Fusion, Guard, Kept, Part, Radio, wrong
+from harness.coordination.parts import (
+    FUSION,
+    RELAY,
+    Ask,
+    Cloud,
+    Fusion,
+    Guard,
+    Kept,
+    Part,
+    Radio,
+    wrong,
+)
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
@@ -31,14 +44,19 @@ from harness.radio.roadside import Relay
 from harness.radio.wrapped import AtLoss
 
 OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
-UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")  # settings of a roadside unit with a place
+# settings of a roadside unit with a place
+UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
 LONGEST_NAME = 1000
 PARTS: dict[str, type[Part]] = {
-    "radio": Radio, "ask": Ask, "fusion": Fusion, "guard": Guard, "cloud": Cloud,
-}  # fmt: skip
+    "radio": Radio,
+    "ask": Ask,
+    "fusion": Fusion,
+    "guard": Guard,
+    "cloud": Cloud,
+}
 RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
 IN_NO_TEXT = ("profile", "further")  # settings that a condition's text has in another way
 
@@ -51,7 +69,9 @@ def more_parts() -> Mapping[str, type[Part]]:
 
 @cache
 def part_of_settings() -> Mapping[str, str]:
-    """Return the part of each setting, in the order in which manifests and conditions have them, flat."""
+    """Return the part of each setting,
+    in the order in which manifests and conditions have them, flat.
+    """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
     for part, kind in more_parts().items():
         after = 1 + [key for key, _ in part_of].index(kind.behind)
@@ -77,7 +97,8 @@ class Rewrites(NamedTuple):
     """How a fusion call shows messages."""
 
     blind: bool = False  # whether they come from helpers that are shown nothing
-    attack: str = ""  # the attack that changes attackers' messages (`attacks.in_question`); empty for none
+    # the attack that changes attackers' messages (`attacks.in_question`); empty for none
+    attack: str = ""
     defences: tuple[str, ...] = ()  # the defences that change every message
     graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
     # what the prompt shows of messages: all of each, its words alone, or nothing
@@ -98,7 +119,8 @@ class OperatingPoint:
     fusion: Fusion = Fusion()  # noqa: RUF009
     guard: Guard = Guard()  # noqa: RUF009
     cloud: Cloud = Cloud()  # noqa: RUF009
-    more: tuple[Part, ...] = ()  # those of extensions that do something, in the order of `more_parts`
+    # those of extensions that do something, in the order of `more_parts`
+    more: tuple[Part, ...] = ()
 
     def __post_init__(self) -> None:
         if self.more:
@@ -109,7 +131,8 @@ class OperatingPoint:
             raise UserError(f"operating point name {printable(self.name)!r}: give it some text")
         if len(self.name) > LONGEST_NAME:
             raise UserError(
-                f"operating point name {printable(self.name)!r}: give it {LONGEST_NAME} characters at most"
+                f"operating point name {printable(self.name)!r}: give it {LONGEST_NAME} characters "
+                "at most"
             )
         try:
             self._check_together()
@@ -131,11 +154,15 @@ class OperatingPoint:
             raise wrong("messages", "shuffled", f"own or blind where {holds}")
         if self.content.asks_again and self.radio.edge == FUSION:
             raise wrong(
-                "edge", FUSION, f"none or relay where {holds}: a unit sends a policy and nothing else"
+                "edge",
+                FUSION,
+                f"none or relay where {holds}: a unit sends a policy and nothing else",
             )
         attacks = attacks_of(self.guard.attack)
         if any(attack.in_objects for attack in attacks) and self.content.graph != OBJECTS:
-            raise wrong("attack", self.guard.attack, "one on intents where content lists no objects")
+            raise wrong(
+                "attack", self.guard.attack, "one on intents where content lists no objects"
+            )
         kind = "in_words" if self.content.words else "in_objects"
         apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
         if not (self.content.intent or self.content.plan or apt):
@@ -152,7 +179,9 @@ class OperatingPoint:
             raise wrong("attack", self.guard.attack, allowed)
         if self.fusion.consensus != EGO_PROMPT:
             if self.guard.defence:
-                raise wrong("defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}")
+                raise wrong(
+                    "defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}"
+                )
             return
         where = f"where consensus is {EGO_PROMPT}"
         if not (self.content.asks_helpers or self.content.plan):
@@ -162,18 +191,26 @@ class OperatingPoint:
             raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
 
     def _check_plans(self, holds: str) -> None:
-        """Raise ValueError for a rule that does not fit the content, and for what plans go without."""
+        """Raise ValueError for a rule that does not fit the content,
+        and for what plans go without.
+        """
         asks_again = self.content.plan and self.fusion.consensus == EGO_PROMPT
         if reads_plans(self.fusion.consensus) != self.content.plan and not asks_again:
             if self.content.plan:
-                able = ", ".join(name for name in names() if reads_plans(name) or name == EGO_PROMPT)
+                able = ", ".join(
+                    name for name in names() if reads_plans(name) or name == EGO_PROMPT
+                )
                 raise wrong("consensus", self.fusion.consensus, f"one of {able} where {holds}")
-            raise wrong("content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}")
+            raise wrong(
+                "content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}"
+            )
         if not self.content.plan:
             if self.fusion.rounds > 1:
                 raise wrong("rounds", self.fusion.rounds, f"1 where {holds}, which holds no plans")
             return
-        if self.fusion.rounds > 1 and (self.cloud.round_trip or self.cloud.round_trip_s is not None):
+        if self.fusion.rounds > 1 and (
+            self.cloud.round_trip or self.cloud.round_trip_s is not None
+        ):
             raise wrong("rounds", self.fusion.rounds, "1 where the ego's model runs in a cloud")
         if self.ask.messages != "own":
             raise wrong("messages", self.ask.messages, f"own where {holds}")
@@ -182,14 +219,18 @@ class OperatingPoint:
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
         if any(attack.in_words for attack in attacks_of(self.guard.attack)):
-            raise wrong("attack", self.guard.attack, f"one on intents where {holds}, which has no words")
+            raise wrong(
+                "attack", self.guard.attack, f"one on intents where {holds}, which has no words"
+            )
         if self.guard.defence:
             allowed = f"left out where {holds}, which is no advice and has no words"
             raise wrong("defence", self.guard.defence, allowed)
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
-        """Return the point of flat settings. Raises UserError for one that is unknown or not allowed."""
+        """Return the point of flat settings.
+        Raises UserError for one that is unknown or not allowed.
+        """
         return cls(name).changed(profile=profile, **settings)
 
     @classmethod
@@ -205,7 +246,9 @@ class OperatingPoint:
                 raise unknown("operating point setting", str(key), allowed)
         if "name" not in values:
             raise UserError('operating point without a name: add name = "..."')
-        return cls.of(**{"further" if key == "radio" else key: value for key, value in values.items()})
+        return cls.of(
+            **{"further" if key == "radio" else key: value for key, value in values.items()}
+        )
 
     @staticmethod
     def types() -> dict[str, Any]:
@@ -242,13 +285,17 @@ class OperatingPoint:
         return next((part for part in self.more if type(part) is kind), kind())
 
     def changed(self, **settings: Any) -> "OperatingPoint":
-        """Return the point with some settings changed by their flat names, or its name. Raises UserError."""
+        """Return the point with some settings changed by their flat names, or its name.
+        Raises UserError.
+        """
         name = settings.pop("name", self.name)
         by_part: dict[str, dict[str, Any]] = {}
         for key, value in settings.items():
             by_part.setdefault(part_of_settings()[key], {})[key] = value
         try:
-            parts = {part: structs.replace(self._part(part), **some) for part, some in by_part.items()}
+            parts = {
+                part: structs.replace(self._part(part), **some) for part, some in by_part.items()
+            }
         except ValueError as error:
             raise _error_of(name, error) from None
         own: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
@@ -259,7 +306,8 @@ class OperatingPoint:
 
     @cached_property
     def channel(self) -> Channel:
-        """The profile's channel with the point's overrides; its file is read once, when the point is made.
+        """The profile's channel with the point's overrides;
+        its file is read once, when the point is made.
 
         Raises UserError for an override of a setting that the profile does not have.
         """
@@ -269,13 +317,17 @@ class OperatingPoint:
         channel = CHANNELS[radio.profile]
         settings = {key: getattr(radio, key) for key in OVERRIDES}
         overrides = {
-            key: value for key, value in settings.items() if value is not None and value is not False
+            key: value
+            for key, value in settings.items()
+            if value is not None and value is not False
         }
         # A physical channel has no field for a loss: AtLoss wraps it below.
         loss = overrides.pop("loss", None) if isinstance(channel, Physical) else None
         for key in overrides:
             if key not in {field.name for field in fields(channel)}:
-                raise self._wrong(key, f"left out: channel profile {radio.profile} has no such setting")
+                raise self._wrong(
+                    key, f"left out: channel profile {radio.profile} has no such setting"
+                )
         further: Mapping[str, str] = pairs(radio.further) if radio.further else {}
         if further:
             channel = changed(channel, further, f"channel profile {radio.profile}")
@@ -285,7 +337,9 @@ class OperatingPoint:
         channel = replace(channel, **overrides)
         if isinstance(channel, Physical):
             channel = channel if loss is None else AtLoss(channel, loss)
-            return Relay(channel, self._unit, radio.edge_delay_s) if radio.edge == RELAY else channel
+            return (
+                Relay(channel, self._unit, radio.edge_delay_s) if radio.edge == RELAY else channel
+            )
         if radio.edge != "none":
             channel = self._relayed(channel)
         if radio.loss is not None and getattr(channel, "density_coupled", False):
@@ -294,19 +348,25 @@ class OperatingPoint:
 
     @cached_property
     def physical(self) -> Physical | None:
-        """The channel if its losses follow from where vehicles are; None if it has one loss for all links."""
+        """The channel if its losses follow from where vehicles are;
+        None if it has one loss for all links.
+        """
         return self.channel if isinstance(self.channel, Physical) else None
 
     def _relayed(self, channel: Channel) -> Channel:
         """Return a channel without places, with the relay as a second path of the same kind."""
         profile = self.radio.profile
         if self.radio.edge == FUSION:
-            raise self._wrong("edge", f"none or relay: links of channel profile {profile} have no places")
+            raise self._wrong(
+                "edge", f"none or relay: links of channel profile {profile} have no places"
+            )
         if not hasattr(channel, "roadside_edge"):
             raise self._wrong("edge", f"left out: channel profile {profile} has no such setting")
         for key in UNIT:
             if getattr(self.radio, key) != getattr(Radio(), key):
-                raise self._wrong(key, f"left out: links of channel profile {profile} have no places")
+                raise self._wrong(
+                    key, f"left out: links of channel profile {profile} have no places"
+                )
         return replace(channel, roadside_edge=True)
 
     @property
@@ -320,16 +380,21 @@ class OperatingPoint:
 
     @cached_property
     def network(self) -> Network | None:
-        """The network to a cloud, or None; its file is read once. Raises UserError if it is unknown."""
+        """The network to a cloud, or None; its file is read once.
+        Raises UserError if it is unknown.
+        """
         return network(self.cloud.round_trip) if self.cloud.round_trip else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
-        """Return the point with these settings of its channel. Raises UserError for an unknown setting."""
+        """Return the point with these settings of its channel.
+        Raises UserError for an unknown setting.
+        """
         texts = {**pairs(self.radio.further), **settings}
         return self.changed(further=",".join(f"{key}={value}" for key, value in texts.items()))
 
     def idle(self, setting: str | None) -> str | None:
-        """Return why a setting changes nothing here, whatever its value; None if it may change something.
+        """Return why a setting changes nothing here, whatever its value;
+        None if it may change something.
 
         Args:
             setting: a setting of the point or of its channel; None for the number of vehicles.
@@ -355,7 +420,9 @@ class OperatingPoint:
         weighs_none = consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads | Precedence)
         if setting in WEIGHING and weighs_none:
             return f"consensus {consensus} weighs no distances"
-        counts_rounds = isinstance(self.channel, constant.Radio) and not self.channel.density_coupled
+        counts_rounds = (
+            isinstance(self.channel, constant.Radio) and not self.channel.density_coupled
+        )
         if setting == "helper_rounds" and not counts_rounds:
             return "the load of its channel does not depend on it"
         channel: Any = self.channel
@@ -367,7 +434,9 @@ class OperatingPoint:
         return None
 
     def prepared(self, intents: Intents) -> Intents:
-        """Return what vehicles intend, (n, ...), as its parts have it before anything is made of it."""
+        """Return what vehicles intend, (n, ...),
+        as its parts have it before anything is made of it.
+        """
         for part in self.more:
             intents = part.before(intents)
         return intents
@@ -375,10 +444,16 @@ class OperatingPoint:
     @property
     def asks(self) -> bool:
         """Whether an ego may ask a helper here at all."""
-        return self.radio.profile is not None and self.ask.max_helpers > 0 and self.ask.schedule != NEVER
+        return (
+            self.radio.profile is not None
+            and self.ask.max_helpers > 0
+            and self.ask.schedule != NEVER
+        )
 
     def needs(self, what: str) -> bool:
-        """Return whether a schedule, rule or attack of it needs `in_time`, `outlook`, `lot` or `claims`."""
+        """Return whether a schedule, rule or attack of it needs `in_time`, `outlook`,
+        `lot` or `claims`.
+        """
         return what in self._needs
 
     @cached_property
@@ -426,7 +501,9 @@ class OperatingPoint:
         shows: Literal["message", "words", ""] = "words" if self.content.words else whole
         graph = self.content.graph
         attack = in_question(self.guard.attack, bool(shows), bool(graph))
-        return Rewrites(self.blind_helpers, attack, defences, graph, shows, self.ask.messages == "shuffled")
+        return Rewrites(
+            self.blind_helpers, attack, defences, graph, shows, self.ask.messages == "shuffled"
+        )
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))
@@ -450,13 +527,16 @@ def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
     here = without_gone(settings)
     for kind in more_parts().values():
         defaults = kind()
-        if all(here.get(key, default) == default for key, default in structs.asdict(defaults).items()):
+        if all(
+            here.get(key, default) == default for key, default in structs.asdict(defaults).items()
+        ):
             here = {key: value for key, value in here.items() if key not in kind.__struct_fields__}
     return here
 
 
 def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's settings without those of extensions that are gone, where these do nothing.
+    """Return a condition's settings without those of extensions that are gone,
+    where these do nothing.
 
     Raises UserError for one that does something.
     """
@@ -466,7 +546,9 @@ def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
         if not gone:
             kept[key] = value
         elif ("" if value is None else str(value)) != gone.idle:
-            raise UserError(f"setting {key}={printable(value)} of a condition is {part_of(gone.extension)}")
+            raise UserError(
+                f"setting {key}={printable(value)} of a condition is {part_of(gone.extension)}"
+            )
     return kept
 
 
@@ -487,11 +569,12 @@ CLOUD = OperatingPoint("cloud", cloud=Cloud(round_trip_s=0.51))
 
 
 def named_point(text: str) -> OperatingPoint:
-    """Return an operating point by its name and changes, such as `6g:consensus=ego-prompt,window_s=0.4`.
+    """Return an operating point by its name and changes,
+    such as `6g:consensus=ego-prompt,window_s=0.4`.
 
-    The name is one of the paper's points, or a channel profile, which stands for a point with that profile
-    and the defaults. A setting may have its name in `SHORT`, and may be one of the channel's own. The whole
-    text becomes the point's name.
+    The name is one of the paper's points, or a channel profile, which stands for a point with that
+    profile and the defaults. A setting may have its name in `SHORT`, and may be one of the
+    channel's own. The whole text becomes the point's name.
 
     Raises:
         UserError: there is no such point or setting, or a value is not allowed.
@@ -502,7 +585,9 @@ def named_point(text: str) -> OperatingPoint:
         raise unknown("operating point", name, {*points, *CHANNELS})
     point = points.get(name) or OperatingPoint(name, Radio(profile=name))
     channel_settings = (
-        [key for key in settable(point.channel) if key not in OVERRIDES] if point.radio.profile else []
+        [key for key in settable(point.channel) if key not in OVERRIDES]
+        if point.radio.profile
+        else []
     )
     settings: dict[str, Any] = {}
     radio: dict[str, str] = {}
@@ -512,15 +597,20 @@ def named_point(text: str) -> OperatingPoint:
         if field not in typed_settings() and field not in channel_settings:
             without_gone({field: value})
             allowed = (*typed_settings(), *SHORT, *channel_settings)
-            raise unknown(f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3")
+            raise unknown(
+                f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3"
+            )
         if ":" in value and field != "attack":
             joined = f"{key}={value.replace(':', ',')}"
             raise UserError(
-                f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings are "
+                f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings "
+                "are "
                 f"joined by commas, as in {printable(f'{name}:{joined}')}"
             )
         if field in settings or field in radio:
-            raise UserError(f"operating point {printable(text)!r}: {field} is given twice; give it once")
+            raise UserError(
+                f"operating point {printable(text)!r}: {field} is given twice; give it once"
+            )
         if field not in typed_settings():
             radio[field] = value
             continue
@@ -529,7 +619,8 @@ def named_point(text: str) -> OperatingPoint:
     for key in (*OVERRIDES, "edge", *UNIT):
         if key in settings and point.radio.profile is None:
             raise UserError(
-                f"operating point {printable(text)!r}: {name} has no channel, so {key} changes nothing; "
+                f"operating point {printable(text)!r}: {name} has no channel, so {key} changes "
+                "nothing; "
                 "leave it out"
             )
     if "round_trip" in settings and "round_trip_s" not in settings:
@@ -538,10 +629,13 @@ def named_point(text: str) -> OperatingPoint:
     return point.changed(name=text, **settings) if settings or radio else point
 
 
-# Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's unit.
+# Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's
+# unit.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
 
 
 def setting_of(key: str, text: str) -> object:
-    """Parse a setting's text by the type of its default; another text stays text, which no setting allows."""
+    """Parse a setting's text by the type of its default;
+    another text stays text, which no setting allows.
+    """
     return value_of(POINTS["6g"].setting(key), text)

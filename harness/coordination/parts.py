@@ -1,4 +1,5 @@
-"""Define the parts of an operating point: radio, whom the ego asks, fusion, what guards it, a cloud.
+"""Define the parts of an operating point:
+radio, whom the ego asks, fusion, what guards it, a cloud.
 
 Each part checks itself and raises ValueError with the setting, its value and what it must be.
 """
@@ -62,15 +63,17 @@ class RunFacts(Protocol):
 
 
 class Part(Struct, frozen=True, kw_only=True):
-    """Settings that are checked as they are made; whole numbers become floats where a float is meant.
+    """Settings that are checked as they are made;
+    whole numbers become floats where a float is meant.
 
-    A part with its defaults does nothing. Those that an extension adds (`adds={"parts": ...}`) are called in
-    the order of what follows, and only where they do something.
+    A part with its defaults does nothing. Those that an extension adds (`adds={"parts": ...}`) are
+    called in the order of what follows, and only where they do something.
     """
 
     behind: ClassVar[str] = ""  # the setting behind which its own stand in records
     of_ego: ClassVar[bool] = False  # whether it matters to an ego that asks nobody
-    # its settings that name something, and what returns the names that there are; empty names nothing
+    # its settings that name something, and what returns the names that there are; empty names
+    # nothing
     named: ClassVar[Mapping[str, Callable[[], Collection[str]]]] = {}
 
     def __post_init__(self) -> None:
@@ -100,7 +103,9 @@ class Part(Struct, frozen=True, kw_only=True):
         return {}
 
     def before(self, intents: "Intents") -> "Intents":
-        """Return what vehicles intend, (n, ...), as it is before anything is made of it; NaN may be there."""
+        """Return what vehicles intend, (n, ...), as it is before anything is made of it;
+        NaN may be there.
+        """
         return intents
 
 
@@ -121,14 +126,21 @@ class Ask(Part, frozen=True, kw_only=True):
     radius_m: Metres = 100.0  # the paper's R; helpers farther from the ego are not asked
     # The cooperative neighbourhood; if there are more helpers, the nearest are asked.
     max_helpers: Annotated[
-        int, Meta(ge=0, le=MOST_HELPERS, description=f"a whole number, 0 or more, at most {MOST_HELPERS}")
+        int,
+        Meta(
+            ge=0, le=MOST_HELPERS, description=f"a whole number, 0 or more, at most {MOST_HELPERS}"
+        ),
     ] = 3
-    # Size of the request. The default is 50 bytes: who asks whom and until when, as compact JSON without a
-    # signature or headers. Replies are counted in the same way.
-    request_bits: Annotated[float, Meta(ge=0, le=1e12, description="bits, 0 or more, at most 1e12")] = 400.0
-    on_demand: Flag = False  # whether a helper infers only when it is asked, not in parallel with the ego
-    # What the ego hears: its `own` helpers, or as a control helpers of another layout (`shuffled`) or helpers
-    # that are shown nothing (`blind`). A gain that remains under a control is not from what helpers see.
+    # Size of the request. The default is 50 bytes: who asks whom and until when, as compact JSON
+    # without a signature or headers. Replies are counted in the same way.
+    request_bits: Annotated[
+        float, Meta(ge=0, le=1e12, description="bits, 0 or more, at most 1e12")
+    ] = 400.0
+    # whether a helper infers only when it is asked, not in parallel with the ego
+    on_demand: Flag = False
+    # What the ego hears: its `own` helpers, or as a control helpers of another layout (`shuffled`)
+    # or helpers that are shown nothing (`blind`). A gain that remains under a control is not from
+    # what helpers see.
     messages: Text = "own"
     content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
 
@@ -139,16 +151,21 @@ class Ask(Part, frozen=True, kw_only=True):
             raise unknown("content", self.content, CONTENTS)
         if self.schedule == ORACLE:
             raise ValueError(
-                f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` plays it, and "
+                f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` "
+                "plays it, and "
                 f"others are {', '.join(SCHEDULES)}"
             )
         if self.schedule not in SCHEDULES:
             raise unknown("schedule", self.schedule, SCHEDULES)
         if self.threshold is not None and self.schedule == PAPER:
-            raise wrong("threshold", self.threshold, f"left out where schedule is {PAPER}: its is tau_nats")
+            raise wrong(
+                "threshold", self.threshold, f"left out where schedule is {PAPER}: its is tau_nats"
+            )
         if self.threshold is not None and SCHEDULES[self.schedule].threshold is None:
             raise wrong(
-                "threshold", self.threshold, f"left out where schedule is {self.schedule}, which has none"
+                "threshold",
+                self.threshold,
+                f"left out where schedule is {self.schedule}, which has none",
             )
 
     @property
@@ -170,13 +187,15 @@ class Radio(Part, frozen=True, kw_only=True):
     density_coupled: Flag = False  # whether loss follows the number of active vehicles
     # Whether a helper whose entropy is above tau opens a round of its own, which loads the channel.
     helper_rounds: Flag = False
-    # What a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the ego and
-    # fuses (`harness.radio.roadside`). With the constant model a relay has no place (`constant.Radio`).
+    # What a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the
+    # ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
+    # (`constant.Radio`).
     edge: Text = "none"
-    # From the end of what the unit receives to the start of what it sends: processing and backhaul. The
-    # default is declared: a unit that has nothing to wait for.
+    # From the end of what the unit receives to the start of what it sends: processing and backhaul.
+    # The default is declared: a unit that has nothing to wait for.
     edge_delay_s: Seconds = 0.0
-    edge_x_m: Place = 0.0  # to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
+    # to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
+    edge_x_m: Place = 0.0
     edge_y_m: Place = 0.0  # to the south
     # Height of the unit's antenna; by default that of TR 37.885, table 6.1.4-1, a roadside unit.
     edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
@@ -186,7 +205,9 @@ class Radio(Part, frozen=True, kw_only=True):
 
     def check(self) -> None:
         if self.profile is not None and self.profile not in CHANNELS:
-            raise unknown("channel profile", self.profile, CHANNELS, "; leave it out to disable V2V")
+            raise unknown(
+                "channel profile", self.profile, CHANNELS, "; leave it out to disable V2V"
+            )
         if self.edge not in EDGES:
             raise unknown("edge", self.edge, EDGES)
         if self.encoding not in ENCODINGS:
@@ -198,15 +219,17 @@ class Fusion(Part, frozen=True, kw_only=True):
 
     consensus: Text = "linear"  # consensus rule, or `ego-prompt`
     # Decision window, from the start of the decision; a later reply is not fused.
-    window_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="seconds above 0, at most 3600")] = 0.2
+    window_s: Annotated[
+        float, Meta(gt=0, le=LONGEST_S, description="seconds above 0, at most 3600")
+    ] = 0.2
     min_distance_m: Metres = 1.0  # lower bound of d in the paper's Eq. 2
-    # The ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The paper's preset
-    # declares a proxy of 3.5 m (section IV-A).
+    # The ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The
+    # paper's preset declares a proxy of 3.5 m (section IV-A).
     ego_distance_m: Metres | None = None
     # Largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
     weight_cap: Annotated[float, Meta(gt=0, le=1, description="a share above 0, up to 1")] = 1.0
-    # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass on the
-    # first action, which is the most conservative one.
+    # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
+    # on the first action, which is the most conservative one.
     fallback: Text = "uniform"
     # How often agents tell each other their plans before they act (`harness.evaluate.rounds`).
     rounds: Annotated[
@@ -223,9 +246,11 @@ class Fusion(Part, frozen=True, kw_only=True):
 class Guard(Part, frozen=True, kw_only=True):
     """What some helpers do instead of saying what they intend, and what guards a fusion call."""
 
-    attack: Text = ""  # such as `liar:share=1/3+spoof` (`harness.coordination.attacks`); empty for none
-    # Some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string; `schema` removes free text from
-    # messages; `majority` lets an action on which most voices agree win against the call's.
+    # such as `liar:share=1/3+spoof` (`harness.coordination.attacks`); empty for none
+    attack: Text = ""
+    # Some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string; `schema` removes free
+    # text from messages; `majority` lets an action on which most voices agree win against the
+    # call's.
     defence: Text = ""
 
     def check(self) -> None:
@@ -245,8 +270,8 @@ class Cloud(Part, frozen=True, kw_only=True):
 
     # From the ego's question to the answer of a model in a cloud; replaces the ego's own inference.
     round_trip_s: Seconds | None = None
-    # Network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each decision
-    # draws a round trip, which is added to the model's inference.
+    # Network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each
+    # decision draws a round trip, which is added to the model's inference.
     round_trip: Text = ""
 
     def check(self) -> None:
@@ -254,5 +279,7 @@ class Cloud(Part, frozen=True, kw_only=True):
             network(self.round_trip)
             if self.round_trip_s is not None:
                 raise wrong(
-                    "round_trip", self.round_trip, "left out where round_trip_s says all; keep one of the two"
+                    "round_trip",
+                    self.round_trip,
+                    "left out where round_trip_s says all; keep one of the two",
                 )

@@ -1,4 +1,6 @@
-"""Define `Plans`: what agents say about themselves beside the intents that they are going to act by."""
+"""Define `Plans`: what agents say about themselves beside the intents that they are going to act
+by.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +11,8 @@ from harness.core.arrays import Floats, Ints
 
 STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
 NO_PLANS = (
-    "condition {}: content plan needs several agents, and here one ego decides; give --agents all with "
+    "condition {}: content plan needs several agents, and here one ego decides; give --agents all "
+    "with "
     "`harness drive`, or content=intent"
 )
 
@@ -21,14 +24,15 @@ class Plans:
     All is what the sender itself states, so all who hear it compare the same numbers.
     """
 
-    # the row of the decision that each other makes itself now, among those made together, `(..., H)`; -1
-    # where it makes none. H is 0 until it is known whom an agent hears
+    # the row of the decision that each other makes itself now, among those made together, `(...,
+    # H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
     row: Ints
     vehicle: Ints  # the vehicle's number in its world; -1 for one without a plan
-    # seconds until it is at the centroid of the conflict zone at its speed; inf for one that stands, or has
-    # passed it. NaN without a plan
+    # seconds until it is at the centroid of the conflict zone at its speed; inf for one that
+    # stands, or has passed it. NaN without a plan
     reaches_s: Floats
-    # how much later it is than at the speed that it had in the beginning, at least 0; NaN without a plan
+    # how much later it is than at the speed that it had in the beginning, at least 0; NaN without a
+    # plan
     lost_s: Floats
 
     def take(self, at: Any) -> "Plans":
@@ -46,11 +50,16 @@ class Plans:
         return Plans(row, of(self.vehicle), of(self.reaches_s), of(self.lost_s))
 
     def among(self, senders: Ints) -> "Plans":
-        """Return what agents (n, 1) hear of each other, (n, 1+H), by the row of each sender (n, H) or -1."""
+        """Return what agents (n, 1) hear of each other, (n, 1+H),
+        by the row of each sender (n, H) or -1.
+        """
 
         def heard(own: Any, unknown: float) -> Any:
             return np.concatenate([own, np.where(senders >= 0, own[senders, 0], unknown)], axis=1)
 
         return Plans(
-            senders, heard(self.vehicle, -1), heard(self.reaches_s, np.nan), heard(self.lost_s, np.nan)
+            senders,
+            heard(self.vehicle, -1),
+            heard(self.reaches_s, np.nan),
+            heard(self.lost_s, np.nan),
         )

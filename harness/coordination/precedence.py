@@ -1,7 +1,8 @@
-"""Rules that read plans: who goes first is decided by an order that all agents know, and the others wait.
+"""Rules that read plans: who goes first is decided by an order that all agents know,
+and the others wait.
 
-A rule knows what agents say of themselves (`plans.Plans`) and the actions that they plan. It is not told
-whether two ways cross, and nobody pays for going first.
+A rule knows what agents say of themselves (`plans.Plans`) and the actions that they plan. It is not
+told whether two ways cross, and nobody pays for going first.
 """
 
 from collections.abc import Callable
@@ -17,16 +18,17 @@ from harness.core.arrays import Floats
 
 @dataclass(frozen=True)
 class Precedence:
-    """An agent takes its most careful action if one that goes before it is near, and plans to go on.
+    """An agent takes its most careful action if one that goes before it is near,
+    and plans to go on.
 
-    Else it acts by its own intent. Who plans the most careful action waits already, and who stands or has
-    passed the conflict is near nobody, so nobody waits for these. Agents of the same rank go by their number
-    in the world.
+    Else it acts by its own intent. Who plans the most careful action waits already, and who stands
+    or has passed the conflict is near nobody, so nobody waits for these. Agents of the same rank go
+    by their number in the world.
     """
 
     rank: Callable[[Plans], Floats]  # of each vehicle, `(..., 1+H)`; the lowest goes first
-    # two agents are near if they reach the conflict at times less than this apart. Declared: the headway of
-    # the two-second rule
+    # two agents are near if they reach the conflict at times less than this apart. Declared: the
+    # headway of the two-second rule
     apart_s: float = 2.0
     needs: ClassVar[tuple[str, ...]] = ("plans",)
 

@@ -1,8 +1,8 @@
 """Consensus rules that count heads, so that a claimed distance gives no helper more weight.
 
-Each of them makes the same promise: if at least two others, the ego among them, agree on an action, no single
-helper can change it. A pool of probabilities alone does not keep it: if each action's median is taken by
-itself, one voice can make the second choice of all others the first.
+Each of them makes the same promise: if at least two others, the ego among them, agree on an action,
+no single helper can change it. A pool of probabilities alone does not keep it: if each action's
+median is taken by itself, one voice can make the second choice of all others the first.
 """
 
 from dataclasses import dataclass
@@ -22,19 +22,26 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median 
 
 @dataclass(frozen=True)
 class Heads(Pool):
-    """A pool in which all who are heard weigh the same, and no helper flips what all others agree on."""
+    """A pool in which all who are heard weigh the same,
+    and no helper flips what all others agree on.
+    """
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Apply the pool; if it departs from what all but one want, return the mean of their intents."""
+        """Apply the pool; if it departs from what all but one want,
+        return the mean of their intents.
+        """
         voices = messages.weights > 0
         heads = np.sum(voices, axis=-1)
         weights = voices / heads[..., None]
         policy = self.pool(messages.intents, weights)
-        return Fused(outvoted(policy, messages.intents, voices, np.maximum(heads - 1, 2)), weights, state)
+        return Fused(
+            outvoted(policy, messages.intents, voices, np.maximum(heads - 1, 2)), weights, state
+        )
 
 
 def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
-    """Return the policy, or the mean of the majority's intents where a majority wants another action.
+    """Return the policy, or the mean of the majority's intents where a majority wants another
+    action.
 
     A majority counts only if the ego is in it.
 
@@ -48,7 +55,9 @@ def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
     counts = np.sum(choices[..., None] == np.arange(p.shape[-1]), axis=-2)
     majority_action = np.argmax(counts, axis=-1)
     in_majority = choices == majority_action[..., None]
-    majority_mean = linear_pool(p, in_majority / np.maximum(np.sum(in_majority, axis=-1, keepdims=True), 1))
+    majority_mean = linear_pool(
+        p, in_majority / np.maximum(np.sum(in_majority, axis=-1, keepdims=True), 1)
+    )
     overrides = (
         (np.max(counts, axis=-1) >= votes)
         & in_majority[..., 0]
@@ -58,14 +67,18 @@ def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
 
 
 def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
-    """Return each action's mean probability without the highest and the lowest head, scaled to sum to 1.
+    """Return each action's mean probability without the highest and the lowest head,
+    scaled to sum to 1.
 
-    With fewer than three heads, none is left out. The k-truncated mean of Guo and Kong (2024) with k = 1.
+    With fewer than three heads, none is left out.
+    The k-truncated mean of Guo and Kong (2024) with k = 1.
     """
     voices = weights > 0
     heads = np.sum(voices, axis=-1)[..., None, None]
     rank = np.argsort(
-        np.argsort(np.where(voices[..., None], p, np.inf), axis=-2, kind="stable"), axis=-2, kind="stable"
+        np.argsort(np.where(voices[..., None], p, np.inf), axis=-2, kind="stable"),
+        axis=-2,
+        kind="stable",
     )
     trimmed = np.where(heads >= 3, 1, 0)
     kept = voices[..., None] & (rank >= trimmed) & (rank < heads - trimmed)
@@ -73,7 +86,9 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
 
 
 def geometric_median(p: Floats, weights: Floats) -> Floats:
-    """Return the distribution with the least sum of distances to messages, `(..., A)` (Weiszfeld 1937)."""
+    """Return the distribution with the least sum of distances to messages,
+    `(..., A)` (Weiszfeld 1937).
+    """
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
     for _ in range(WEISZFELD_ROUNDS):
@@ -84,10 +99,11 @@ def geometric_median(p: Floats, weights: Floats) -> Floats:
 
 
 def centred_clipping(p: Floats, weights: Floats) -> Floats:
-    """Return the ego's intent, moved by the mean of the steps to all messages, `(..., A)`, in some rounds.
+    """Return the ego's intent, moved by the mean of the steps to all messages, `(..., A)`,
+    in some rounds.
 
-    No step is longer than `CLIP`. Karimireddy, He and Jaggi (2021), starting from the ego's intent instead of
-    the last round's aggregate.
+    No step is longer than `CLIP`. Karimireddy, He and Jaggi (2021),
+    starting from the ego's intent instead of the last round's aggregate.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
@@ -99,11 +115,12 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
 
 
 def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY) -> Floats:
-    """Return the product of all messages, each true with a probability and else uninformative, `(..., A)`.
+    """Return the product of all messages,
+    each true with a probability and else uninformative, `(..., A)`.
 
-    A message counts as `r p + (1 - r) / A`, so no voice weighs more than `(1 - r + A r) / (1 - r)` to one.
-    The ego's intent counts as it is. The prior is uniform over the actions. Voices are taken as independent,
-    which those of vehicles that see the same are not.
+    A message counts as `r p + (1 - r) / A`, so no voice weighs more than `(1 - r + A r) / (1 - r)`
+    to one. The ego's intent counts as it is. The prior is uniform over the actions. Voices are
+    taken as independent, which those of vehicles that see the same are not.
 
     Args:
         p: intents, `(..., 1+H, A)`.

@@ -1,8 +1,8 @@
 """Find consensus rules by name, those that other packages add included.
 
-A package adds a rule by an entry point in the group `swarmdrive.rules`; `Pool` makes a rule of a function of
-(p, weights). `ego-prompt` is no rule: a fusion call asks the ego's model with the messages in its prompt (the
-paper's section III-C).
+A package adds a rule by an entry point in the group `swarmdrive.rules`; `Pool` makes a rule of a
+function of (p, weights). `ego-prompt` is no rule: a fusion call asks the ego's model with the
+messages in its prompt (the paper's section III-C).
 """
 
 from harness.coordination.consensus import Pool, Rule, linear_pool, log_pool, median, trimmed_mean
@@ -11,7 +11,12 @@ from harness.coordination.robust import HEADS
 from harness.coordination.trust import Trust
 from harness.core.plugins import Plugins
 
-POOLS = {"linear": linear_pool, "log-pool": log_pool, "median": median, "trimmed-mean": trimmed_mean}
+POOLS = {
+    "linear": linear_pool,
+    "log-pool": log_pool,
+    "median": median,
+    "trimmed-mean": trimmed_mean,
+}
 RULES: Plugins[Rule] = Plugins(
     "swarmdrive.rules",
     Rule,

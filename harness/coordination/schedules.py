@@ -1,8 +1,9 @@
-"""Find schedules by name: formulas, learnt ones in files `schedules/*.toml`, and those that packages add.
+"""Find schedules by name: formulas, learnt ones in files `schedules/*.toml`,
+and those that packages add.
 
-A file holds a small network, which says what asking a helper is worth from what the ego knows before, and
-what it was learnt from; `harness study schedule learn` writes it. A package adds a schedule by an entry point
-in the group `swarmdrive.schedules`.
+A file holds a small network, which says what asking a helper is worth from what the ego knows
+before, and what it was learnt from; `harness study schedule learn` writes it. A package adds a
+schedule by an entry point in the group `swarmdrive.schedules`.
 """
 
 from dataclasses import asdict, dataclass
@@ -19,9 +20,21 @@ from harness.core.plugins import FilesAndPlugins
 
 FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
 INPUTS = (
-    "entropy", "margin", "most careful", "least careful", "unseen, most", "unseen, mean", "added, most",
-    "added, mean", "range", "helper to zone", "ego to zone", "seconds to zone", "others nearer", "others",
-)  # fmt: skip
+    "entropy",
+    "margin",
+    "most careful",
+    "least careful",
+    "unseen, most",
+    "unseen, mean",
+    "added, most",
+    "added, mean",
+    "range",
+    "helper to zone",
+    "ego to zone",
+    "seconds to zone",
+    "others nearer",
+    "others",
+)
 
 
 @dataclass(frozen=True)
@@ -43,14 +56,18 @@ class Network:
 
 @dataclass(frozen=True)
 class Learnt:
-    """A schedule whose worth is the expected gain in success probability from asking only this helper."""
+    """A schedule whose worth is the expected gain in success probability from asking only this
+    helper.
+    """
 
     network: Network
     threshold: float
     needs: ClassVar[tuple[str, ...]] = ("outlook",)
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return the network's output for each helper, `(..., H)`; NaN for one that may not be asked."""
+        """Return the network's output for each helper, `(..., H)`;
+        NaN for one that may not be asked.
+        """
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
 
@@ -80,11 +97,24 @@ class Stated:
     network: Weights  # the network's weights
 
     def schedule(self, where: str) -> Learnt:
-        """Return the schedule. Raises UserError for other inputs than `INPUTS`, or weights of other sizes."""
-        arrays: dict[str, Any] = {name: np.array(value) for name, value in asdict(self.network).items()}
+        """Return the schedule. Raises UserError for other inputs than `INPUTS`,
+        or weights of other sizes.
+        """
+        arrays: dict[str, Any] = {
+            name: np.array(value) for name, value in asdict(self.network).items()
+        }
         f, j = len(INPUTS), len(self.network.bias)
-        shapes = {"centre": (f,), "scale": (f,), "into": (f, j), "bias": (j,), "out": (j,), "base": ()}
-        if self.inputs != INPUTS or any(arrays[name].shape != shape for name, shape in shapes.items()):
+        shapes = {
+            "centre": (f,),
+            "scale": (f,),
+            "into": (f, j),
+            "bias": (j,),
+            "out": (j,),
+            "base": (),
+        }
+        if self.inputs != INPUTS or any(
+            arrays[name].shape != shape for name, shape in shapes.items()
+        ):
             raise UserError(f"{where} has other inputs or sizes than the program; learn it again")
         return Learnt(Network(**arrays), self.threshold)
 
@@ -98,19 +128,35 @@ def inputs(known: ScheduleInputs) -> Floats:
     range_m = np.where(may_ask, known.range_m, np.inf)
     nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
     ego_inputs = (
-        known.entropy_nats, 1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1), known.own[..., 0],
-        known.own[..., -1], outlook.unseen.max(axis=-1, initial=0.0), outlook.unseen.sum(axis=-1) / regions,
-        known.distance_m[..., 0] / FAR_M, np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
+        known.entropy_nats,
+        1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1),
+        known.own[..., 0],
+        known.own[..., -1],
+        outlook.unseen.max(axis=-1, initial=0.0),
+        outlook.unseen.sum(axis=-1) / regions,
+        known.distance_m[..., 0] / FAR_M,
+        np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
         may_ask.sum(axis=-1) - 1.0,
-    )  # fmt: skip
+    )
     entropy, margin, careful, bold, unseen_most, unseen, ego_m, to_zone, others = (
         np.broadcast_to(column[..., None], may_ask.shape) for column in ego_inputs
     )
     columns = (
-        entropy, margin, careful, bold, unseen_most, unseen, outlook.added.max(axis=-1, initial=0.0),
-        outlook.added.sum(axis=-1) / regions, known.range_m / FAR_M, known.distance_m[..., 1:] / FAR_M, ego_m,
-        to_zone, nearer, others,
-    )  # fmt: skip
+        entropy,
+        margin,
+        careful,
+        bold,
+        unseen_most,
+        unseen,
+        outlook.added.max(axis=-1, initial=0.0),
+        outlook.added.sum(axis=-1) / regions,
+        known.range_m / FAR_M,
+        known.distance_m[..., 1:] / FAR_M,
+        ego_m,
+        to_zone,
+        nearer,
+        others,
+    )
     return np.stack(columns, axis=-1)
 
 

@@ -1,9 +1,10 @@
 """Schedules: rules for whom the ego asks and when, from what it knows before it asks.
 
-A schedule is one function of `ScheduleInputs` and one entry in `FORMULAS`, or a learnt network (`learnt.py`);
-`schedules.py` has all of them by name. It returns what asking each helper is worth, in its own unit. Helpers
-worth more than the operating point's threshold are asked, up to the number that the point allows: those worth
-the most first, and the nearest first of equals. `entropy` is the paper's schedule (Eq. 3).
+A schedule is one function of `ScheduleInputs` and one entry in `FORMULAS`, or a learnt network
+(`learnt.py`); `schedules.py` has all of them by name. It returns what asking each helper is worth,
+in its own unit. Helpers worth more than the operating point's threshold are asked, up to the number
+that the point allows: those worth the most first, and the nearest first of equals. `entropy` is the
+paper's schedule (Eq. 3).
 """
 
 from collections.abc import Callable
@@ -20,11 +21,12 @@ class Outlook:
     """What the ego sees of the scenario's R regions, and what it can infer that its helpers see."""
 
     unseen: Floats  # share of each region that the ego does not see, `(..., R)`
-    # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from the place
-    # in the helper's last beacon and the obstacles that the ego knows. NaN for a helper that is absent
+    # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from
+    # the place in the helper's last beacon and the obstacles that the ego knows. NaN for a helper
+    # that is absent
     added: Floats
-    # seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there, and inf at a
-    # standstill
+    # seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there, and
+    # inf at a standstill
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
@@ -32,21 +34,25 @@ class Outlook:
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
-        """Return the outlook with the helpers at these indices, `(..., H')`; one may be repeated."""
+        """Return the outlook with the helpers at these indices, `(..., H')`;
+        one may be repeated.
+        """
         return replace(self, added=np.take_along_axis(self.added, places[..., None], axis=-2))
 
 
 @dataclass(frozen=True)
 class ScheduleInputs:
-    """What the ego knows before it asks. Values for a helper that may not be asked are arbitrary."""
+    """What the ego knows before it asks.
+    Values for a helper that may not be asked are arbitrary.
+    """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
     entropy_nats: Floats  # entropy of `own`, `(...)`
     may_ask: Bools  # which helpers are in the radius and would answer, `(..., H)`
     range_m: Floats  # distance to the ego, `(..., H)`
     distance_m: Floats  # distance to the conflict zone, `(..., 1+H)`, the ego first
-    # probability that request and reply are received within the window, `(..., H)`, by the channel's model
-    # for such links, if all who may be asked are asked
+    # probability that request and reply are received within the window, `(..., H)`, by the
+    # channel's model for such links, if all who may be asked are asked
     in_time: Floats | None = None
     outlook: Outlook | None = None  # what the ego sees, and what helpers would add
     lot: Floats | None = None  # a draw in [0, 1), new at each decision, `(...)`
@@ -58,14 +64,19 @@ class Schedule(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Which of `in_time`, `outlook` and `lot` it uses; the others are None in `ScheduleInputs`."""
+        """Which of `in_time`, `outlook` and `lot` it uses;
+        the others are None in `ScheduleInputs`.
+        """
 
     @property
     def threshold(self) -> float | None:
-        """The worth above which the ego asks, unless the operating point has its own; None without one."""
+        """The worth above which the ego asks, unless the operating point has its own;
+        None without one.
+        """
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return what asking each helper is worth, `(..., H)`, or `(..., 1)` if it is the same for all.
+        """Return what asking each helper is worth, `(..., H)`,
+        or `(..., 1)` if it is the same for all.
 
         If helpers differ, it is NaN for one that may not be asked.
         """
@@ -78,8 +89,8 @@ class Formula:
     formula: Callable[[ScheduleInputs], Floats]
     threshold: float | None = None
     needs: tuple[str, ...] = ()
-    # whether what one helper is worth depends on which others may be asked. That of a schedule that does not
-    # say may
+    # whether what one helper is worth depends on which others may be asked. That of a schedule that
+    # does not say may
     by_presence: bool = False
 
     def worth(self, known: ScheduleInputs) -> Floats:
@@ -103,21 +114,27 @@ def entropy(known: ScheduleInputs) -> Floats:
 
 
 def margin(known: ScheduleInputs) -> Floats:
-    """Return 1 minus the lead of the likeliest action over the next: 0 sure, 1 undecided between two."""
+    """Return 1 minus the lead of the likeliest action over the next:
+    0 sure, 1 undecided between two.
+    """
     ranked = np.sort(known.own, axis=-1)
     lead: Floats = ranked[..., -1] - (ranked[..., -2] if ranked.shape[-1] > 1 else 0.0)
     return (1.0 - lead)[..., None]
 
 
 def risk(known: ScheduleInputs) -> Floats:
-    """Return the entropy, in nats, times the unseen share of the region that the ego sees least of."""
+    """Return the entropy, in nats, times the unseen share of the region that the ego sees least
+    of.
+    """
     assert known.outlook is not None
     unseen: Floats = np.max(known.outlook.unseen, axis=-1, initial=0.0)
     return (known.entropy_nats * unseen)[..., None]
 
 
 def deadline(known: ScheduleInputs) -> Floats:
-    """Return the entropy, in nats, times the probability that the helper's reply arrives in time."""
+    """Return the entropy, in nats, times the probability that the helper's reply arrives in
+    time.
+    """
     assert known.in_time is not None
     return np.where(known.may_ask, known.entropy_nats[..., None] * known.in_time, np.nan)
 
@@ -125,7 +142,8 @@ def deadline(known: ScheduleInputs) -> Floats:
 def coverage(known: ScheduleInputs) -> Floats:
     """Return the mean share of the regions that the helper sees and the ego does not.
 
-    This is need times supply at each point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
+    This is need times supply at each point of a region,
+    as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
     """
     assert known.outlook is not None
     regions = max(known.outlook.added.shape[-1], 1)
@@ -133,7 +151,9 @@ def coverage(known: ScheduleInputs) -> Floats:
 
 
 def random(known: ScheduleInputs) -> Floats:
-    """Return a draw in [0, 1), so that the ego asks in a share of 1 minus the threshold of its decisions."""
+    """Return a draw in [0, 1), so that the ego asks in a share of 1 minus the threshold of its
+    decisions.
+    """
     assert known.lot is not None
     return known.lot[..., None]
 
@@ -154,7 +174,9 @@ ORACLE = "oracle"  # a bound that only a study of frozen scenes can play
 
 
 def chosen(worth: Floats, threshold: float, may_ask: Bools, range_m: Floats, most: int) -> Bools:
-    """Return who is asked, `(..., H)`: at most `most` above the threshold, by worth, then the nearest."""
+    """Return who is asked, `(..., H)`:
+    at most `most` above the threshold, by worth, then the nearest.
+    """
     asked = may_ask & (worth > threshold)
     if most >= asked.shape[-1]:
         return asked

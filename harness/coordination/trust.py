@@ -1,18 +1,21 @@
 """The `trust` rule: a consensus rule that learns during an episode which helpers to trust.
 
-Each helper has a reputation, the mean of a beta distribution (Jøsang and Ismail 2002), which starts in good
-faith and forgets. These checks speak against a helper, by the detector classes of ETSI TS 103 759:
+Each helper has a reputation, the mean of a beta distribution (Jøsang and Ismail 2002), which starts
+in good faith and forgets. These checks speak against a helper, by the detector classes of ETSI TS
+103 759:
 
-- its own past (class 2): between two messages it must have moved as far as its claimed speeds say, and no
-  vehicle is faster than `top_mps`.
+- its own past (class 2): between two messages it must have moved as far as its claimed speeds say,
+  and no vehicle is faster than `top_mps`.
 - the map (class 3): it must be on a lane, and no two vehicles may be in one place.
-- own sensors (class 4): if the ego sees the helper, its claimed place must agree. And what the helper
-  intended at the last step is compared with the ego's own intent now, with more weight the surer the ego is.
-- other helpers (class 5): how far its intent is from the nearest intent of another vehicle. A witness that
-  sees what nobody else does is also far from all others, so one step is not enough unless it is very far.
+- own sensors (class 4): if the ego sees the helper, its claimed place must agree. And what the
+  helper intended at the last step is compared with the ego's own intent now, with more weight the
+  surer the ego is.
+- other helpers (class 5): how far its intent is from the nearest intent of another vehicle. A
+  witness that sees what nobody else does is also far from all others, so one step is not enough
+  unless it is very far.
 
-A helper that is not trusted has no weight. One that is trusted has the weight of Eq. 2, by the place where
-the ego sees it and not by the one that it claims.
+A helper that is not trusted has no weight. One that is trusted has the weight of Eq. 2, by the
+place where the ego sees it and not by the one that it claims.
 """
 
 from dataclasses import dataclass
@@ -29,16 +32,19 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 
 @dataclass(frozen=True)
 class Trust:
-    """Reputation with memory. All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`)."""
+    """Reputation with memory.
+    All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
+    """
 
-    faith: tuple[float, float] = (2.5, 0.5)  # what counts for and against a helper before its first message
+    # what counts for and against a helper before its first message
+    faith: tuple[float, float] = (2.5, 0.5)
     kept: float = 0.6  # share of what counts for and against a helper that is left at the next step
     contradiction: float = 4.0  # how much more a full contradiction counts than a full agreement
     place_tolerance_m: float = 5.0  # how far a claimed distance may be from the sensed one
     # how far from the middle of a lane a claimed place may be, in addition to `noise`
     lane_tolerance_m: float = 2.0
-    # how much the mean speed between two claimed places may differ from the mean of the claimed speeds, in
-    # addition to `noise`
+    # how much the mean speed between two claimed places may differ from the mean of the claimed
+    # speeds, in addition to `noise`
     speed_tolerance_mps: float = 2.0
     top_mps: float = 60.0  # the highest speed of a vehicle
     apart_m: float = 2.5  # the smallest distance between two vehicles
@@ -46,13 +52,17 @@ class Trust:
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the initial memory: for and against each helper, its last intent and its last claim."""
+        """Return the initial memory: for and against each helper,
+        its last intent and its last claim.
+        """
         state = np.full((*batch, helpers, 2 + actions + CLAIM), np.nan)
         state[..., :2] = self.faith
         return state.reshape(*batch, -1)
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the linear pool of those trusted; the trust takes the present messages into account."""
+        """Return the linear pool of those trusted;
+        the trust takes the present messages into account.
+        """
         p, heard = messages.intents, messages.heard
         remembered = state.reshape(*heard.shape, -1)
         last_intents, present_claims = remembered[..., 2:-CLAIM], _claims_of(messages)
@@ -64,11 +74,15 @@ class Trust:
         counts = np.stack([1 - against, self.contradiction * against], axis=-1)
         # A helper that is not heard keeps its reputation.
         last_reputation = remembered[..., :2]
-        reputation = np.where(heard[..., None], self.kept * last_reputation + counts, last_reputation)
+        reputation = np.where(
+            heard[..., None], self.kept * last_reputation + counts, last_reputation
+        )
         trust = reputation[..., 0] / np.sum(reputation, axis=-1)
         weights = self._weights(messages, trust)
         intended = np.where(heard[..., None], p[..., 1:, :], last_intents)
-        memory = np.concatenate([reputation, intended, present_claims], axis=-1).reshape(state.shape)
+        memory = np.concatenate([reputation, intended, present_claims], axis=-1).reshape(
+            state.shape
+        )
         return Fused(linear_pool(p, weights), weights, memory, trust)
 
     def _against(self, messages: Messages, intended: Floats) -> Floats:
@@ -83,7 +97,9 @@ class Trust:
         return np.where(heard, np.maximum(from_nearest, against_ego), 0.0)
 
     def _false(self, messages: Messages, claimed: Floats, last: Floats) -> Bools:
-        """Return whose place or speed cannot be true, `(..., H)`, by the claims now and one step ago."""
+        """Return whose place or speed cannot be true, `(..., H)`,
+        by the claims now and one step ago.
+        """
         if (claims := messages.claims) is None:
             return np.zeros(messages.heard.shape, dtype=bool)
         error_m = self.noise * claims.error_m[..., None]
@@ -101,7 +117,9 @@ class Trust:
         return np.asarray(elsewhere | off_road | contradicts_last | overlaps)
 
     def _weights(self, messages: Messages, trust: Floats) -> Floats:
-        """Return the weights of Eq. 2 for the trusted helpers, by the sensed distance if there is one."""
+        """Return the weights of Eq. 2 for the trusted helpers,
+        by the sensed distance if there is one.
+        """
         claimed_m, sensed_m = messages.distance_m[..., 1:], np.full(trust.shape, np.nan)
         if messages.claims is not None:
             sensed_m = messages.claims.sensed_m
@@ -109,20 +127,28 @@ class Trust:
         corrected = messages.weights[..., 1:] * np.where(
             np.isnan(sensed_m), 1.0, np.maximum(claimed_m, 1.0) / np.maximum(sensed_m, 1.0)
         )
-        weights = np.concatenate([messages.weights[..., :1], np.where(trust < 0.5, 0.0, corrected)], axis=-1)
+        weights = np.concatenate(
+            [messages.weights[..., :1], np.where(trust < 0.5, 0.0, corrected)], axis=-1
+        )
         weights = np.where(weights > 0, weights, 0.0)
         return np.asarray(weights / np.sum(weights, axis=-1, keepdims=True))
 
 
 def _claims_of(messages: Messages) -> Floats:
-    """Return the claimed place, speed and time of each helper, `(..., H, CLAIM)`; NaN without claims."""
+    """Return the claimed place, speed and time of each helper, `(..., H, CLAIM)`;
+    NaN without claims.
+    """
     if (claims := messages.claims) is None:
         return np.full((*messages.heard.shape, CLAIM), np.nan)
     time_s = np.broadcast_to(claims.time_s[..., None], claims.speed_mps.shape)
-    return np.concatenate([claims.xy_m[..., 1:, :], np.stack([claims.speed_mps, time_s], -1)], axis=-1)
+    return np.concatenate(
+        [claims.xy_m[..., 1:, :], np.stack([claims.speed_mps, time_s], -1)], axis=-1
+    )
 
 
 def divergence(p: Floats, q: Floats) -> Floats:
-    """Return the Jensen-Shannon divergence of distributions `(..., A)`: 0 if equal, 1 if disjoint."""
+    """Return the Jensen-Shannon divergence of distributions `(..., A)`:
+    0 if equal, 1 if disjoint.
+    """
     gained_nats = entropy_nats((p + q) / 2) - (entropy_nats(p) + entropy_nats(q)) / 2
     return np.asarray(gained_nats / np.log(2))

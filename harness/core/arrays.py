@@ -1,4 +1,6 @@
-"""Types of the arrays that rules take and return. `(...)` in a docstring means any number of batch dims."""
+"""Types of the arrays that rules take and return.
+`(...)` in a docstring means any number of batch dims.
+"""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -29,14 +31,18 @@ def summed(values: Floats, axis: int) -> Floats:
 
 
 def any_of(flags: Bools) -> Bools:
-    """Return whether any is true along a short last axis, such as that of helpers; faster than `np.any`."""
+    """Return whether any is true along a short last axis, such as that of helpers;
+    faster than `np.any`.
+    """
     first = np.zeros(flags.shape[:-1], dtype=bool)
     result: Bools = reduce(np.logical_or, [flags[..., k] for k in range(flags.shape[-1])], first)
     return result
 
 
 def count_of(flags: Bools) -> Ints:
-    """Count those that are true along a short last axis, such as that of helpers; faster than `np.sum`."""
+    """Count those that are true along a short last axis, such as that of helpers;
+    faster than `np.sum`.
+    """
     none = np.zeros(flags.shape[:-1], dtype=np.int64)
     count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
     return count
@@ -45,7 +51,8 @@ def count_of(flags: Bools) -> Ints:
 def read_only(value: T) -> T:
     """Return an array, or a dataclass or mapping of some, with views that nobody can write to.
 
-    So code of a package that writes to its arguments raises ValueError, and moves nothing that others read.
+    So code of a package that writes to its arguments raises ValueError,
+    and moves nothing that others read.
     """
     given: Any = value
     if isinstance(given, np.ndarray):
@@ -71,7 +78,8 @@ def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
 def numbers(name: str, values: Any, *allowed: tuple[int, ...]) -> Floats:
     """Return numbers that a package gave, as an array of one's own, which it cannot write to later.
 
-    Raises ValueError unless they are an array of one of the shapes, without a mask, and of real numbers.
+    Raises ValueError unless they are an array of one of the shapes, without a mask,
+    and of real numbers.
     """
     check_shape(name, values, *allowed)
     if values.dtype.kind not in "biuf":

@@ -2,11 +2,11 @@
 
 The line names the file, the table, the key, the value and what is allowed.
 
-A record is a frozen dataclass or a `msgspec.Struct`, nested as the file's tables are. Its annotations are the
-rules: `Literal[...]` lists choices; `Annotated[float, Meta(ge=0, description="seconds, 0 or more")]` bounds a
-value and describes the bound; a ValueError from `__post_init__` says what is wrong with a table as a whole.
-Integers are converted to floats, and nothing else is. An unknown key is refused, and the message suggests the
-nearest known one.
+A record is a frozen dataclass or a `msgspec.Struct`, nested as the file's tables are. Its
+annotations are the rules: `Literal[...]` lists choices; `Annotated[float, Meta(ge=0,
+description="seconds, 0 or more")]` bounds a value and describes the bound; a ValueError from
+`__post_init__` says what is wrong with a table as a whole. Integers are converted to floats, and
+nothing else is. An unknown key is refused, and the message suggests the nearest known one.
 
     @dataclass(frozen=True)
     class Channel:
@@ -24,7 +24,17 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 
@@ -35,7 +45,8 @@ Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
 LONGEST_S = 3600.0  # the longest time that a model may be declared to take for an answer
 Seconds = Annotated[
-    float, msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}")
+    float,
+    msgspec.Meta(ge=0, le=LONGEST_S, description=f"seconds, 0 or more, at most {LONGEST_S:g}"),
 ]
 
 
@@ -50,13 +61,18 @@ _DOTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
 _LONG_KEY = re.compile(rf"(?<![\w.-])(?:{_PART}\.[ \t]*+){{{_DOTS}}}")
 _IN_WORDS = {
-    "object": "a table", "array": "a list", "str": "a text", "int": "a whole number", "float": "a number",
+    "object": "a table",
+    "array": "a list",
+    "str": "a text",
+    "int": "a whole number",
+    "float": "a number",
     "bool": "true or false",
-}  # fmt: skip
+}
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
-    """Read the tables of a TOML file; `where` names it in messages, such as `model card models/mine.toml`.
+    """Read the tables of a TOML file;
+    `where` names it in messages, such as `model card models/mine.toml`.
 
     Raises UserError if it cannot be read or is no TOML.
     """
@@ -72,8 +88,8 @@ def toml(path: Path, where: str) -> dict[str, Any]:
 def loads(text: str, where: str) -> dict[str, Any]:
     """Parse a TOML text into tables. Raises UserError if it is not TOML.
 
-    A dotted key with thousands of parts is refused: the parser takes time and memory by the square of their
-    number.
+    A dotted key with thousands of parts is refused:
+    the parser takes time and memory by the square of their number.
     """
     if _LONG_KEY.search(text):
         raise UserError(f"{where} is no TOML: a key has more than {_DOTS} dots; fix the file")
@@ -95,8 +111,8 @@ def json_loads(text: str, where: str) -> Any:
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
     """Convert a TOML or JSON table to a record; `where` names it in messages.
 
-    The program fills in the fields `given`; the table may not hold them. Raises UserError for an unknown or
-    missing key and for a value that is not allowed.
+    The program fills in the fields `given`; the table may not hold them. Raises UserError for an
+    unknown or missing key and for a value that is not allowed.
     """
     for path, key, known in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
@@ -112,7 +128,8 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
-    """Return a copy of a frozen dataclass with some fields set from text; `where` names it in messages.
+    """Return a copy of a frozen dataclass with some fields set from text;
+    `where` names it in messages.
 
     Raises UserError for an unknown field and for a value that is not allowed.
     """
@@ -131,12 +148,18 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 
 
 def check(record: Any) -> None:
-    """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN is not."""
+    """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN
+    is not.
+    """
     for name, hint in _fields(record.__class__).items():
         value = getattr(record, name)
-        bounds = [meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)]
+        bounds = [
+            meta for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta)
+        ]
         allowed = [str(choice) for choice in get_args(hint)] if get_origin(hint) is Literal else []
-        if not all(meta.ge <= value <= meta.le for meta in bounds) or (allowed and str(value) not in allowed):
+        if not all(meta.ge <= value <= meta.le for meta in bounds) or (
+            allowed and str(value) not in allowed
+        ):
             raise UserError(f"{name} is {value}: give {' or '.join(allowed) or description(hint)}")
 
 
@@ -188,7 +211,9 @@ def _endless(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...
 
 
 def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
-    """Describe the first value that does not fit its type; msgspec's words are rewritten for people."""
+    """Describe the first value that does not fit its type;
+    msgspec's words are rewritten for people.
+    """
     path, value, hint = _wrong(table, kind)
     here, (*tables, key) = _place(where, path), path or ("",)
     problem, of_key, _ = (_problem(value, hint) or "").partition(" - at `key`")
@@ -199,7 +224,9 @@ def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
     if of_key:
         names = [get_args(member)[0] for member in _members(hint, value) if get_args(member)]
         name = next((name for name in value if _problem(name, names[0])), "")
-        return UserError(f"{here}: {printable(repr(name))} is no name for this; {printable(problem)}")
+        return UserError(
+            f"{here}: {printable(repr(name))} is no name for this; {printable(problem)}"
+        )
     if problem.startswith("Invalid") and (choices := _choices(hint)):
         return unknown(f"{key} in {_place(where, tables)}", str(value), choices)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
@@ -207,7 +234,9 @@ def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
     allowed = (" or ".join(_choices(hint)) or kinds) if got else description(hint) or kinds
     if not problem.startswith("Expected"):
         allowed = description(hint) or "a number that a computer holds"
-    return UserError(f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}")
+    return UserError(
+        f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}"
+    )
 
 
 def _in_words(kind: str) -> str:
@@ -235,17 +264,27 @@ def _problem(value: Any, hint: Any) -> str | None:
 
 
 def _entries(value: Any, hint: Any) -> Iterator[tuple[Any, Any, list[Any]]]:
-    """Yield key, value and possible types of each entry of a table or list; no type where none is known."""
+    """Yield key, value and possible types of each entry of a table or list;
+    no type where none is known.
+    """
     if isinstance(value, Mapping | list):
         is_table = isinstance(value, Mapping)
         members = _members(hint, value)
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
-            fields = [_fields(member)[key] for member in members if is_table and key in _fields(member)]
-            yield key, inner, fields or [each for member in members for each in _items(member, key, is_table)]
+            fields = [
+                _fields(member)[key] for member in members if is_table and key in _fields(member)
+            ]
+            yield (
+                key,
+                inner,
+                fields or [each for member in members for each in _items(member, key, is_table)],
+            )
 
 
 def _members(hint: Any, value: Any = None) -> list[Any]:
-    """Return the types of a union, without descriptions; of tagged records the one that a value names."""
+    """Return the types of a union, without descriptions;
+    of tagged records the one that a value names.
+    """
     while get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
     if get_origin(hint) not in (Union, UnionType):
@@ -255,7 +294,10 @@ def _members(hint: Any, value: Any = None) -> list[Any]:
     named = [
         member
         for member, tag in zip(members, tags, strict=True)
-        if tag and tag.tag is not None and isinstance(value, Mapping) and value.get(tag.tag_field) == tag.tag
+        if tag
+        and tag.tag is not None
+        and isinstance(value, Mapping)
+        and value.get(tag.tag_field) == tag.tag
     ]
     return named or members
 
@@ -287,12 +329,21 @@ def _items(hint: Any, key: Any, is_table: bool) -> list[Any]:
 
 def _choices(hint: Any) -> list[str]:
     """Return the choices of a type; none if it has no list of them."""
-    return [str(name) for kind in _members(hint) if get_origin(kind) is Literal for name in get_args(kind)]
+    return [
+        str(name)
+        for kind in _members(hint)
+        if get_origin(kind) is Literal
+        for name in get_args(kind)
+    ]
 
 
 def description(hint: Any) -> str | None:
     """Return the text of a type's `Meta(description=...)`."""
-    texts = (meta.description for meta in getattr(hint, "__metadata__", ()) if isinstance(meta, msgspec.Meta))
+    texts = (
+        meta.description
+        for meta in getattr(hint, "__metadata__", ())
+        if isinstance(meta, msgspec.Meta)
+    )
     members = get_args(hint) if get_origin(hint) in (Annotated, Union, UnionType) else ()
     of_members = [description(member) for member in members]
     return next(filter(None, [*texts, *of_members]), None)

@@ -1,14 +1,16 @@
-"""Correct a mean over some layouts by what is known of more layouts, before anybody was asked there.
+"""Correct a mean over some layouts by what is known of more layouts,
+before anybody was asked there.
 
-The values are regressed on what is known, and their mean is moved by how far its mean in all layouts is from
-that in those with a value: a control variate (Glynn and Szechtman 2002), or the regression estimator of
-two-phase sampling (Cochran 1977, section 12.6). Its variance has three parts: of what the regression leaves,
-of its slopes, and of the layouts that are known, which are a sample, too.
+The values are regressed on what is known, and their mean is moved by how far its mean in all
+layouts is from that in those with a value: a control variate (Glynn and Szechtman 2002), or the
+regression estimator of two-phase sampling (Cochran 1977, section 12.6). Its variance has three
+parts: of what the regression leaves, of its slopes, and of the layouts that are known, which are a
+sample, too.
 
-The interval is that of the plain mean, moved as the mean is. Its ends are as much nearer as the standard
-error is smaller, times a quotient of Student's t: what the plain interval does near 0 and 1 stays. It is at
-least as wide as Student's, since the plain one may be narrower elsewhere. `benchmarks/difficulty.py` measures
-how often it holds the truth.
+The interval is that of the plain mean, moved as the mean is. Its ends are as much nearer as the
+standard error is smaller, times a quotient of Student's t: what the plain interval does near 0 and
+1 stays. It is at least as wide as Student's, since the plain one may be narrower elsewhere.
+`benchmarks/difficulty.py` measures how often it holds the truth.
 """
 
 import math
@@ -19,7 +21,8 @@ from harness.core.arrays import Floats
 from harness.core.statistics import LEVEL, ROUNDING, Estimate
 
 LEAST = 30  # layouts with a value: of fewer, intervals hold the truth too seldom
-COLLINEAR = 1e-6  # what is known varies less in a direction that counts as none, as a standard deviation
+# what is known varies less in a direction that counts as none, as a standard deviation
+COLLINEAR = 1e-6
 
 
 def corrected(
@@ -35,8 +38,8 @@ def corrected(
         least: the least that a value can be.
         level: of the plain interval.
 
-    None if there are fewer than `LEAST` values or no further layouts, or if either the values or all that is
-    known of them are alike.
+    None if there are fewer than `LEAST` values or no further layouts,
+    or if either the values or all that is known of them are alike.
     """
     from harness.core.special import stdtrit
 
@@ -63,7 +66,8 @@ def corrected(
 def worth(plain: Estimate, better: Estimate) -> float:
     """Return how many times as many layouts the plain mean needs for an interval as narrow.
 
-    It is that of the end which is farther from the bounds, where intervals are cut; 1 where none is known.
+    It is that of the end which is farther from the bounds, where intervals are cut;
+    1 where none is known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

@@ -1,8 +1,8 @@
 """Errors for users: bad input is reported in one line.
 
-Four kinds of failure are kept apart. A bad completion is data (a parse status). Bad input is a `UserError`:
-one line, exit code 2. A question that got no answer is no data either: `Unanswered`, exit code 3. Anything
-else is a bug and crashes with a traceback.
+Four kinds of failure are kept apart. A bad completion is data (a parse status). Bad input is a
+`UserError`: one line, exit code 2. A question that got no answer is no data either: `Unanswered`,
+exit code 3. Anything else is a bug and crashes with a traceback.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,8 @@ EXIT_CODES = {
 
 BETWEEN_NAMES = " · "  # in tables, of a model, a prompt and an answer mode
 MOST_LISTED, FEW, NEAR = 60, 24, 6  # names that a message lists, and how many it lists of more
-LISTS = {"model": "harness model list", "prompt": "harness prompt list"}  # what prints all of a kind
+# what prints all of a kind
+LISTS = {"model": "harness model list", "prompt": "harness prompt list"}
 
 
 class UserError(Exception):
@@ -43,13 +44,17 @@ class Unanswered(Unfinished):
 
 
 def printable(text: object, limit: int = 120) -> str:
-    """Make any text safe for one terminal line: escape control characters, and cut at `limit` characters."""
+    """Make any text safe for one terminal line:
+    escape control characters, and cut at `limit` characters.
+    """
     escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _said(text))
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
 def _said(thing: object) -> str:
-    """Return the text of a thing, or the name of its type where it has none, as a package's error may."""
+    """Return the text of a thing, or the name of its type where it has none,
+    as a package's error may.
+    """
     try:
         return str(thing)
     except Exception:
@@ -59,13 +64,17 @@ def _said(thing: object) -> str:
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
     """Return a name if terminals, pages and records carry it as it is. Raises UserError otherwise.
 
-    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none of these;
-    nor is a name that looks like several, with what stands between names in tables.
+    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none
+    of these; nor is a name that looks like several, with what stands between names in tables.
     """
     if not name.isprintable():
-        raise UserError(f"{what} `{printable(name)}` has characters that nothing can show; {repair}")
+        raise UserError(
+            f"{what} `{printable(name)}` has characters that nothing can show; {repair}"
+        )
     if BETWEEN_NAMES in name:
-        raise UserError(f"{what} `{name}` has `{BETWEEN_NAMES}`, which stands between names; {repair}")
+        raise UserError(
+            f"{what} `{name}` has `{BETWEEN_NAMES}`, which stands between names; {repair}"
+        )
     return name
 
 
@@ -75,7 +84,8 @@ def one_line(error: Exception) -> str:
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
-    """Build the `UserError` for a name that does not exist; it suggests the nearest name and lists all.
+    """Build the `UserError` for a name that does not exist;
+    it suggests the nearest name and lists all.
 
     Of more than `MOST_LISTED`, or `FEW` if a command of `LISTS` prints all, the nearest are listed.
     """

@@ -1,8 +1,8 @@
 """Hold what extensions add: one object for those of this distribution and for everybody's packages.
 
-An extension is an entry point of the group `swarmdrive.extensions`; docs/extend.md shows a whole one. Those
-that ship are folders of `harness/extensions/`. The distribution's metadata name them and their commands:
-without the folder all else works, and says what a command was part of.
+An extension is an entry point of the group `swarmdrive.extensions`; docs/extend.md shows a whole
+one. Those that ship are folders of `harness/extensions/`. The distribution's metadata name them and
+their commands: without the folder all else works, and says what a command was part of.
 """
 
 import re
@@ -20,9 +20,11 @@ from harness.core.plugins import Plugins, entries, is_ours
 from harness.core.strangers import worded
 
 GROUP = "swarmdrive.extensions"
-# In the metadata: by command, kind of study and name from Python, the package of the extension that has it.
+# In the metadata: by command, kind of study and name from Python, the package of the extension that
+# has it.
 COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdrive.names"
-# The same by setting of a condition, with the value that does nothing in brackets; nothing for an empty one.
+# The same by setting of a condition, with the value that does nothing in brackets; nothing for an
+# empty one.
 SETTINGS = "swarmdrive.settings"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
@@ -33,7 +35,9 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting of a run that an extension adds: an option of `harness eval` and `harness drive`."""
+    """A setting of a run that an extension adds:
+    an option of `harness eval` and `harness drive`.
+    """
 
     kind: type  # str, int, float or bool
     default: str | int | float | bool
@@ -47,14 +51,19 @@ class Extension:
     name: str  # the same as that of its entry point
     interface: int = INTERFACE  # the version of this class that it was written for
     # What follows are tables by name.
-    commands: Texts = field(default_factory=dict)  # what is typed after `harness`, and the function's place
-    groups: Texts = field(default_factory=dict)  # the groups of commands that it opens, and their help
-    panels: Texts = field(default_factory=dict)  # its words of the first screen, and the panel of each
-    spellings: Texts = field(default_factory=dict)  # older spellings of its commands, and what replaces them
+    # what is typed after `harness`, and the function's place
+    commands: Texts = field(default_factory=dict)
+    # the groups of commands that it opens, and their help
+    groups: Texts = field(default_factory=dict)
+    # its words of the first screen, and the panel of each
+    panels: Texts = field(default_factory=dict)
+    # older spellings of its commands, and what replaces them
+    spellings: Texts = field(default_factory=dict)
     short: Texts = field(default_factory=dict)  # what is short for one of its commands, for good
     # kinds of study that it writes, and what lists call them; `<kind>.json` marks such a folder
     studies: Texts = field(default_factory=dict)
-    # settings of a run by the name of their option, with `_`; a run's `settings.extensions` has their values
+    # settings of a run by the name of their option, with `_`; a run's `settings.extensions` has
+    # their values
     settings: Mapping[str, Setting] = field(default_factory=dict)
     # plug-ins by kind, such as `rules` or `metrics`, and by name; the value is a place
     adds: Mapping[str, Texts] = field(default_factory=dict)
@@ -69,7 +78,9 @@ def extensions() -> Mapping[str, Extension]:
 
 
 def owner(command: str) -> str | None:
-    """Return the extension that has a command or group, by the metadata of what is installed; else None."""
+    """Return the extension that has a command or group, by the metadata of what is installed;
+    else None.
+    """
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
             return _extension_of(entry)
@@ -96,7 +107,9 @@ class OfExtension(NamedTuple):
 
 
 def setting_of_extension(name: str) -> OfExtension | None:
-    """Return the extension that has a setting of conditions, and the value that does nothing; else None."""
+    """Return the extension that has a setting of conditions, and the value that does nothing;
+    else None.
+    """
     entry = entries(SETTINGS).get(name)
     if entry is None:
         return None
@@ -124,17 +137,23 @@ def joined(core: Texts, kind: str) -> Mapping[str, Any]:
 
 def taken(path: str, table: Iterable[str]) -> bool:
     """Return whether a path is a command of a table, begins one, or goes on after one."""
-    return any(f"{each} ".startswith(f"{path} ") or f"{path} ".startswith(f"{each} ") for each in table)
+    return any(
+        f"{each} ".startswith(f"{path} ") or f"{path} ".startswith(f"{each} ") for each in table
+    )
 
 
 def studies() -> Texts:
-    """Return every kind of study, those of extensions that are gone included, and what lists call it."""
+    """Return every kind of study, those of extensions that are gone included,
+    and what lists call it.
+    """
     gone = {kind: kind for kind in entries(STUDIES)}
     return {**gone, **joined(formats.STUDIES, "studies")}
 
 
 def added(group: str) -> Mapping[str, Any]:
-    """Return the entry points of the plug-ins of a group, such as `swarmdrive.rules`, that extensions add."""
+    """Return the entry points of the plug-ins of a group, such as `swarmdrive.rules`,
+    that extensions add.
+    """
     from importlib.metadata import EntryPoint
 
     if group == GROUP:
@@ -180,7 +199,8 @@ def _checked(name: str, extension: Extension) -> Extension:
     what = f"extension {printable(name)}"
     if extension.interface != INTERFACE:
         raise UserError(
-            f"{what} is for version {printable(repr(extension.interface))} of `Extension`, and this is "
+            f"{what} is for version {printable(repr(extension.interface))} of `Extension`, and "
+            "this is "
             f"version {INTERFACE}; install a version of its package for this harness"
         )
     if extension.name != name:
@@ -193,7 +213,9 @@ def _checked(name: str, extension: Extension) -> Extension:
             if not (isinstance(value, Mapping) and all(map(_is_setting, value, value.values()))):
                 raise UserError(f"{what}: its settings are no table of Setting; repair its package")
             continue
-        tables = [*value.values()] if table.name == "adds" and isinstance(value, Mapping) else [value]
+        tables = (
+            [*value.values()] if table.name == "adds" and isinstance(value, Mapping) else [value]
+        )
         if not all(map(_is_texts, tables)):
             raise UserError(f"{what}: its {table.name} are no table of texts; repair its package")
     for kind in TYPED:
@@ -202,13 +224,16 @@ def _checked(name: str, extension: Extension) -> Extension:
         for words in (*names, *replacements):
             if not WORDS.fullmatch(words):
                 raise UserError(
-                    f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its package"
+                    f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its "
+                    "package"
                 )
     return Extension(name=name, **copied)
 
 
 def _is_texts(table: Any) -> bool:
-    return isinstance(table, Mapping) and all(isinstance(text, str) for text in (*table, *table.values()))
+    return isinstance(table, Mapping) and all(
+        isinstance(text, str) for text in (*table, *table.values())
+    )
 
 
 def _is_setting(name: Any, setting: Any) -> bool:
@@ -228,13 +253,16 @@ def _is_setting(name: Any, setting: Any) -> bool:
 
 
 @cache
-def _joined(core: tuple[tuple[str, Any], ...], kind: str, path: tuple[str, ...]) -> Mapping[str, Any]:
+def _joined(
+    core: tuple[tuple[str, Any], ...], kind: str, path: tuple[str, ...]
+) -> Mapping[str, Any]:
     table: dict[str, Any] = dict(core)
     for extension in extensions().values():
         for name, value in getattr(extension, kind).items():
             if name in table or (kind == "commands" and taken(name, table)):
                 print(
-                    f"harness: extension {printable(extension.name)}: {printable(name)} of its {kind} is "
+                    f"harness: extension {printable(extension.name)}: {printable(name)} of its "
+                    f"{kind} is "
                     "taken; it is left out, and all else works",
                     file=sys.stderr,
                 )

@@ -1,7 +1,7 @@
 """Optional packages, which only some commands need; each is in an extra of pyproject.toml.
 
-They are imported where they are used. If one is missing, a one-line error names it and the command that
-installs it: `need` checks before long work, and `without` builds the error of a failed import.
+They are imported where they are used. If one is missing, a one-line error names it and the command
+that installs it: `need` checks before long work, and `without` builds the error of a failed import.
 """
 
 from importlib.util import find_spec

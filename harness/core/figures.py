@@ -1,4 +1,6 @@
-"""The one way in which a number is written for people, and plain values of estimates for machines."""
+"""The one way in which a number is written for people,
+and plain values of estimates for machines.
+"""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +37,9 @@ class Unit:
     factor: float = 1.0  # what a stored value is multiplied by
 
     def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
-        """Write a value without the unit's name; `digits` are the most significant digits, all in all."""
+        """Write a value without the unit's name;
+        `digits` are the most significant digits, all in all.
+        """
         if value is None or math.isnan(value):
             return DASH
         number, places = value * self.factor, self.decimals
@@ -50,10 +54,16 @@ class Unit:
         return f"{self.number(value)} {self.name}" if known and self.name else self.number(value)
 
     def interval(
-        self, value: float | None, low: float | None, high: float | None, sign: str = "",
+        self,
+        value: float | None,
+        low: float | None,
+        high: float | None,
+        sign: str = "",
         digits: int | None = None,
-    ) -> str:  # fmt: skip
-        """Write a value and its interval as `89.0 [81.4, 93.7]`; a dash where the value is not known."""
+    ) -> str:
+        """Write a value and its interval as `89.0 [81.4, 93.7]`;
+        a dash where the value is not known.
+        """
         number, *ends = (self.number(each, sign, digits) for each in (value, low, high))
         return number if number == DASH else f"{number} [{', '.join(ends)}]"
 
@@ -72,7 +82,9 @@ def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
 
 
 def within(low: float, high: float) -> str:
-    """Write how large a difference may be, either way: `±5.2 points`; its interval excludes larger ones."""
+    """Write how large a difference may be, either way: `±5.2 points`;
+    its interval excludes larger ones.
+    """
     return f"±{POINTS.text(max(abs(low), abs(high)))}"
 
 

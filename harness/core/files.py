@@ -1,7 +1,7 @@
 """Read files, write them atomically, lock them, and compute digests of files and JSON values.
 
-Every file that the harness reads passes `opened`. A file may come from a stranger: a pipe in its place would
-block, a device would never end, and a large one would fill memory.
+Every file that the harness reads passes `opened`. A file may come from a stranger: a pipe in its
+place would block, a device would never end, and a large one would fill memory.
 """
 
 import errno
@@ -29,17 +29,22 @@ _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a formula begins with, and what spreadsheets skip before it
+# what a formula begins with, and what spreadsheets skip before it
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
 T = TypeVar("T")
 
 
 def canonical_json(value: Any) -> str:
-    """Return the one JSON text of a value: sorted keys, no spaces. Raises ValueError on NaN or infinity."""
+    """Return the one JSON text of a value: sorted keys, no spaces.
+    Raises ValueError on NaN or infinity.
+    """
     return _EXACT.encode(value)
 
 
 def canonical_bytes(value: Any) -> bytes:
-    """Return `canonical_json` in UTF-8. Raises UnicodeEncodeError, a ValueError, on a lone surrogate."""
+    """Return `canonical_json` in UTF-8.
+    Raises UnicodeEncodeError, a ValueError, on a lone surrogate.
+    """
     return canonical_json(value).encode()
 
 
@@ -48,26 +53,32 @@ BROKEN = (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionE
 
 
 class Refused(OSError):
-    """A file that is not read: it is no regular file, or it is larger than the limit of its kind."""
+    """A file that is not read: it is no regular file,
+    or it is larger than the limit of its kind.
+    """
 
 
 Kind = Literal["settings", "text", "record", "picture", "rows", "weights"]
 _MB = 1 << 20
 LARGEST: dict[Kind, int] = {
-    "settings": 1 * _MB,  # what people write in TOML and JSON: cards, channels, suites, --env-config
+    # what people write in TOML and JSON: cards, channels, suites, --env-config
+    "settings": 1 * _MB,
     "text": 16 * _MB,  # a prompt's files, one completion, a table of measurements
-    "record": 256 * _MB,  # JSON by programs: run.json, manifest.json, a checkpoint's config and vocabulary
+    # JSON by programs: run.json, manifest.json, a checkpoint's config and vocabulary
+    "record": 256 * _MB,
     "picture": 64 * _MB,  # figures and pages
     "rows": 32 << 30,  # one line or row for each answer or decision, layouts, logs of work
     "weights": 4 << 40,
 }
 """The largest file of each kind, bytes."""
 
-MOST_TIMES = 200  # its size that an archive may unpack to: JSON takes some 30, nothing but zeros 1000
+# its size that an archive may unpack to: JSON takes some 30, nothing but zeros 1000
+MOST_TIMES = 200
 
 
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
-    """Open a file for reading; it is checked after it is opened, so nothing can take its place in between.
+    """Open a file for reading; it is checked after it is opened,
+    so nothing can take its place in between.
 
     Raises OSError, and Refused if it is not a regular file or is larger than `LARGEST` of its kind.
     """
@@ -77,7 +88,9 @@ def opened(path: str | Path, kind: Kind) -> BufferedReader:
         if not stat.S_ISREG(state.st_mode):
             raise Refused(errno.EINVAL, "it is no file, but a pipe or a device", str(path))
         if state.st_size > LARGEST[kind]:
-            raise Refused(errno.EFBIG, f"it is larger than {_size(LARGEST[kind])}, the limit", str(path))
+            raise Refused(
+                errno.EFBIG, f"it is larger than {_size(LARGEST[kind])}, the limit", str(path)
+            )
     except OSError:
         file.close()
         raise
@@ -108,7 +121,9 @@ def text_of(path: str | Path, kind: Kind = "text") -> str:
 
 
 def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Decorate what reads a file, so that the file is read again only after it was written again."""
+    """Decorate what reads a file, so that the file is read again only after it was written
+    again.
+    """
 
     @lru_cache(maxsize=64)
     def kept(path: Path, written_ns: int) -> T:
@@ -126,7 +141,8 @@ def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
 
 
 def neutral(cell: T) -> T | str:
-    """Return a cell of a CSV file for spreadsheets: a text that they would take for a formula as text.
+    """Return a cell of a CSV file for spreadsheets:
+    a text that they would take for a formula as text.
 
     It gets an apostrophe before it. Numbers, also those that are texts, stay as they are.
     """
@@ -142,7 +158,8 @@ def neutral(cell: T) -> T | str:
 def refuse_bomb(archive: "ZipFile", packed: int, most: float = math.inf) -> None:
     """Raise BadZipFile, before anything is unpacked, for an archive that states too much.
 
-    It may unpack to `most` bytes, and to `MOST_TIMES` the bytes that it has, `packed`, and a megabyte.
+    It may unpack to `most` bytes, and to `MOST_TIMES` the bytes that it has, `packed`,
+    and a megabyte.
     """
     from zipfile import BadZipFile  # imported here, since few commands need it
 
@@ -169,7 +186,9 @@ def digest(value: Any) -> str:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Have an error that a disk has no room, which comes without a name, name the file that is written."""
+    """Have an error that a disk has no room, which comes without a name,
+    name the file that is written.
+    """
     try:
         yield
     except OSError as error:
@@ -189,8 +208,8 @@ def appending(path: Path) -> Iterator[BinaryIO]:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file to write to; it replaces `path` on success and is deleted on an error.
 
-    Temporary files of killed processes are deleted as well. Raises OSError if `path` cannot be written, which
-    is never FileNotFoundError.
+    Temporary files of killed processes are deleted as well.
+    Raises OSError if `path` cannot be written, which is never FileNotFoundError.
     """
     sayable("file", path.name, "give another name")
     if path.is_dir():  # fail now, and not only after all is written
@@ -242,7 +261,9 @@ def making(folder: Path) -> Iterator[Path]:
 
 
 def forget_halves(folder: Path, name: str = "*") -> None:
-    """Delete what killed processes left half written (it is not locked); `name` is a glob pattern."""
+    """Delete what killed processes left half written (it is not locked);
+    `name` is a glob pattern.
+    """
     for part in folder.glob(f".{name}.[0-9]*.part"):
         with suppress(OSError), alone(part):
             shutil.rmtree(part) if part.is_dir() else part.unlink()
@@ -256,10 +277,12 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold an exclusive lock on a folder or file; a missing file is created. A killed process releases it.
+    """Hold an exclusive lock on a folder or file; a missing file is created.
+    A killed process releases it.
 
-    On a system without such locks (Windows) nothing is locked. Raises BlockingIOError if another process
-    still holds it after `patience_s` seconds, and OSError if the file is a link or cannot be opened.
+    On a system without such locks (Windows) nothing is locked. Raises BlockingIOError if another
+    process still holds it after `patience_s` seconds, and OSError if the file is a link or cannot
+    be opened.
     """
     try:
         import fcntl

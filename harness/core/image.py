@@ -30,7 +30,8 @@ class Image:
         import numpy as np
 
         height, width, _ = self.pixels.shape
-        # Every line begins with 0, which means no filter: pictures with few colours are smallest so.
+        # Every line begins with 0, which means no filter: pictures with few colours are smallest
+        # so.
         lines = np.pad(self.pixels.reshape(height, -1), ((0, 0), (1, 0)))
         chunks = (
             (b"IHDR", pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
@@ -38,5 +39,6 @@ class Image:
             (b"IEND", b""),
         )
         return b"\x89PNG\r\n\x1a\n" + b"".join(
-            pack(">I", len(data)) + kind + data + pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+            pack(">I", len(data)) + kind + data + pack(">I", zlib.crc32(kind + data))
+            for kind, data in chunks
         )

@@ -28,7 +28,9 @@ def junit(name: str, cases: Sequence[Case]) -> str:
         counts["errors"] = str(errors)
     suite = Element("testsuite", {"name": printable(name), **counts})
     for case in cases:
-        element = SubElement(suite, "testcase", classname=printable(case.of), name=printable(case.name))
+        element = SubElement(
+            suite, "testcase", classname=printable(case.of), name=printable(case.name)
+        )
         if case.error is not None:
             SubElement(element, "error", message=printable(case.error, WHOLE))
         elif case.failure is not None:

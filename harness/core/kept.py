@@ -1,4 +1,6 @@
-"""Keep data between runs in the user's cache folder. It only saves time: what is missing is made again."""
+"""Keep data between runs in the user's cache folder. It only saves time:
+what is missing is made again.
+"""
 
 import os
 from contextlib import suppress

@@ -1,7 +1,7 @@
 """Random draws keyed by content.
 
-A draw depends on its purpose (run seed, scene, link), never on when it is made, so order, batch size,
-workers and a resume cannot change it, and two operating points share their draws.
+A draw depends on its purpose (run seed, scene, link), never on when it is made, so order, batch
+size, workers and a resume cannot change it, and two operating points share their draws.
 """
 
 import hashlib
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 
 def generator(*key: object) -> np.random.Generator:
-    """Return the generator of one key. Parts are joined by their `repr`, so `1` and `"1"` differ."""
+    """Return the generator of one key.
+    Parts are joined by their `repr`, so `1` and `"1"` differ.
+    """
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
     # The words of the digest as a whole number, which NumPy would take apart at thrice the cost.
     words = np.frombuffer(seed[::-1], "<u4")

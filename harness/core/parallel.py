@@ -30,7 +30,9 @@ _RAY = re.compile(r"ray(?::(//)?([\w.\[\]:-]+:\d+))?", re.ASCII)
 
 @dataclass(frozen=True)
 class Ray:
-    """A Ray cluster by its address; None means that of `RAY_ADDRESS`, or else one on this machine."""
+    """A Ray cluster by its address; None means that of `RAY_ADDRESS`,
+    or else one on this machine.
+    """
 
     address: str | None = None
 
@@ -46,13 +48,16 @@ def workers_of(text: str) -> Workers:
     if match := _RAY.fullmatch(text):
         return Ray(text if match[1] else match[2])
     raise UserError(
-        f"--workers {printable(text)}: give 1 to {MOST_WORKERS} processes, or ray for a Ray cluster, "
+        f"--workers {printable(text)}: give 1 to {MOST_WORKERS} processes, or ray for a Ray "
+        "cluster, "
         "ray://HOST:10001 for one elsewhere, ray:HOST:6379 on a node of it"
     )
 
 
 class Executor(Protocol):
-    """Runs items on workers. Every submitted item comes back once, as its result or as `WorkerDied`."""
+    """Runs items on workers. Every submitted item comes back once,
+    as its result or as `WorkerDied`.
+    """
 
     def room(self) -> bool:
         """Return whether another item can be submitted."""
@@ -63,7 +68,9 @@ class Executor(Protocol):
         ...
 
     def take(self) -> "tuple[int, Any]":
-        """Wait for an item; return its place, and its result or `WorkerDied`. Raises what the work raises."""
+        """Wait for an item; return its place, and its result or `WorkerDied`.
+        Raises what the work raises.
+        """
         ...
 
     def close(self) -> None:
@@ -76,13 +83,17 @@ class WorkerDied:
 
 
 def each(
-    work: Callable[[Item], Result], items: Iterable[Item], workers: Workers,
-    on_result: Callable[[int, Result], None], label: Callable[[Item], str] = str, repeatable: bool = True,
-) -> None:  # fmt: skip
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    workers: Workers,
+    on_result: Callable[[int, Result], None],
+    label: Callable[[Item], str] = str,
+    repeatable: bool = True,
+) -> None:
     """Call `work` on every item, in any order, and handle each result once, in this process.
 
-    If `work` raises, or the call is interrupted, the items that still run are stopped. Raises Unfinished if
-    the workers of some items died `TRIES` times; all other items are done.
+    If `work` raises, or the call is interrupted, the items that still run are stopped. Raises
+    Unfinished if the workers of some items died `TRIES` times; all other items are done.
 
     Args:
         work: the function; it and the items can be pickled.
@@ -90,7 +101,8 @@ def each(
         workers: 1 means this process.
         on_result: called with an item's place and its result as soon as the result arrives.
         label: gives an item's name in messages.
-        repeatable: whether the same item must give the same result on another node; a difference is an error.
+        repeatable: whether the same item must give the same result on another node;
+            a difference is an error.
     """
     inputs = list(items)
     if workers == 1 or not inputs:
@@ -124,7 +136,8 @@ def each(
     if dead:
         names = ", ".join(label(inputs[place]) for place in sorted(dead))
         raise Unfinished(
-            f"{printable(names)}: the worker was killed {TRIES} times, perhaps because memory ran out; try "
+            f"{printable(names)}: the worker was killed {TRIES} times, perhaps because memory ran "
+            "out; try "
             f"fewer --workers; the other {n_done} are done"
         )
 
@@ -136,9 +149,13 @@ def done(work: Callable[[Item], Result], item: Item) -> Result:
 
 
 def spread(
-    work: Callable[[Item], Result], items: Iterable[Item], workers: Workers,
-    progress: Callable[[int], None], label: Callable[[Item], str] = str, repeatable: bool = True,
-) -> list[Result]:  # fmt: skip
+    work: Callable[[Item], Result],
+    items: Iterable[Item],
+    workers: Workers,
+    progress: Callable[[int], None],
+    label: Callable[[Item], str] = str,
+    repeatable: bool = True,
+) -> list[Result]:
     """Return `[work(i) for i in items]` (see `each`), and call `progress(1)` after every item."""
     results: dict[int, Result] = {}
 
@@ -166,13 +183,17 @@ def _executor(
 
 
 class _Processes:
-    """An executor of processes. Each process is a pool of its own, so a death loses one item only."""
+    """An executor of processes. Each process is a pool of its own,
+    so a death loses one item only.
+    """
 
     def __init__(self, work: Callable[[Any], Any], workers: int, n_items: int) -> None:
         self._work, self._waiting = work, n_items
         n_processes = min(workers, n_items)
         self._at_work: Flags = RawArray("b", [1] * n_processes)
-        self._idle: list[tuple[int, ProcessPoolExecutor | None]] = [(n, None) for n in range(n_processes)]
+        self._idle: list[tuple[int, ProcessPoolExecutor | None]] = [
+            (n, None) for n in range(n_processes)
+        ]
         self._busy: dict[Future[Any], tuple[int, int, ProcessPoolExecutor]] = {}
 
     def room(self) -> bool:
@@ -213,7 +234,8 @@ _shared: tuple[Flags, int] | None = None  # of a worker: which workers have work
 
 
 def share(total: int) -> int:
-    """Return how many of `total` this process may use, which all workers at work divide; 1 at least.
+    """Return how many of `total` this process may use, which all workers at work divide;
+    1 at least.
 
     It grows when another worker ends. Outside workers, and on a cluster, it is all.
     """
@@ -234,7 +256,9 @@ def _begin(at_work: Flags, number: int) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as its parent ends, for whatever reason, even in the middle of its work."""
+    """End this process as soon as its parent ends, for whatever reason,
+    even in the middle of its work.
+    """
 
     def wait() -> None:
         parent = parent_process()

@@ -1,4 +1,6 @@
-"""Leave out of what others read where things lie on this machine, and the keys that stand in addresses."""
+"""Leave out of what others read where things lie on this machine,
+and the keys that stand in addresses.
+"""
 
 import re
 import shlex
@@ -20,8 +22,8 @@ COMMAND = "command"  # key of a value that is a command line
 def nameless(value: Any, key: str = "") -> Any:
     """Return a value of JSON with the names of files in place of their absolute paths.
 
-    Addresses lose a user, a password and a query. A path with spaces is found if it is the whole text, or a
-    word of a command line.
+    Addresses lose a user, a password and a query.
+    A path with spaces is found if it is the whole text, or a word of a command line.
     """
     if isinstance(value, str):
         return _command(value) if key == COMMAND else text(value)
@@ -41,7 +43,9 @@ def text(value: str) -> str:
 
 def name(path: str) -> str:
     """Return the last part of a path of any system; the path itself if it has none."""
-    kind: type[PurePath] = PureWindowsPath if "\\" in path or re.match("[A-Za-z]:", path) else PurePosixPath
+    kind: type[PurePath] = (
+        PureWindowsPath if "\\" in path or re.match("[A-Za-z]:", path) else PurePosixPath
+    )
     return kind(path).name or path
 
 

@@ -32,14 +32,17 @@ def _entries(group: str, path: tuple[str, ...]) -> Mapping[str, Any]:
         if first.value != entry.value:
             name, *places = map(printable, (entry.name, first.value, entry.value))
             print(
-                f"harness: {name!r} ({group}) is in two packages, {' and '.join(places)}; the first is taken",
+                f"harness: {name!r} ({group}) is in two packages, {' and '.join(places)}; the "
+                "first is taken",
                 file=sys.stderr,
             )
     return by_name
 
 
 def _declared(group: str) -> list[Any]:
-    """Return the entry points of a group. Of a package whose metadata cannot be read a line says so."""
+    """Return the entry points of a group.
+    Of a package whose metadata cannot be read a line says so.
+    """
     from importlib.metadata import distributions, entry_points  # imported here because it is slow
 
     try:
@@ -82,14 +85,17 @@ def _waiting(what: str, entry: Any) -> Iterator[None]:
 
 
 class Failed(UserError):
-    """What people read in the place of what a plug-in would have said: whose it is, and why it says none."""
+    """What people read in the place of what a plug-in would have said:
+    whose it is, and why it says none.
+    """
 
 
 class Plugins(Mapping[str, T], Generic[T]):
-    """Plug-ins by name. A package adds one by an entry point, which is loaded when its name is looked up.
+    """Plug-ins by name. A package adds one by an entry point,
+    which is loaded when its name is looked up.
 
-    Each must be an instance of `kind`, a class or runtime-checkable protocol. Those that are `built_in`
-    cannot be replaced.
+    Each must be an instance of `kind`, a class or runtime-checkable protocol.
+    Those that are `built_in` cannot be replaced.
     """
 
     def __init__(self, group: str, kind: Any, built_in: Mapping[str, T]) -> None:
@@ -104,12 +110,15 @@ class Plugins(Mapping[str, T], Generic[T]):
 
     def usable(self) -> dict[str, T]:
         loaded = resources.each(self, self.__getitem__)
-        return {name: plugin for name, plugin in loaded.items() if not isinstance(plugin, UserError)}
+        return {
+            name: plugin for name, plugin in loaded.items() if not isinstance(plugin, UserError)
+        }
 
     def ask(self, name: str, question: Callable[[T], Said]) -> Said:
         """Return what a plug-in says to people, who read on where it fails.
 
-        Raises Failed if it does not load or its package fails, and UserError if the plug-in raises that.
+        Raises Failed if it does not load or its package fails,
+        and UserError if the plug-in raises that.
         """
         try:
             plugin = self[name]
@@ -144,7 +153,8 @@ class Plugins(Mapping[str, T], Generic[T]):
         try:
             with _waiting(what, entry), aside(what):
                 plugin: T = entry.load()
-                # A class has the methods of its instances, so it would pass the check of the protocol.
+                # A class has the methods of its instances, so it would pass the check of the
+                # protocol.
                 fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)
         except UserError:
             raise
@@ -177,9 +187,13 @@ class FilesAndPlugins(Plugins[T]):
         return file if os.path.lexists(file) else None
 
     def __getitem__(self, name: str) -> T:
-        """Raises KeyError for an unknown name and UserError for a file or a package that does not work."""
+        """Raises KeyError for an unknown name and UserError for a file or a package that does not
+        work.
+        """
         file = self.file(name)
         return self.read(file) if file else super().__getitem__(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys([*self.built_in, *resources.names(self.folder), *self._entries()]))
+        return iter(
+            dict.fromkeys([*self.built_in, *resources.names(self.folder), *self._entries()])
+        )

@@ -1,8 +1,9 @@
-"""How many episodes find a paired difference of success, and which difference so many episodes find.
+"""How many episodes find a paired difference of success,
+and which difference so many episodes find.
 
-A difference is found where the 95 % interval of `statistics.paired_difference` leaves out 0. Over n episodes
-its standard error is that of a paired mean (Miller 2024, arXiv:2411.00640, section 5). The interval is wider
-by what it counts on and has not seen. `benchmarks/plan.py` simulates the power.
+A difference is found where the 95 % interval of `statistics.paired_difference` leaves out 0. Over n
+episodes its standard error is that of a paired mean (Miller 2024, arXiv:2411.00640, section 5). The
+interval is wider by what it counts on and has not seen. `benchmarks/plan.py` simulates the power.
 """
 
 from dataclasses import dataclass
@@ -19,13 +20,17 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 
 @dataclass(frozen=True)
 class Spread:
-    """How much the difference of two successes varies between episodes, whose parts are averaged."""
+    """How much the difference of two successes varies between episodes,
+    whose parts are averaged.
+    """
 
     shares: Floats  # of all episodes that each part has, (H,); they sum to 1
     variances: Floats  # of an episode's difference in each part, (..., H)
 
     def episodes(self, difference: float, power: float) -> Floats:
-        """Return how many episodes find a difference with a power, (...); whole numbers, inf above `MOST`."""
+        """Return how many episodes find a difference with a power, (...);
+        whole numbers, inf above `MOST`.
+        """
         low, high = np.ones(self._shape), np.full(self._shape, MOST)
         for _ in range(HALVINGS):  # of the ratio, since the bracket spans nine orders of magnitude
             middle = np.sqrt(low * high)
@@ -34,7 +39,9 @@ class Spread:
         return np.where(high < MOST, np.ceil(high - 1e-6), np.inf)
 
     def difference(self, n: float, power: float) -> Floats:
-        """Return the least difference that n episodes find with a power, (...); NaN where none up to 1 is."""
+        """Return the least difference that n episodes find with a power, (...);
+        NaN where none up to 1 is.
+        """
         low, high = np.zeros(self._shape), np.ones(self._shape)
         for _ in range(HALVINGS):
             middle = (low + high) / 2
@@ -47,10 +54,12 @@ class Spread:
         return self.variances.shape[:-1]
 
     def _needed(self, n: Floats, difference: Floats, power: float) -> Floats:
-        """Return the difference that n episodes find if outcomes vary as they must for `difference`, (...).
+        """Return the difference that n episodes find if outcomes vary as they must for
+        `difference`, (...).
 
-        A difference makes outcomes of 0 and 1 vary, even if none is lost and a share of them gained: pilots
-        that agree do not say that fewer layouts are enough. Over several seeds this is more than it must be.
+        A difference makes outcomes of 0 and 1 vary, even if none is lost and a share of them
+        gained: pilots that agree do not say that fewer layouts are enough. Over several seeds this
+        is more than it must be.
         """
         from harness.core.special import ndtri
 
@@ -72,7 +81,9 @@ class Spread:
 
 
 def variance(values: Floats, counts: Ints) -> Floats:
-    """Return the variance of values (E,) that count so often, (..., E); inf where fewer than two count."""
+    """Return the variance of values (E,) that count so often, (..., E);
+    inf where fewer than two count.
+    """
     n = counts.sum(axis=-1)
     mean = counts @ values / np.maximum(n, 1)
     squares = np.maximum(counts @ values**2 - n * mean**2, 0)  # rounding may go below

@@ -12,10 +12,12 @@ from types import FrameType
 from typing import Any, NoReturn
 
 STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
-LEAVE_S = 120.0  # in which the process is gone once its work is done; a tracker may still send things
+# in which the process is gone once its work is done; a tracker may still send things
+LEAVE_S = 120.0
 GIVEN_UP_S = 2.0  # the same where something hangs that was waited for already
 AGAIN_S = 0.05  # after which a stop that fell where nothing can be raised is raised again
-LEAST_MB = 768  # of address space; with less, libraries end the process in ways that cannot be caught
+# of address space; with less, libraries end the process in ways that cannot be caught
+LEAST_MB = 768
 # Texts of the errors, other than MemoryError, of a process whose memory ran out.
 MEMORY = (
     "failed to map segment",
@@ -27,7 +29,9 @@ STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their 
 
 
 class Stop(KeyboardInterrupt):
-    """SIGTERM or SIGINT, which end a command wherever it is; the argument is the signal's number."""
+    """SIGTERM or SIGINT, which end a command wherever it is;
+    the argument is the signal's number.
+    """
 
     @property
     def word(self) -> str:
@@ -42,8 +46,8 @@ class Stop(KeyboardInterrupt):
 def run(program: Callable[[], object]) -> None:
     """Run the program so that SIGTERM, SIGINT or a want of memory end it with one line.
 
-    Exit codes are 143, 130 and 2. Where standard input, output or error is closed, nothing is read or
-    written; a character that an encoding lacks is replaced.
+    Exit codes are 143, 130 and 2. Where standard input, output or error is closed, nothing is read
+    or written; a character that an encoding lacks is replaced.
     """
     _open_streams()
     _leave_out_wrong_date()
@@ -73,7 +77,9 @@ def run(program: Callable[[], object]) -> None:
 
 
 def give_up() -> None:
-    """Note that something hangs: what its package registered with `atexit` may wait for the same server."""
+    """Note that something hangs: what its package registered with `atexit` may wait for the same
+    server.
+    """
     global LEAVE_S
     LEAVE_S = min(LEAVE_S, GIVEN_UP_S)
 
@@ -81,16 +87,22 @@ def give_up() -> None:
 def _leave(error: BaseException | None) -> None:
     """Have the process end with this error within `LEAVE_S`, whatever packages left behind.
 
-    Python waits for threads that are no daemons, and calls what was registered with `atexit`: both may hang.
+    Python waits for threads that are no daemons, and calls what was registered with `atexit`:
+    both may hang.
     """
     code = getattr(error, "code", 1 if error else 0)
     code = code if isinstance(code, int) else int(code is not None)
 
     def end() -> None:
         time.sleep(LEAVE_S)
-        names = ", ".join(ascii(t.name) for t in threading.enumerate() if not t.daemon and t is not main)
+        names = ", ".join(
+            ascii(t.name) for t in threading.enumerate() if not t.daemon and t is not main
+        )
         what = f"threads that packages left ({names})" if names else "what packages do at the end"
-        print(f"harness: {what} took longer than {LEAVE_S:g} s; all is written, and it ends", file=sys.stderr)
+        print(
+            f"harness: {what} took longer than {LEAVE_S:g} s; all is written, and it ends",
+            file=sys.stderr,
+        )
         os._exit(code)
 
     main = threading.main_thread()
@@ -124,7 +136,9 @@ class _Stops:
         sys.unraisablehook = self._unraisable
 
     def let_go(self) -> None:
-        """Leave signals to the system, whose default ends the process while the interpreter shuts down."""
+        """Leave signals to the system, whose default ends the process while the interpreter shuts
+        down.
+        """
         for number in STOPS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, signal.SIG_DFL)
@@ -166,7 +180,9 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _open_streams() -> None:
-    """Open streams that are closed, so that no other file gets their numbers; write what can be encoded."""
+    """Open streams that are closed, so that no other file gets their numbers;
+    write what can be encoded.
+    """
     for number, (name, mode) in enumerate(STREAMS.items()):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_RDWR)  # it gets the lowest free number
@@ -180,7 +196,9 @@ def _open_streams() -> None:
 
 
 def _leave_out_wrong_date() -> None:
-    """Remove a wrong date from the environment: NumPy, when SciPy imports all of it, fails at one."""
+    """Remove a wrong date from the environment:
+    NumPy, when SciPy imports all of it, fails at one.
+    """
     try:
         time.gmtime(int(os.environ.get("SOURCE_DATE_EPOCH", "0")))
     except (ValueError, OverflowError, OSError):
@@ -200,7 +218,8 @@ def _lack() -> str | None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit >> 20 < LEAST_MB:
         return (
-            f"the address space is limited to {limit >> 20} MB, and {LEAST_MB} MB are the least; raise it "
+            f"the address space is limited to {limit >> 20} MB, and {LEAST_MB} MB are the least; "
+            "raise it "
             f"with `ulimit -v {LEAST_MB << 10}`"
         )
     return None

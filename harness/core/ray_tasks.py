@@ -1,4 +1,6 @@
-"""Run items as tasks on the nodes of a Ray cluster. Imported only if `--workers` names a cluster."""
+"""Run items as tasks on the nodes of a Ray cluster.
+Imported only if `--workers` names a cluster.
+"""
 
 import logging
 import os
@@ -36,20 +38,27 @@ COUNT_S = 2.0  # cores are counted again after this time, since nodes come and g
 class Tasks:
     """An executor whose items are tasks of Ray, which chooses the nodes.
 
-    Ray does not retry a task, so that `each` can count deaths of workers. The first item of every further
-    node is run again on the first node, and must give the same result.
+    Ray does not retry a task, so that `each` can count deaths of workers. The first item of every
+    further node is run again on the first node, and must give the same result.
     """
 
     def __init__(
-        self, work: Callable[[Any], Any], address: str | None, label: Callable[[int], str], repeatable: bool
+        self,
+        work: Callable[[Any], Any],
+        address: str | None,
+        label: Callable[[int], str],
+        repeatable: bool,
     ) -> None:
-        """`label` gives the name of the item at a place; `repeatable` says whether nodes are compared."""
+        """`label` gives the name of the item at a place;
+        `repeatable` says whether nodes are compared.
+        """
         _connect(address)
         self._label, self._repeatable = label, repeatable
         self._run = ray.remote(num_cpus=1, max_retries=0)(_on_node)
         self._work = ray.put((work, node_versions(), os.getcwd()))
         self._busy: dict[Any, tuple[int, Any]] = {}
-        self._again: dict[Any, tuple[int, str, str]] = {}  # repeated items: place, first node, its result
+        # repeated items: place, first node, its result
+        self._again: dict[Any, tuple[int, str, str]] = {}
         self._nodes: dict[str, str] = {}  # names by id of the nodes that have answered
         self._cores, self._counted_s = 1, -COUNT_S
 
@@ -123,7 +132,8 @@ def _connect(address: str | None) -> None:
     # A version of Ray or Python other than the cluster's raises one of these, too.
     except (OSError, RuntimeError, ValueError, ImportError) as error:
         raise UserError(
-            f"--workers ray: no cluster at {printable(target or 'this machine')} ({printable(error)}); start "
+            f"--workers ray: no cluster at {printable(target or 'this machine')} "
+            f"({printable(error)}); start "
             "one with `ray start --head`, and give its address"
         ) from None
 
@@ -138,12 +148,17 @@ def _result(task: Any) -> tuple[str, str, Any] | None:
         cause = getattr(error, "cause", None)
         if isinstance(cause, Exception) and not isinstance(cause, exceptions.RayError):
             raise cause from error
-        reason = printable(str(cause or error).partition("\n")[0])  # such as a package that a node lacks
-        raise UserError(f"--workers ray: {reason}; fix the cluster's nodes, or use processes") from None
+        # such as a package that a node lacks
+        reason = printable(str(cause or error).partition("\n")[0])
+        raise UserError(
+            f"--workers ray: {reason}; fix the cluster's nodes, or use processes"
+        ) from None
     return answer
 
 
-def _on_node(job: tuple[Callable[[Any], Any], dict[str, str], str], item: Any) -> tuple[str, str, Any]:
+def _on_node(
+    job: tuple[Callable[[Any], Any], dict[str, str], str], item: Any
+) -> tuple[str, str, Any]:
     """Run an item on this node, if the versions here are the same as on the calling machine."""
     work, versions, folder = job
     node = ray.get_runtime_context().get_node_id()

@@ -1,8 +1,9 @@
 """Locate prompts, models, channels, devices, networks, schedules, datasets and the like.
 
 They ship with the harness, at the checkout's top level or inside the wheel. A folder with a file
-`swarmdrive.toml` is a project: if it is the current directory, its own `prompts/`, `models/`, `channels/`,
-`devices/`, `networks/`, `schedules/` and `datasets/` are searched as well, and so is what extensions keep so.
+`swarmdrive.toml` is a project: if it is the current directory, its own `prompts/`, `models/`,
+`channels/`, `devices/`, `networks/`, `schedules/` and `datasets/` are searched as well, and so is
+what extensions keep so.
 """
 
 import os
@@ -33,7 +34,9 @@ def folder(kind: str) -> Path:
 
 
 def entries(kind: str, pattern: str) -> list[Path]:
-    """List the paths of one kind, shipped and the project's, that match a glob pattern below its folder."""
+    """List the paths of one kind, shipped and the project's,
+    that match a glob pattern below its folder.
+    """
     return sorted(path for where in _folders(kind) for path in where.glob(pattern))
 
 
@@ -43,7 +46,9 @@ def names(kind: str) -> list[str]:
 
 
 def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
-    """Load all that a list shows; one that is wrong stands there as its error, and takes no other with it."""
+    """Load all that a list shows; one that is wrong stands there as its error,
+    and takes no other with it.
+    """
     loaded: dict[str, T | UserError] = {}
     for name in names:
         try:
@@ -56,13 +61,16 @@ def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserEr
 def find(kind: str, name: str) -> Path:
     """Return the path of a resource; if it does not exist, its path among the shipped ones.
 
-    Raises UserError if the project and the harness both have a resource of that name, or nothing can show it.
+    Raises UserError if the project and the harness both have a resource of that name,
+    or nothing can show it.
     """
-    candidates = list(dict.fromkeys(where / name for where in _folders(kind)))  # one, if `name` is absolute
+    # one, if `name` is absolute
+    candidates = list(dict.fromkeys(where / name for where in _folders(kind)))
     existing = [path for path in candidates if os.path.lexists(path)]
     if len(existing) > 1:
         raise UserError(
-            f"{kind}/{printable(name)} is in this project and ships with the harness; give yours another name"
+            f"{kind}/{printable(name)} is in this project and ships with the harness; give yours "
+            "another name"
         )
     if existing and "/" not in name:
         sayable(f"file of {kind}", name)
@@ -70,14 +78,17 @@ def find(kind: str, name: str) -> Path:
 
 
 def card_to_copy(model: str) -> str | None:
-    """Say where the card of a model is that no longer ships, and what to do with it; None of all others."""
+    """Say where the card of a model is that no longer ships, and what to do with it;
+    None of all others.
+    """
     page = root() / "docs" / "model-cards.md"
     name, _, _ = model.partition(":")
     file = f"models/{name}.toml"
     if file not in re.findall("^### `(.+)`$", text_of(page), re.MULTILINE):
         return None
     return (
-        f"model {name!r} no longer ships; copy its card from {printable(page, 1000)} to {file} in your "
+        f"model {name!r} no longer ships; copy its card from {printable(page, 1000)} to {file} in "
+        "your "
         "project's folder, which `harness init` makes, and it runs again"
     )
 

@@ -1,7 +1,8 @@
 """Ranges of layout seeds by purpose, so that no layout is tuned or trained on and then reported.
 
-Constants of scenarios and wordings of prompts are chosen on tune seeds, models learn from train seeds, and
-every number that is quoted comes from report seeds. The rule is the same for every scenario.
+Constants of scenarios and wordings of prompts are chosen on tune seeds, models learn from train
+seeds, and every number that is quoted comes from report seeds. The rule is the same for every
+scenario.
 """
 
 from itertools import pairwise
@@ -11,24 +12,32 @@ from harness.core.errors import UserError
 
 Purpose = Literal["tune", "train", "report"]
 
-FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}  # each range ends at the next
+# each range ends at the next
+FIRST: dict[Purpose, int] = {"tune": 0, "train": 100_000, "report": 200_000}
 LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """Return the one purpose of the layout seeds `first` to `first + count - 1`, or raise UserError."""
+    """Return the one purpose of the layout seeds `first` to `first + count - 1`,
+    or raise UserError.
+    """
     present = purposes(first, count)
     if len(present) > 1:
-        ends = [f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())]
+        ends = [
+            f"{start} to {end - 1} ({name})" for (name, start), (_, end) in pairwise(FIRST.items())
+        ]
         raise UserError(
-            f"layout seeds {first} to {first + count - 1} are for {' and '.join(present)}; keep to one of "
+            f"layout seeds {first} to {first + count - 1} are for {' and '.join(present)}; keep to "
+            "one of "
             f"{', '.join(ends)}, {FIRST['report']} and above (report)"
         )
     return present[0]
 
 
 def stated(first: int, count: int) -> str:
-    """Describe a range of layout seeds as printed beside a number: `layout seeds 0 to 239 (tune)`."""
+    """Describe a range of layout seeds as printed beside a number:
+    `layout seeds 0 to 239 (tune)`.
+    """
     return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 
 
@@ -36,4 +45,6 @@ def purposes(first: int, count: int) -> list[Purpose]:
     """Return all purposes of the layout seeds `first` to `first + count - 1`."""
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
-    return [n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count]
+    return [
+        n for n, end in zip(names, ends, strict=True) if first < end and FIRST[n] < first + count
+    ]

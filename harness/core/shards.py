@@ -1,6 +1,7 @@
 """Split work into shards, one folder each, and merge their files byte for byte.
 
-A shard's working folder holds the same files as the whole work would, and its config names the shard.
+A shard's working folder holds the same files as the whole work would,
+and its config names the shard.
 """
 
 import os
@@ -20,8 +21,8 @@ from harness.core.formats import CONFIG, WORK
 
 T = TypeVar("T")
 MOST = 100_000
-# Environment variables that number a job's tasks, with the number taken as the first: an array of Slurm has
-# the numbers that it was given, and Kubernetes counts from 0.
+# Environment variables that number a job's tasks, with the number taken as the first: an array of
+# Slurm has the numbers that it was given, and Kubernetes counts from 0.
 TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 
 
@@ -36,10 +37,13 @@ class Shard:
         return f"{self.number}/{self.of}"
 
     def part(self, items: Sequence[T]) -> Sequence[T]:
-        """Return this shard's slice of a sequence. Raises UserError if there are more shards than items."""
+        """Return this shard's slice of a sequence.
+        Raises UserError if there are more shards than items.
+        """
         if self.of > len(items):
             raise UserError(
-                f"--shard {self}: the work has {len(items)} parts; give {len(items)} shards or fewer"
+                f"--shard {self}: the work has {len(items)} parts; give {len(items)} shards or "
+                "fewer"
             )
         start, stop = (len(items) * n // self.of for n in (self.number - 1, self.number))
         return items[start:stop]
@@ -58,7 +62,9 @@ def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
                 f"--shard {printable(text)}: neither {' nor '.join(TASKS)} is set; give 1/N to N/N"
             )
         task = environment[name]
-        number = str(int(task) + 1 - TASKS[name]) if re.fullmatch(r"\d{1,9}", task, re.ASCII) else task
+        number = (
+            str(int(task) + 1 - TASKS[name]) if re.fullmatch(r"\d{1,9}", task, re.ASCII) else task
+        )
         text = f"{printable(number)}/{total} ({name} is {printable(task)})"
     counts = re.fullmatch(r"\d{1,9}/\d{1,9}", f"{number}/{total}", re.ASCII)
     if not counts or not 1 <= int(number) <= int(total) <= MOST:
@@ -74,8 +80,8 @@ Start = TypeVar("Start", bound=work.WorkStart)
 def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
     """Read what the shards in some folders began with, and check that they make up one work.
 
-    Raises UserError if a folder holds no shard, one is still being written, they are of different works, or
-    one is missing.
+    Raises UserError if a folder holds no shard, one is still being written,
+    they are of different works, or one is missing.
     """
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
@@ -83,13 +89,16 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
         theirs = config.facts()
         if differ := [key for key in {**facts, **theirs} if facts.get(key) != theirs.get(key)]:
             raise UserError(
-                f"{printable(folder)} and {printable(first)} differ in {printable(', '.join(differ))}; give "
+                f"{printable(folder)} and {printable(first)} differ in "
+                f"{printable(', '.join(differ))}; give "
                 "shards of one run"
             )
     shards = [shard_of(config.shard) for config in configs]
     totals = {shard.of for shard in shards}
     if len(totals) > 1:
-        raise UserError(f"shards of {' and of '.join(map(str, sorted(totals)))}; give those of one run")
+        raise UserError(
+            f"shards of {' and of '.join(map(str, sorted(totals)))}; give those of one run"
+        )
     numbers, total = {shard.number for shard in shards}, shards[0].of
     if missing := [str(Shard(n, total)) for n in range(1, total + 1) if n not in numbers]:
         raise UserError(
@@ -106,7 +115,8 @@ def _read(folder: Path, kind: type[Start]) -> Start:
         config = None
     if config is None or not config.shard:
         raise UserError(
-            f"{printable(folder)} is no shard; give folders made with --shard, which were not merged yet"
+            f"{printable(folder)} is no shard; give folders made with --shard, which were not "
+            "merged yet"
         )
     shard_of(config.shard, {})
     if work.held(folder):
@@ -122,22 +132,24 @@ def owners(
 ) -> dict[str, Path]:
     """Return the path of each part of a work, by its name, in the folders of its shards.
 
-    `parts` are the names of all parts, in order; `label` gives a part's name in messages. Raises UserError if
-    a shard is not finished, or a part differs between two folders.
+    `parts` are the names of all parts, in order; `label` gives a part's name in messages. Raises
+    UserError if a shard is not finished, or a part differs between two folders.
     """
     paths: dict[str, Path] = {}
     for folder, config in zip(folders, configs, strict=True):
         shard_parts = {name: folder / WORK / name for name in shard_of(config.shard).part(parts)}
         if missing := [name for name, part in shard_parts.items() if not part.exists()]:
             raise UserError(
-                f"{printable(folder)}, shard {config.shard}, lacks {printable(label(missing[0]))} and "
+                f"{printable(folder)}, shard {config.shard}, lacks {printable(label(missing[0]))} "
+                "and "
                 f"{len(missing) - 1} parts more; type its command again, and then merge"
             )
         for name, part in shard_parts.items():
             if name in paths and _content(part) != _content(paths[name]):
                 raise UserError(
                     f"{printable(label(name))} came out differently in {printable(folder)} than in "
-                    f"{printable(paths[name].parents[1])}; find out which is right, and leave out the other"
+                    f"{printable(paths[name].parents[1])}; find out which is right, and leave out "
+                    "the other"
                 )
             paths[name] = part
     return paths

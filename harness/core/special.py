@@ -1,7 +1,8 @@
 """SciPy's special functions, without what their import loads for nobody.
 
-SciPy copies every name of NumPy, which makes it load the compiler of Fortran and the tools for tests: a
-quarter of its time. They are hidden while it does, and load later for whoever asks NumPy for them.
+SciPy copies every name of NumPy, which makes it load the compiler of Fortran and the tools for
+tests: a quarter of its time. They are hidden while it does, and load later for whoever asks NumPy
+for them.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Scores of intents, and confidence intervals of means, shares and differences.
 
-A score has one value per decision; an interval turns values into an `Estimate`. Steps of one episode are not
-independent trials, so intervals are over episodes or over seeds. `benchmarks/intervals.py` measures how often
-they cover the true value.
+A score has one value per decision; an interval turns values into an `Estimate`. Steps of one
+episode are not independent trials, so intervals are over episodes or over seeds.
+`benchmarks/intervals.py` measures how often they cover the true value.
 """
 
 import math
@@ -16,8 +16,10 @@ from harness.core.arrays import Bools, Floats, Ints
 LEVEL = 0.95  # of confidence
 LEAST_MASS = 1e-4  # least probability that is counted of safe actions
 ALIKE = 4.0  # episodes, over all parts of a mean, by which each part varies as all do
-FEW = 6.0  # differing units, up to which an interval counts on rarer and heavier ones than were seen
-ROUNDING = 1e-18  # a smaller sum of squares is rounding only; relative to the mean where that is above 1
+# differing units, up to which an interval counts on rarer and heavier ones than were seen
+FEW = 6.0
+# a smaller sum of squares is rounding only; relative to the mean where that is above 1
+ROUNDING = 1e-18
 
 
 @dataclass(frozen=True)
@@ -32,28 +34,32 @@ class Estimate:
 
 
 def safe_target(safe: Bools) -> Floats:
-    """Return the uniform distribution over the safe actions, `(..., A)`; NaN where no action is safe."""
+    """Return the uniform distribution over the safe actions, `(..., A)`;
+    NaN where no action is safe.
+    """
     count = np.sum(safe, axis=-1, keepdims=True)
     return np.where(count > 0, safe / np.maximum(count, 1), np.nan)
 
 
 def brier(p: Floats, target: Floats) -> Floats:
-    """Return the squared distance of intents from target distributions, both `(..., A)`; 0 best, 2 worst.
+    """Return the squared distance of intents from target distributions, both `(..., A)`;
+    0 best, 2 worst.
 
-    This is the score of Brier 1950 for many classes, with a distribution (`safe_target`) instead of one true
-    class. It is smallest at p = target: with two safe actions, an intent that is sure of one scores 0.5, and
-    one that is undecided between both scores 0. Shape `(...)`.
+    This is the score of Brier 1950 for many classes, with a distribution (`safe_target`) instead of
+    one true class. It is smallest at p = target: with two safe actions, an intent that is sure of
+    one scores 0.5, and one that is undecided between both scores 0. Shape `(...)`.
     """
     score: Floats = np.sum((p - target) ** 2, axis=-1)
     return score
 
 
 def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
-    """Return -ln of the probability that intents `(..., A)` give to the safe actions; 0 best. Shape `(...)`.
+    """Return -ln of the probability that intents `(..., A)` give to the safe actions; 0 best.
+    Shape `(...)`.
 
-    This is the logarithmic score (Good 1952) with the set of safe actions as the event that came true. Unlike
-    in `brier`, it does not matter how the mass is spread inside the set. NaN where no action is safe. An
-    answer that is sure and wrong costs -ln(LEAST_MASS) = 9.2 nats.
+    This is the logarithmic score (Good 1952) with the set of safe actions as the event that came
+    true. Unlike in `brier`, it does not matter how the mass is spread inside the set. NaN where no
+    action is safe. An answer that is sure and wrong costs -ln(LEAST_MASS) = 9.2 nats.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -63,7 +69,8 @@ def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
 def seed_interval(per_seed_means: Floats) -> Estimate:
     """Return the mean over seeds `(S,)` with Student's t interval; t(4) = 2.776 for 5 seeds.
 
-    These are the paper's error bars. One seed, or seeds that all agree, have a value and no interval.
+    These are the paper's error bars.
+    One seed, or seeds that all agree, have a value and no interval.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)))
 
@@ -73,12 +80,15 @@ def episode_interval(
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN. Values
-    are `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an episode's known values
-    is taken; an episode that is all NaN is excluded. Or they are `(n,)` with the episode of each: the mean is
-    then over values, and the variance is that of a ratio of totals (Cochran 1977, section 6.3).
+    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN.
+    Values are `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an
+    episode's known values is taken; an episode that is all NaN is excluded. Or they are `(n,)` with
+    the episode of each: the mean is then over values, and the variance is that of a ratio of totals
+    (Cochran 1977, section 6.3).
     """
-    values = values_by_episode.reshape(len(values_by_episode), math.prod(values_by_episode.shape[1:]))
+    values = values_by_episode.reshape(
+        len(values_by_episode), math.prod(values_by_episode.shape[1:])
+    )
     means = known_mean(values, axis=-1)
     return _student(means, np.arange(len(means)) if episodes is None else episodes, level)
 
@@ -92,10 +102,11 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
-    """Return the mean of values from 0 to 1, `(n,)`, with Wilson's interval for their effective sample size.
+    """Return the mean of values from 0 to 1, `(n,)`,
+    with Wilson's interval for their effective sample size.
 
-    NaN is left out. `episodes` is the episode of each value, one of its own if None; how much an episode
-    counts depends on how alike its seeds or decisions are (`_effective_n`).
+    NaN is left out. `episodes` is the episode of each value, one of its own if None; how much an
+    episode counts depends on how alike its seeds or decisions are (`_effective_n`).
     """
     known = ~np.isnan(values)
     n, n_excluded = int(known.sum()), int((~known).sum())
@@ -118,13 +129,13 @@ def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
 def seed_rate_interval(values: Floats) -> Estimate:
     """Return the mean of shares over seeds, for these episodes, with an interval over other seeds.
 
-    Draws are independent between seeds and between episodes, so the variance is that of seeds inside each
-    episode. It has E (S - 1) degrees of freedom, where the means of S seeds have only S - 1. Two values that
-    deviate from the rest of their episode are added, one each way (as Bonett and Price 2012 do with pairs):
-    even if no seed changed anything, another might.
+    Draws are independent between seeds and between episodes, so the variance is that of seeds
+    inside each episode. It has E (S - 1) degrees of freedom, where the means of S seeds have only S
+    - 1. Two values that deviate from the rest of their episode are added, one each way (as Bonett
+    and Price 2012 do with pairs): even if no seed changed anything, another might.
 
-    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out. The number of seeds is n; one
-    seed has a value and no interval.
+    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out.
+    The number of seeds is n; one seed has a value and no interval.
     """
     from harness.core.special import stdtrit
 
@@ -137,19 +148,22 @@ def seed_rate_interval(values: Floats) -> Estimate:
     within = float(np.nansum((values - known_mean(values, axis=0)) ** 2)) / freedom
     n = int(known.sum())
     half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * math.sqrt(n * within + 2) / n
-    return Estimate(value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted)
+    return Estimate(
+        value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted
+    )
 
 
 def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate:
     """Return the mean of the parts' mean differences, with an interval over episodes.
 
-    Parts are strata that weigh alike, such as the layouts with a danger and without of each family: the
-    variance is that of a stratified mean (Cochran 1977, section 5.6). What is rare may not have been seen,
-    so it counts on a little more, in two ways that were found by simulation and whose coverage and power
-    `benchmarks/differences.py` measures. Each of several parts varies as if it had more episodes, `ALIKE` in
-    all parts together, that differ as often as those of all. And two more differ, one each way (as Bonett and
-    Price 2012 add pairs): as heavy as those that differ are on average, or, where few do, as one may be.
-    With k that differ, the squares of both weights are mixed by exp(-k / `FEW`).
+    Parts are strata that weigh alike, such as the layouts with a danger and without of each family:
+    the variance is that of a stratified mean (Cochran 1977, section 5.6). What is rare may not have
+    been seen, so it counts on a little more, in two ways that were found by simulation and whose
+    coverage and power `benchmarks/differences.py` measures. Each of several parts varies as if it
+    had more episodes, `ALIKE` in all parts together, that differ as often as those of all. And two
+    more differ, one each way (as Bonett and Price 2012 add pairs): as heavy as those that differ
+    are on average, or, where few do, as one may be. With k that differ, the squares of both weights
+    are mixed by exp(-k / `FEW`).
 
     Args:
         parts: differences from -1 to 1 of each part's episodes, (E,) each; NaN is left out.
@@ -161,7 +175,9 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
 
 
 def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
-    """Return the mean of `paired_difference` with an interval that reaches so many standard errors."""
+    """Return the mean of `paired_difference` with an interval that reaches so many standard
+    errors.
+    """
     value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
     half = errors * error
@@ -192,17 +208,21 @@ def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
 
 
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
-    """Return what `paired_difference` does of one part, with an interval from the two of `rate_interval`.
+    """Return what `paired_difference` does of one part,
+    with an interval from the two of `rate_interval`.
 
     It is wider, above all as a mean of several (`mean_of`), and stays for what was computed with it
-    (`runs/pinned.py`). The ends of both intervals are combined by the correlation over episodes (Newcombe
-    1998, method 10; Zou and Donner 2008). The correlation includes two more pairs that differ, one each way
-    (as in Bonett and Price 2012): even if all pairs agree, a few of other episodes might not. Both are `(E,)`
-    or `(E, ...)`, with the same episodes; a pair in which either is NaN is excluded.
+    (`runs/pinned.py`). The ends of both intervals are combined by the correlation over episodes
+    (Newcombe 1998, method 10; Zou and Donner 2008). The correlation includes two more pairs that
+    differ, one each way (as in Bonett and Price 2012): even if all pairs agree, a few of other
+    episodes might not. Both are `(E,)` or `(E, ...)`, with the same episodes; a pair in which
+    either is NaN is excluded.
     """
     unknown = np.isnan(a) | np.isnan(b)
     x, y = (
-        known_mean(np.where(unknown, np.nan, side).reshape(len(side), math.prod(side.shape[1:])), axis=-1)
+        known_mean(
+            np.where(unknown, np.nan, side).reshape(len(side), math.prod(side.shape[1:])), axis=-1
+        )
         for side in (a, b)
     )
     x, y = x[~np.isnan(x)], y[~np.isnan(y)]
@@ -227,9 +247,10 @@ def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
-    The distances of the estimates' ends from their values are combined as the root of their sum of squares
-    ("MOVER": Zou and Donner 2008), so the level is theirs. The averaged estimates are taken as fixed and not
-    as a sample: the interval says nothing of another family of scenes. NaN where any estimate is.
+    The distances of the estimates' ends from their values are combined as the root of their sum of
+    squares ("MOVER": Zou and Donner 2008), so the level is theirs. The averaged estimates are taken
+    as fixed and not as a sample: the interval says nothing of another family of scenes. NaN where
+    any estimate is.
     """
     value = np.array([estimate.value for estimate in estimates])
     low = np.array([estimate.low for estimate in estimates])
@@ -241,15 +262,19 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
-    """Return how often each of n units counts, `(1 + times, n)`: once, then as drawn with replacement."""
-    return np.vstack([np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)])
+    """Return how often each of n units counts, `(1 + times, n)`:
+    once, then as drawn with replacement.
+    """
+    return np.vstack(
+        [np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)]
+    )
 
 
 def resampled_estimate(values: Floats, n: int) -> Estimate:
     """Return a figure of n units with its bootstrap's 95 % interval.
 
-    `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 + times,)`.
-    NaN resamples are left out; if the figure itself is NaN, there is no interval.
+    `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 +
+    times,)`. NaN resamples are left out; if the figure itself is NaN, there is no interval.
     """
     known = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):
@@ -259,7 +284,9 @@ def resampled_estimate(values: Floats, n: int) -> Estimate:
 
 
 def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, float]:
-    """Return the mean of shares `(E,)`, the deviations, the interval's ends and the effective sample size."""
+    """Return the mean of shares `(E,)`, the deviations,
+    the interval's ends and the effective sample size.
+    """
     rate = float(np.mean(values))
     deviations = values - rate
     effective_n = _effective_n(rate, deviations, np.ones(len(values)), level)
@@ -269,11 +296,12 @@ def _around(values: Floats, level: float) -> tuple[float, Floats, float, float, 
 def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float = LEVEL) -> float:
     """Return the number of independent yes-or-no trials that are as informative as these episodes.
 
-    This is the effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance of the
-    mean with episodes as clusters, reduced for Student's t in place of the normal distribution. The degrees
-    of freedom are Satterthwaite's, from the fourth moment: they are few if few episodes differ from the rest.
-    An episode counts as one trial at least, since no values from 0 to 1 vary more than yes or no. `totals`
-    are each episode's sum of deviations from the rate, and `sizes` the number of its values, (C,).
+    This is the effective sample size of Korn and Graubard (1998): rate (1 - rate) over the variance
+    of the mean with episodes as clusters, reduced for Student's t in place of the normal
+    distribution. The degrees of freedom are Satterthwaite's, from the fourth moment: they are few
+    if few episodes differ from the rest. An episode counts as one trial at least, since no values
+    from 0 to 1 vary more than yes or no. `totals` are each episode's sum of deviations from the
+    rate, and `sizes` the number of its values, (C,).
     """
     from harness.core.special import stdtrit
 

@@ -1,8 +1,9 @@
-"""The door to the code of packages: it runs between lines that it can neither end nor move the program past.
+"""The door to the code of packages: it runs between lines that it can neither end nor move the
+program past.
 
-An error of a package is raised as it is, for the caller to word. Two things are no errors, and not a
-package's to do: to end the program, as `sys.exit` does, and to leave it in another working folder, from which
-relative paths lead elsewhere.
+An error of a package is raised as it is, for the caller to word. Two things are no errors, and not
+a package's to do: to end the program, as `sys.exit` does, and to leave it in another working
+folder, from which relative paths lead elsewhere.
 """
 
 import os
@@ -21,8 +22,8 @@ from harness.core.process import Stop
 def strangers(what: str = "a package") -> Iterator[None]:
     """Run code that may be a package's; `what` names it in messages.
 
-    Raises UserError for what would end the program, unless somebody did type Ctrl-C. A changed working folder
-    is put back, and a line on stderr says so.
+    Raises UserError for what would end the program, unless somebody did type Ctrl-C. A changed
+    working folder is put back, and a line on stderr says so.
     """
     here = _folder()
     try:
@@ -40,7 +41,9 @@ def strangers(what: str = "a package") -> Iterator[None]:
 
 @contextmanager
 def aside(what: str) -> Iterator[None]:
-    """Run code as `strangers` does; what it prints goes to stderr, since a program may read stdout."""
+    """Run code as `strangers` does; what it prints goes to stderr,
+    since a program may read stdout.
+    """
     with strangers(what), redirect_stdout(sys.stderr):
         yield
 
@@ -66,10 +69,15 @@ def worded(what: str, built_in: bool = False) -> Iterator[None]:
 
 
 def ends_the_program(error: BaseException) -> bool:
-    """Return whether this is no error, and nobody typed Ctrl-C: code that runs here has no right to it."""
+    """Return whether this is no error, and nobody typed Ctrl-C:
+    code that runs here has no right to it.
+    """
     if isinstance(error, Stop):
         return False
-    if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
+    if (
+        isinstance(error, KeyboardInterrupt)
+        and threading.current_thread() is threading.main_thread()
+    ):
         return signal.getsignal(signal.SIGINT) is not signal.default_int_handler  # as in a notebook
     return not isinstance(error, Exception)
 
@@ -87,9 +95,14 @@ def _raised(error: BaseException) -> str:
 
 
 def _exits(error: BaseException) -> bool:
-    """Return whether this ends a command of click or typer with an exit code, as commands here do."""
+    """Return whether this ends a command of click or typer with an exit code,
+    as commands here do.
+    """
     kind = type(error)
-    return kind.__name__ in ("Exit", "Abort") and kind.__module__.partition(".")[0] in ("click", "typer")
+    return kind.__name__ in ("Exit", "Abort") and kind.__module__.partition(".")[0] in (
+        "click",
+        "typer",
+    )
 
 
 def _folder() -> str | None:

@@ -1,9 +1,10 @@
-"""Render Jinja templates of strangers within limits: none can reach out, run for ever or fill memory.
+"""Render Jinja templates of strangers within limits:
+none can reach out, run for ever or fill memory.
 
-All that a template does is paid from one account of steps: the nodes of a body each time it runs, the texts
-that an operation, a filter or a call reads and makes. What could be large is paid before it is made, since
-nothing can stop a single operation of Python. So the limit needs no clock, and a template that renders on one
-machine renders on every other.
+All that a template does is paid from one account of steps: the nodes of a body each time it runs,
+the texts that an operation, a filter or a call reads and makes. What could be large is paid before
+it is made, since nothing can stop a single operation of Python. So the limit needs no clock, and a
+template that renders on one machine renders on every other.
 """
 
 import re
@@ -11,7 +12,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
 from itertools import chain
 from threading import local
-from types import BuiltinFunctionType, CodeType, FunctionType, GeneratorType, MappingProxyType, MethodType
+from types import (
+    BuiltinFunctionType,
+    CodeType,
+    FunctionType,
+    GeneratorType,
+    MappingProxyType,
+    MethodType,
+)
 from typing import Any
 
 from jinja2 import Environment, Template, TemplateSyntaxError, nodes
@@ -21,7 +29,14 @@ from jinja2.filters import do_format, do_join, do_replace, make_attrgetter
 from jinja2.nodes import EvalContext
 from jinja2.runtime import Context, LoopContext
 from jinja2.sandbox import ImmutableSandboxedEnvironment
-from jinja2.utils import Cycler, Joiner, Namespace, generate_lorem_ipsum, pass_environment, pass_eval_context
+from jinja2.utils import (
+    Cycler,
+    Joiner,
+    Namespace,
+    generate_lorem_ipsum,
+    pass_environment,
+    pass_eval_context,
+)
 
 MOST_STEPS = 1_000_000  # of one rendering; a prompt that ships takes 2 000 at most
 MOST_TEXT = 200_000  # characters of a template
@@ -31,7 +46,8 @@ _SHORT = 64  # characters of a text that is not counted
 _WIDE = re.compile(r"%[-+ #0]*(?:\d{3}|\d*\.?\*|\d*\.\d{3})|\{[^{}]*(?:\d{3}|\{)")
 _NAMED_WIDE = re.compile(r"\d{3}|\*")  # in one with `%(name)`, whose name may hold anything
 FREE = "free "  # prefix of the name of a filter that pays nothing
-_STEP = "spent step"  # name of the node that pays; as those with the prefix, no template can write it
+# name of the node that pays; as those with the prefix, no template can write it
+_STEP = "spent step"
 
 _VIEWS: tuple[type[Any], ...] = (type({}.keys()), type({}.values()), type({}.items()))
 _LISTS: tuple[type[Any], ...] = (list, tuple, set, frozenset, range, *_VIEWS)
@@ -43,14 +59,34 @@ PLAIN = _SMALL | {str, int, dict}  # what nearly all that a prompt writes is of
 # Filters that read one thing of a value, whatever its size.
 _FREE = frozenset({"attr", "count", "d", "default", "first", "last", "length"})
 # Filters whose result may be as large as the value times an argument.
-_GROWING = frozenset({"batch", "center", "indent", "round", "slice", "tojson", "urlize", "wordwrap"})
+_GROWING = frozenset(
+    {"batch", "center", "indent", "round", "slice", "tojson", "urlize", "wordwrap"}
+)
 # Filters whose time may grow with the square of the value.
 _SLOW = frozenset({"pprint", "striptags", "urlize", "wordwrap", "xmlattr"})
 # Tests that read the whole of a value.
-_READING = frozenset({
-    "!=", "<", "<=", "==", ">", ">=", "eq", "equalto", "ge", "greaterthan", "gt", "in", "le", "lessthan",
-    "lower", "lt", "ne", "upper",
-})  # fmt: skip
+_READING = frozenset(
+    {
+        "!=",
+        "<",
+        "<=",
+        "==",
+        ">",
+        ">=",
+        "eq",
+        "equalto",
+        "ge",
+        "greaterthan",
+        "gt",
+        "in",
+        "le",
+        "lessthan",
+        "lower",
+        "lt",
+        "ne",
+        "upper",
+    }
+)
 _PADDING = frozenset({"center", "expandtabs", "ljust", "rjust", "zfill"})
 _DEEPEST_INDENT = 64  # of JSON: its lines are indented by a multiple of it
 _WITH_LENGTH = (str, bytes, list, tuple, dict)
@@ -64,7 +100,9 @@ class TooMuch(SecurityError):
 
 
 class Unwritten(SecurityError):
-    """A template writes a thing whose text is where it lies in memory, another one in every process."""
+    """A template writes a thing whose text is where it lies in memory,
+    another one in every process.
+    """
 
     def __init__(self, thing: object) -> None:
         super().__init__(f"a {type(thing).__name__} has no text; call it, or write what it makes")
@@ -100,7 +138,9 @@ def read(value: Any) -> Any:
 
 
 def written(value: Any) -> Any:
-    """Return a value that is to be written, as `read` does. Raises Unwritten if its text is its address."""
+    """Return a value that is to be written, as `read` does.
+    Raises Unwritten if its text is its address.
+    """
     if isinstance(value, _ADDRESSED):
         raise Unwritten(value)
     return read(value)
@@ -112,10 +152,11 @@ def looked_in(value: Any) -> Any:
 
 
 def _size(value: Any) -> int:
-    """Return what reading the whole of a value costs: 1, and 1 for each 8 characters and for each item.
+    """Return what reading the whole of a value costs:
+    1, and 1 for each 8 characters and for each item.
 
-    A list that is there several times counts as often, as in its text. Raises TooMuch if it is too large, and
-    Unwritten for a function.
+    A list that is there several times counts as often, as in its text.
+    Raises TooMuch if it is too large, and Unwritten for a function.
     """
     most, total, unread = _account.left, 0, [value]
     while unread:
@@ -160,7 +201,9 @@ def _extent(value: Any) -> int:
 
 
 def _charged(value: Any) -> Any:
-    """Return a result after paying for it; items that are made one by one are paid for as they come."""
+    """Return a result after paying for it;
+    items that are made one by one are paid for as they come.
+    """
     if isinstance(value, str | bytes):
         spend(len(value) >> 3)
     elif isinstance(value, _WITH_LENGTH):
@@ -201,7 +244,9 @@ def _filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def paid(*given: Any, **named: Any) -> Any:
         value, arguments = given[at], [*given[at + 1 :], *named.values()]
-        if not arguments and (type(value) in _SMALL or (type(value) is str and len(value) < _SHORT)):
+        if not arguments and (
+            type(value) in _SMALL or (type(value) is str and len(value) < _SHORT)
+        ):
             return function(*given)
         size = _size(value)
         if name in _GROWING:
@@ -300,7 +345,9 @@ class Code(CodeGenerator):
         self.write("(")
         sides = [node.expr, *(operand.expr for operand in node.ops)]
         plain = len(sides) == 2 and _is_constant(sides[1])
-        plain |= len(sides) == 2 and _is_constant(sides[0]) and node.ops[0].op not in ("in", "notin")
+        plain |= (
+            len(sides) == 2 and _is_constant(sides[0]) and node.ops[0].op not in ("in", "notin")
+        )
         self._side(sides[0], "" if plain else "read", frame)
         for operand in node.ops:
             within = operand.op in ("in", "notin")
@@ -341,7 +388,8 @@ def _cost(body: Iterable[nodes.Node]) -> int:
     steps, unread = 1, list(body)
     while unread:
         node = unread.pop()
-        text = getattr(node, "data", None) or getattr(node, "value", None)  # of the template, of a constant
+        # of the template, of a constant
+        text = getattr(node, "data", None) or getattr(node, "value", None)
         steps += 1 + (len(text) >> 3 if isinstance(text, str) else 0)
         unread += node.iter_child_nodes()
     return steps
@@ -358,7 +406,8 @@ class Bounded(Template):
 class Sandbox(ImmutableSandboxedEnvironment):
     """Jinja environment for templates of strangers, each of whose renderings has `MOST_STEPS`.
 
-    Compiling raises jinja2.TemplateSyntaxError for whatever is no template, and for one that is too long.
+    Compiling raises jinja2.TemplateSyntaxError for whatever is no template,
+    and for one that is too long.
     """
 
     intercepted_binops = frozenset(ImmutableSandboxedEnvironment.default_binop_table)
@@ -372,7 +421,9 @@ class Sandbox(ImmutableSandboxedEnvironment):
             self.filters[f"{FREE}{name}"] = function
             self.add_filter(name, own.get(name, function))
         tests: dict[str, Any] = {**self.tests}
-        self.tests = {name: _test(test) if name in _READING else test for name, test in tests.items()}
+        self.tests = {
+            name: _test(test) if name in _READING else test for name, test in tests.items()
+        }
         self.globals |= {"lipsum": _lorem_ipsum, "namespace": _Namespace}
 
     def add_filter(self, name: str, function: Callable[..., Any]) -> None:
@@ -380,16 +431,23 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
     def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
         if len(source) > MOST_TEXT:
-            raise TemplateSyntaxError(f"it has {len(source):,} characters; allowed: {MOST_TEXT:,}", 1)
+            raise TemplateSyntaxError(
+                f"it has {len(source):,} characters; allowed: {MOST_TEXT:,}", 1
+            )
         try:
             return super()._parse(source, name, filename)
         except RecursionError:
             raise TemplateSyntaxError("its expressions are nested too deeply", 1) from None
 
     def _generate(
-        self, source: nodes.Template, name: str | None, filename: str | None, defer_init: bool = False
+        self,
+        source: nodes.Template,
+        name: str | None,
+        filename: str | None,
+        defer_init: bool = False,
     ) -> str:
-        # So that no filter is applied to a constant, where nothing pays for it, and no method becomes one.
+        # So that no filter is applied to a constant, where nothing pays for it, and no method
+        # becomes one.
         _account.left, _account.compiles = 0, True
         try:
             self._put_steps_into(source)
@@ -399,7 +457,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         finally:
             _account.compiles = False
         # At the end, so that lines keep their numbers.
-        return f"{code}\nfrom {__name__} import PLAIN, _charged as made, looked_in, read, spend, written\n"
+        return (
+            f"{code}\nfrom {__name__} import PLAIN, _charged as made, looked_in, read, spend, "
+            "written\n"
+        )
 
     def is_small(self, node: nodes.Node) -> bool:
         """Return whether it is known of an expression that its value costs nothing to read."""
@@ -464,7 +525,11 @@ class Sandbox(ImmutableSandboxedEnvironment):
         spend(size)
         if name in _PADDING:
             spend(size * sum(map(_extent, given)))
-        elif name == "replace" and len(given) > 1 and all(isinstance(text, str) for text in given[:2]):
+        elif (
+            name == "replace"
+            and len(given) > 1
+            and all(isinstance(text, str) for text in given[:2])
+        ):
             _replaced(owner, given[0], given[1])
         elif name == "join" and given:
             items = list(_one_by_one(given[0]))

@@ -9,8 +9,9 @@ from typing import Any
 from harness import __version__
 from harness.core.kept import code_sha256
 
-# Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins their results
-# and asks for a new version when one moves. Work that was stopped under another version is not resumed.
+# Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins
+# their results and asks for a new version when one moves. Work that was stopped under another
+# version is not resumed.
 PARSER, DECISIONS = 2, 1
 FIGURES = 2  # of what summary.csv has of decisions and answers; runs that state none are of 1
 PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
@@ -20,12 +21,17 @@ _version = cache(metadata.version)
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
-    """Return the versions of the harness, Python, the platform and those packages that are installed."""
+    """Return the versions of the harness, Python,
+    the platform and those packages that are installed.
+    """
     installed = {
-        "harness": __version__, "parser": str(PARSER), "decisions": str(DECISIONS),
+        "harness": __version__,
+        "parser": str(PARSER),
+        "decisions": str(DECISIONS),
         "figures": str(FIGURES),
-        "python": platform.python_version(), "platform": platform.platform(),
-    }  # fmt: skip
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
     for name in packages:
         try:
             installed[name] = _version(name)
@@ -36,8 +42,12 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
 
 @cache
 def node_versions() -> dict[str, str]:
-    """Return the versions that must agree on all nodes of one job, with a digest of the harness's source."""
-    required: dict[str, str] = versions((*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow"))
+    """Return the versions that must agree on all nodes of one job,
+    with a digest of the harness's source.
+    """
+    required: dict[str, str] = versions(
+        (*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow")
+    )
     del required["platform"]  # it names the kernel, which may differ
     return {**required, "source of harness": code_sha256("**/*.py")[:12]}
 

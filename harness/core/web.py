@@ -19,14 +19,16 @@ LOOPBACK = "127.0.0.1"
 BACKLOG = 512  # connections that wait to be taken
 NAMES = (LOOPBACK, "localhost", "::1")  # of this machine, as who is on it writes them
 HEAD_S = 10.0  # within which a request's head, its line and headers, must have come
-WAITING = 64  # connections on which a head is waited for; of more, the one that took longest is closed
+# connections on which a head is waited for; of more, the one that took longest is closed
+WAITING = 64
 
 
 class HeadInTime(H11Protocol):
     """HTTP that closes a connection on which a request's head takes longer than `HEAD_S`.
 
-    uvicorn waits for a head for ever, however slowly it drips. Between requests its own, shorter time holds.
-    Who sends no head takes nobody's place: no more than `WAITING` connections wait for one.
+    uvicorn waits for a head for ever, however slowly it drips. Between requests its own, shorter
+    time holds. Who sends no head takes nobody's place: no more than `WAITING` connections wait for
+    one.
     """
 
     _late: asyncio.TimerHandle | None = None
@@ -51,7 +53,9 @@ class HeadInTime(H11Protocol):
             self._relax()
         elif self._late is None:
             self._late = self.loop.call_later(HEAD_S, self.transport.close)
-            waiting = [each for each in self.connections if isinstance(each, HeadInTime) and each._late]
+            waiting = [
+                each for each in self.connections if isinstance(each, HeadInTime) and each._late
+            ]
             if len(waiting) > WAITING:
                 oldest = min(waiting, key=HeadInTime._closes_at)
                 oldest._relax()  # it is chosen once
@@ -77,13 +81,23 @@ def is_loopback(host: str) -> bool:
 def server_of(app: ASGIApp, **limits: Any) -> uvicorn.Server:
     """Return the server of an application, with further settings of uvicorn."""
     config = uvicorn.Config(
-        app, log_level="critical", access_log=False, lifespan="off", ws="none", proxy_headers=False,
-        server_header=False, timeout_graceful_shutdown=1, http=HeadInTime, **limits,
-    )  # fmt: skip
+        app,
+        log_level="critical",
+        access_log=False,
+        lifespan="off",
+        ws="none",
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        http=HeadInTime,
+        **limits,
+    )
     return uvicorn.Server(config)
 
 
-def serve(app: ASGIApp, host: str, port: int, listening: Callable[[str], None], **limits: Any) -> None:
+def serve(
+    app: ASGIApp, host: str, port: int, listening: Callable[[str], None], **limits: Any
+) -> None:
     """Serve until Ctrl-C.
 
     Args:
@@ -96,9 +110,13 @@ def serve(app: ASGIApp, host: str, port: int, listening: Callable[[str], None], 
     Raises:
         UserError: the address or the port is not available.
     """
-    unknown = f"--host {printable(host)} is no address of this machine; give one, such as {LOOPBACK}"
+    unknown = (
+        f"--host {printable(host)} is no address of this machine; give one, such as {LOOPBACK}"
+    )
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
     except (OSError, UnicodeError):
         raise UserError(unknown) from None
     # Without its protocol asyncio would not send at once, and each answer would take 40 ms longer.
@@ -110,7 +128,11 @@ def serve(app: ASGIApp, host: str, port: int, listening: Callable[[str], None], 
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise UserError(unknown) from None
-            what = "is in use" if error.errno == errno.EADDRINUSE else f"is not available ({error.strerror})"
+            what = (
+                "is in use"
+                if error.errno == errno.EADDRINUSE
+                else f"is not available ({error.strerror})"
+            )
             raise UserError(f"--port {port} {what}; give another, or 0 for a free one") from None
         name = f"[{host}]" if ":" in host else host
         listening(f"http://{name}:{listener.getsockname()[1]}")

@@ -1,7 +1,8 @@
 """The working folder of a command, from which the same command resumes after it was stopped.
 
-It is the folder `.work` inside the output folder. Its `config.json` holds the settings that the work began
-with; without that file there is nothing to resume. A lock keeps the folder to one process at a time.
+It is the folder `.work` inside the output folder. Its `config.json` holds the settings that the
+work began with; without that file there is nothing to resume. A lock keeps the folder to one
+process at a time.
 """
 
 import os
@@ -39,7 +40,8 @@ Kind = TypeVar("Kind", bound=WorkStart)
 
 
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
-    """Read what the unfinished work in a folder began with; None if the folder is new, empty or `idle`.
+    """Read what the unfinished work in a folder began with;
+    None if the folder is new, empty or `idle`.
 
     Raises UserError if the file is damaged, or the folder holds something else.
     """
@@ -51,7 +53,8 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
         occupied = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
-            f"{printable(file)} is damaged ({printable(error)}); delete --out {shown} and start again"
+            f"{printable(file)} is damaged ({printable(error)}); delete --out {shown} and start "
+            "again"
         ) from None
     if occupied or (out.exists() and not out.is_dir()):
         what = "a folder with other files in it" if occupied else "no folder"
@@ -60,7 +63,9 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
 
 
 def unanswered(out: Path) -> str | None:
-    """Return why the work in a folder, or in one of its runs, stopped if its model could not be asked."""
+    """Return why the work in a folder, or in one of its runs,
+    stopped if its model could not be asked.
+    """
     for place in (out, *([] if (out / "run.json").is_file() else sorted(out.glob("*/")))):
         with suppress(OSError, ValueError, UserError):
             return printable(text_of(place / WORK / UNANSWERED), MOST_WORDS)
@@ -83,16 +88,23 @@ def _nothing_done(work: Path) -> bool:
 
 
 def same(
-    out: Path, now: Mapping[str, Any], stored: Mapping[str, Any], typed: Callable[[], str] = lambda: ""
+    out: Path,
+    now: Mapping[str, Any],
+    stored: Mapping[str, Any],
+    typed: Callable[[], str] = lambda: "",
 ) -> None:
     """Raise UserError, naming what differs and what it was, unless work began with these settings.
 
-    `typed` says what it began with, and what was typed now; it is empty where nobody typed what differs.
+    `typed` says what it began with, and what was typed now;
+    it is empty where nobody typed what differs.
     """
-    now = msgspec.json.decode(msgspec.json.encode(now))  # turns tuples into lists, as they are stored
+    # turns tuples into lists, as they are stored
+    now = msgspec.json.decode(msgspec.json.encode(now))
     if differing := [key for key in {**now, **stored} if now.get(key) != stored.get(key)]:
         before = {key: stored.get(key) for key in differing}
-        words = {key: str(value) for key, value in before.items() if isinstance(value, str | int | float)}
+        words = {
+            key: str(value) for key, value in before.items() if isinstance(value, str | int | float)
+        }
         short = ", ".join(f"{key} {value}" for key, value in words.items() if len(value) <= SHORT)
         what = typed() or f"another {', '.join(differing)}"
         repeated = f" ({short})" if short and what.startswith("another ") else ""
@@ -115,9 +127,10 @@ def held(out: Path) -> bool:
 def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Path]:
     """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
 
-    If a UserError or OSError ends the work before anything is done, the folders created here are deleted; but
-    if the model could not be asked, the folder keeps why (`unanswered`). Finished work writes the file `last`
-    of `out` at the end: if another process has finished since this one looked, this raises UserError.
+    If a UserError or OSError ends the work before anything is done, the folders created here are
+    deleted; but if the model could not be asked, the folder keeps why (`unanswered`). Finished work
+    writes the file `last` of `out` at the end: if another process has finished since this one
+    looked, this raises UserError.
     """
     work, created = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     try:
@@ -131,7 +144,8 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
         ) from None
     try:
         with alone(work / LOCK, GONE_S), going_on(out):
-            earlier = begun(out, type(begin))  # another process may have begun since this one looked
+            # another process may have begun since this one looked
+            earlier = begun(out, type(begin))
             if earlier is None:
                 for path in work.iterdir():
                     if path.name != LOCK:
@@ -146,7 +160,9 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
                 write_whole(work / UNANSWERED, str(error))
                 raise
     except BlockingIOError:
-        raise UserError(f"--out {printable(out)} is being written by another process; wait for it") from None
+        raise UserError(
+            f"--out {printable(out)} is being written by another process; wait for it"
+        ) from None
     except (UserError, OSError):
         with suppress(OSError):  # another process may be working in one of them by now
             if _nothing_done(work) and not (work / UNANSWERED).exists():
@@ -167,7 +183,9 @@ def going_on(out: Path) -> Iterator[None]:
 
 
 def tidy(out: Path) -> None:
-    """Delete the working folder, and temporary files that killed processes left in the output folder."""
+    """Delete the working folder, and temporary files that killed processes left in the output
+    folder.
+    """
     with suppress(OSError):  # first, so that nothing resumes from a half-deleted folder
         os.unlink(out / WORK / CONFIG)
     shutil.rmtree(out / WORK, ignore_errors=True)

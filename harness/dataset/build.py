@@ -1,8 +1,9 @@
-"""Build a dataset, for `harness dataset build`: freeze layouts in any number of processes, and resume.
+"""Build a dataset, for `harness dataset build`:
+freeze layouts in any number of processes, and resume.
 
-Layouts are frozen some at a time. Each finished one is a file under `.work/`; when all are finished, they
-become one `layouts.zip`. Its content depends only on the scenario, the seed, the number of episodes and the
-folder's name.
+Layouts are frozen some at a time. Each finished one is a file under `.work/`; when all are
+finished, they become one `layouts.zip`. Its content depends only on the scenario, the seed, the
+number of episodes and the folder's name.
 """
 
 import json
@@ -62,7 +63,12 @@ class Audit(Protocol):
         ...
 
     def found(
-        self, scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers
+        self,
+        scenario: Scenario,
+        layouts: int,
+        seed: int,
+        progress: Callable[[int], None],
+        workers: Workers,
     ) -> str:
         """Return what the card says of the layout seeds `seed` to `seed + layouts - 1`."""
         ...
@@ -72,19 +78,26 @@ AUDITS = Plugins[Audit]("swarmdrive.audits", Audit, {})  # those that extensions
 
 
 def build(
-    scenario: Scenario, out: Path, episodes: int, seed: int, workers: Workers,
-    progress: Callable[[int], None], audits: bool = True, more: Callable[[int], None] = lambda count: None,
+    scenario: Scenario,
+    out: Path,
+    episodes: int,
+    seed: int,
+    workers: Workers,
+    progress: Callable[[int], None],
+    audits: bool = True,
+    more: Callable[[int], None] = lambda count: None,
     shard: Shard | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
-    Episode e has layout seed `seed + e`, and the folder's name is the dataset's. `audits` says whether the
-    layouts are audited for tells, if there are `LEAST_AUDITED` or more; `more` is called with their number
-    before that, `progress` with the number of layouts just finished or audited.
+    Episode e has layout seed `seed + e`, and the folder's name is the dataset's. `audits` says
+    whether the layouts are audited for tells, if there are `LEAST_AUDITED` or more; `more` is
+    called with their number before that, `progress` with the number of layouts just finished or
+    audited.
 
-    Returns the manifest; for a shard the settings that it begins with. Raises UserError if the folder holds
-    a finished dataset, one begun with other settings, or something else; the seeds are for several purposes;
-    or the audit needs a package that is missing.
+    Returns the manifest; for a shard the settings that it begins with. Raises UserError if the
+    folder holds a finished dataset, one begun with other settings, or something else; the seeds are
+    for several purposes; or the audit needs a package that is missing.
     """
     refuse_agents(scenario, "a dataset")
     # An environment states no danger.
@@ -107,13 +120,15 @@ def build(
     }
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
-            f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or '-', "
+            f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or "
+            "'-', "
             "a letter or digit first"
         )
     if (out / "manifest.json").exists():
         if not (out / WORK).is_dir():
             raise UserError(
-                f"--out {printable(out)} already holds a finished dataset; choose another folder or delete it"
+                f"--out {printable(out)} already holds a finished dataset; choose another folder "
+                "or delete it"
             )
         # A build was stopped while it tidied up.
         finished: dict[str, Any] = msgspec.to_builtins(read_manifest(out)[0])
@@ -136,13 +151,18 @@ def build(
 
 
 def merge(
-    folders: Sequence[Path], out: Path, workers: Workers, progress: Callable[[int], None],
-    audits: bool = True, more: Callable[[int], None] = lambda count: None,
-) -> dict[str, Any]:  # fmt: skip
-    """Combine the shards of a dataset into the one that `build` makes without shards, byte for byte.
+    folders: Sequence[Path],
+    out: Path,
+    workers: Workers,
+    progress: Callable[[int], None],
+    audits: bool = True,
+    more: Callable[[int], None] = lambda count: None,
+) -> dict[str, Any]:
+    """Combine the shards of a dataset into the one that `build` makes without shards,
+    byte for byte.
 
-    Raises UserError as `build`, or if the folders are not all the shards of one build, a shard is unfinished,
-    or two hold different bytes for the same layout.
+    Raises UserError as `build`, or if the folders are not all the shards of one build, a shard is
+    unfinished, or two hold different bytes for the same layout.
     """
     begun = shards.read(folders, work.WorkStart)
     config = begun[0].settings
@@ -159,9 +179,13 @@ def merge(
 
 
 def _freeze_missing(
-    scenario: Scenario, place: Path, seed: int, episodes: Sequence[int], workers: Workers,
+    scenario: Scenario,
+    place: Path,
+    seed: int,
+    episodes: Sequence[int],
+    workers: Workers,
     progress: Callable[[int], None],
-) -> None:  # fmt: skip
+) -> None:
     todo = [e for e in episodes if not (place / part_of(e)).is_file()]
     progress(len(episodes) - len(todo))
     size = TOGETHER
@@ -174,13 +198,25 @@ def _freeze_missing(
             write_whole(place / part_of(episode), data)
             progress(1)
 
-    each(partial(_freeze_layouts, scenario, seed), chunks, workers, keep, lambda chunk: _named(*chunk))
+    each(
+        partial(_freeze_layouts, scenario, seed),
+        chunks,
+        workers,
+        keep,
+        lambda chunk: _named(*chunk),
+    )
 
 
 def _write_dataset(
-    scenario: Scenario, out: Path, place: Path, config: dict[str, Any], workers: Workers,
-    progress: Callable[[int], None], audits: bool, more: Callable[[int], None],
-) -> dict[str, Any]:  # fmt: skip
+    scenario: Scenario,
+    out: Path,
+    place: Path,
+    config: dict[str, Any],
+    workers: Workers,
+    progress: Callable[[int], None],
+    audits: bool,
+    more: Callable[[int], None],
+) -> dict[str, Any]:
     episodes, seed = config["episodes"], config["seed"]
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
@@ -221,7 +257,9 @@ def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> l
         ]
         for line in b"".join(texts).splitlines():  # a record that breaks its own form is a bug
             msgspec.json.decode(line, type=record_type(scenario))
-        tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts)))
+        tree = Tree(
+            episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts))
+        )
         data = BytesIO()
         with ZipFile(data, "w") as file:
             file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
@@ -236,11 +274,16 @@ def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> l
 
 
 def _check(scenario: Scenario, trees: Sequence[Tree]) -> None:
-    """Drive layouts in closed loop; a reference driver that ends otherwise than in the tree is a bug."""
+    """Drive layouts in closed loop; a reference driver that ends otherwise than in the tree is a
+    bug.
+    """
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
     driven = drive_all(scenario, forest.seeds.tolist())
     for driver in DRIVERS:
-        last, success = forest.last_edge(forest.drivers[driver]).tolist(), forest.driver_success(driver)
+        last, success = (
+            forest.last_edge(forest.drivers[driver]).tolist(),
+            forest.driver_success(driver),
+        )
         for n, outcomes in enumerate(driven):
             end, outcome = forest.end(last[n]), outcomes[driver]
             in_tree = bool(success[n]), end.time_s, end.partner, end.fault
@@ -292,10 +335,13 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
 
 
-def _readme(name: str, command: str, config: dict[str, Any], forest: Forest, audited: Sequence[str]) -> str:
+def _readme(
+    name: str, command: str, config: dict[str, Any], forest: Forest, audited: Sequence[str]
+) -> str:
     seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
     drivers = "\n".join(
-        f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |" for driver in forest.drivers
+        f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |"
+        for driver in forest.drivers
     )
     parameters = config["parameters"]
     audit_text = "\n\n".join(audited) or "Not audited for tells."
@@ -323,4 +369,4 @@ ended as in the trees.
 - `manifest.json`: scenario parameters, versions, the sha256 of every file and tree; a tree pins its scenes.
 
 `harness dataset check` verifies all of it, `harness dataset rank` drives the reference drivers again.
-"""
+"""  # noqa: E501

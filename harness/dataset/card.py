@@ -1,7 +1,7 @@
 """Describe published datasets: a card with metadata for hubs, and a Croissant file for programs.
 
-The card is Markdown after YAML (as the Hugging Face hub reads it), the other file JSON-LD (MLCommons
-Croissant 1.0).
+The card is Markdown after YAML (as the Hugging Face hub reads it),
+the other file JSON-LD (MLCommons Croissant 1.0).
 """
 
 import json
@@ -21,11 +21,19 @@ from harness.dataset.schema import Manifest
 README, CROISSANT = "README.md", "croissant.json"
 # How trainers name the parts of a dataset, by what its layout seeds are for.
 SPLITS: dict[Purpose, str] = {"tune": "validation", "train": "train", "report": "test"}
-TAGS = ("autonomous-driving", "cooperative-driving", "v2v", "decision-trees", "simulation", "benchmark")
+TAGS = (
+    "autonomous-driving",
+    "cooperative-driving",
+    "v2v",
+    "decision-trees",
+    "simulation",
+    "benchmark",
+)
 PAPER = "https://arxiv.org/abs/2604.22852"
 UNSTATED = "Not stated: whoever built the dataset decides. Write it here and above."
 LICENCE = "https://www.apache.org/licenses/LICENSE-2.0"
-SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000)  # rows at which the hub's sizes end
+# rows at which the hub's sizes end
+SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000)
 KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool": "sc:Boolean"}
 
 
@@ -67,7 +75,9 @@ def path_of(name: str) -> str:
 
 
 def readme(name: str, tables: Sequence[Table]) -> str:
-    """Return the card. Texts of a manifest stand in it quoted, so none of them adds a key or a heading."""
+    """Return the card. Texts of a manifest stand in it quoted,
+    so none of them adds a key or a heading.
+    """
     released = all(t.released for t in tables)
     head = {
         "license": "apache-2.0" if released else "unknown",
@@ -77,7 +87,8 @@ def readme(name: str, tables: Sequence[Table]) -> str:
         "tags": [*TAGS, "croissant"],
         "size_categories": [hub_size(sum(t.rows for t in tables))],
         "configs": [
-            {"config_name": t.name, "data_files": [{"split": t.split, "path": t.path}]} for t in tables
+            {"config_name": t.name, "data_files": [{"split": t.split, "path": t.path}]}
+            for t in tables
         ],
     }
     return _CARD.format(
@@ -88,7 +99,13 @@ def readme(name: str, tables: Sequence[Table]) -> str:
         size=_megabytes(*tables),
         tables=_lines(
             _row(
-                f"`{t.name}`", _code(t.title), t.manifest.episodes, t.rows, t.layouts, t.split, _megabytes(t),
+                f"`{t.name}`",
+                _code(t.title),
+                t.manifest.episodes,
+                t.rows,
+                t.layouts,
+                t.split,
+                _megabytes(t),
                 _code(t.prompt),
             )
             for t in tables
@@ -100,7 +117,7 @@ def readme(name: str, tables: Sequence[Table]) -> str:
         version=__version__,
         paper=PAPER,
         sources=_lines(f"- `{t.name}`, manifest sha256 `{t.dataset_sha256}`" for t in tables),
-    )  # fmt: skip
+    )
 
 
 def limits(tables: Sequence[Table]) -> Iterator[str]:
@@ -108,46 +125,58 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
     splits = {t.split for t in tables}
     if SPLITS["report"] in splits:
         yield (
-            "Rows of the split `test` are of report seeds, which results are quoted on. A model that has "
+            "Rows of the split `test` are of report seeds, which results are quoted on. A model "
+            "that has "
             "learnt from them cannot be measured on them any more."
         )
     if splits - {SPLITS["report"]}:
-        yield "Rows of other splits than `test` are for tuning and training; quote no result on them."
+        yield (
+            "Rows of other splits than `test` are for tuning and training; quote no result on them."
+        )
     yield (
-        "Rows of a layout are not independent: count layouts, not rows, as n, and keep a layout on one side "
+        "Rows of a layout are not independent: count layouts, not rows, as n, and keep a layout on "
+        "one side "
         "of any split. `layout_seed` says which rows belong together."
     )
     yield (
-        "A table holds every course, also such as no driver would take. A mean over rows is no success rate: "
+        "A table holds every course, also such as no driver would take. A mean over rows is no "
+        "success rate: "
         "for that, walk from `step` 0 along `next_scene`."
     )
     yield (
-        "`danger_sector`, `danger_vehicle`, `safe` to `drivers` and `state` say what no car knows. A model "
+        "`danger_sector`, `danger_vehicle`, `safe` to `drivers` and `state` say what no car knows. "
+        "A model "
         "that reads them is told the answer."
     )
     yield (
-        "`prompt` asks the ego alone. What helpers say, and which of it a radio delivers, the harness "
+        "`prompt` asks the ego alone. What helpers say, and which of it a radio delivers, the "
+        "harness "
         "simulates; no table has it."
     )
     lags = " or ".join(dict.fromkeys(f"{1000 * t.lag_s:.0f}" for t in tables))
     yield (
-        f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do not say "
+        f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do "
+        "not say "
         "what becomes of a slower model."
     )
     yield (
-        "Scenes, traffic and drivers are of one simulator, and texts are English: nothing here shows that a "
+        "Scenes, traffic and drivers are of one simulator, and texts are English: nothing here "
+        "shows that a "
         "model is safe on a road."
     )
 
 
 def croissant(name: str, tables: Sequence[Table]) -> str:
-    """Return the Croissant file: each Parquet file with its digest, and each column with its meaning."""
+    """Return the Croissant file: each Parquet file with its digest,
+    and each column with its meaning.
+    """
     document = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": name,
-        "description": "Decisions in cooperative driving, with the exact safety and value of every action.",
+        "description": "Decisions in cooperative driving, with the "
+        "exact safety and value of every action.",
         "url": PAPER,
         "citeAs": PAPER,
         "isLiveDataset": False,
@@ -155,21 +184,27 @@ def croissant(name: str, tables: Sequence[Table]) -> str:
         "rai:dataLimitations": list(limits(tables)),
         "distribution": [
             {
-                "@type": "cr:FileObject", "@id": t.path, "name": t.name,
-                "contentUrl": t.path, "contentSize": f"{t.bytes} B",
-                "encodingFormat": "application/x-parquet", "sha256": t.sha256,
+                "@type": "cr:FileObject",
+                "@id": t.path,
+                "name": t.name,
+                "contentUrl": t.path,
+                "contentSize": f"{t.bytes} B",
+                "encodingFormat": "application/x-parquet",
+                "sha256": t.sha256,
             }
             for t in tables
         ],
         "recordSet": [
             {
-                "@type": "cr:RecordSet", "@id": t.name, "name": t.name,
+                "@type": "cr:RecordSet",
+                "@id": t.name,
+                "name": t.name,
                 "description": f"{t.rows} decision points, {t.layouts}",
                 "field": [_field(t, column) for column in COLUMNS],
             }
             for t in tables
         ],
-    }  # fmt: skip
+    }
     if all(t.released for t in tables):
         document["license"] = LICENCE
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
@@ -179,22 +214,29 @@ def _field(table: Table, column: Column) -> dict[str, Any]:
     listed = pa.types.is_list(column.kind)
     inner = column.kind.value_type if listed else column.kind
     field: dict[str, Any] = {
-        "@type": "cr:Field", "@id": f"{table.name}/{column.name}", "name": column.name,
+        "@type": "cr:Field",
+        "@id": f"{table.name}/{column.name}",
+        "name": column.name,
         "description": column.meaning,
         "source": {"fileObject": {"@id": table.path}, "extract": {"column": column.name}},
-    }  # fmt: skip
+    }
     if listed:
         field["repeated"] = True
     if not pa.types.is_struct(inner):
         return {**field, "dataType": KINDS[str(inner)]}
-    return {**field, "subField": [
-        {
-            "@type": "cr:Field", "@id": f"{field['@id']}/{part.name}", "name": part.name,
-            "dataType": KINDS[str(part.type)],
-            "source": {**field["source"], "transform": {"jsonPath": part.name}},
-        }
-        for part in inner
-    ]}  # fmt: skip
+    return {
+        **field,
+        "subField": [
+            {
+                "@type": "cr:Field",
+                "@id": f"{field['@id']}/{part.name}",
+                "name": part.name,
+                "dataType": KINDS[str(part.type)],
+                "source": {**field["source"], "transform": {"jsonPath": part.name}},
+            }
+            for part in inner
+        ],
+    }
 
 
 def _references(tables: Sequence[Table]) -> Iterator[str]:
@@ -283,14 +325,36 @@ The scenes are simulated: no recording of a real road, vehicle or person is in t
 export` of SwarmDrive Harness {version} wrote this folder, after the [SwarmDrive paper]({paper}), from:
 
 {sources}
-"""
+"""  # noqa: E501
 
 _WORDS = (
-    "citeAs", "column", "equivalentProperty", "extract", "field", "fileObject",
-    "fileProperty", "fileSet", "format", "includes", "isLiveDataset", "jsonPath", "key",
-    "md5", "parentField", "path", "recordSet", "references", "regex", "repeated",
-    "replace", "samplingRate", "separator", "source", "subField", "transform",
-)  # fmt: skip
+    "citeAs",
+    "column",
+    "equivalentProperty",
+    "extract",
+    "field",
+    "fileObject",
+    "fileProperty",
+    "fileSet",
+    "format",
+    "includes",
+    "isLiveDataset",
+    "jsonPath",
+    "key",
+    "md5",
+    "parentField",
+    "path",
+    "recordSet",
+    "references",
+    "regex",
+    "repeated",
+    "replace",
+    "samplingRate",
+    "separator",
+    "source",
+    "subField",
+    "transform",
+)
 _CONTEXT = {
     "@language": "en",
     "@vocab": "https://schema.org/",

@@ -1,16 +1,18 @@
-"""Hold the decision trees of a dataset as arrays: where each action leads, its worth, and how a walk ends.
+"""Hold the decision trees of a dataset as arrays:
+where each action leads, its worth, and how a walk ends.
 
-The rule: an episode succeeds if the ego reaches its goal no later than an allowance after the full-view
-driver of the same layout, which decides as often and with the same lag (`Parameters.allowance_s`). A pass
-from the leaves backwards gives, exactly, the earliest time at which the goal can still be reached after each
-action. An action is *safe* if that is early enough for success. A decision that is not safe, though a safe
-one was possible, has *lost* the episode: its regret is 1. A safe decision costs the *delay* in seconds by
-which the earliest time grows.
+The rule: an episode succeeds if the ego reaches its goal no later than an allowance after the
+full-view driver of the same layout, which decides as often and with the same lag
+(`Parameters.allowance_s`). A pass from the leaves backwards gives, exactly, the earliest time at
+which the goal can still be reached after each action. An action is *safe* if that is early enough
+for success. A decision that is not safe, though a safe one was possible, has *lost* the episode:
+its regret is 1. A safe decision costs the *delay* in seconds by which the earliest time grows.
 
-A second pass says after which actions harm, a collision or leaving the road, can still be avoided. A decision
-after which it cannot, though it could be before, is a *miss*. A decision that has lost the episode to time
-alone, since harm can be avoided after it, is a *false alarm*. An episode has at most one of each: one that
-ends in harm has a miss, one that ends late or stuck a false alarm, unless that was inevitable from the start.
+A second pass says after which actions harm, a collision or leaving the road, can still be avoided.
+A decision after which it cannot, though it could be before, is a *miss*. A decision that has lost
+the episode to time alone, since harm can be avoided after it, is a *false alarm*. An episode has at
+most one of each: one that ends in harm has a miss, one that ends late or stuck a false alarm,
+unless that was inevitable from the start.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,14 +32,17 @@ from harness.world.parameters import Parameters
 
 @dataclass(frozen=True)
 class Forest:
-    """E trees with N decision points and A actions; within a tree, decision points are ordered by level."""
+    """E trees with N decision points and A actions;
+    within a tree, decision points are ordered by level.
+    """
 
     actions: tuple[str, ...]  # the meta-actions
     allowance_s: Floats  # needless delay that an episode of each tree may have, (E,)
     time_limit_s: float  # when every episode ends
     episodes: Ints  # the episode's number of each tree, (E,)
     seeds: Ints  # the layout seed of each tree, (E,)
-    dangers: tuple[str | None, ...]  # the sector from which each tree's danger comes; None without one
+    # the sector from which each tree's danger comes; None without one
+    dangers: tuple[str | None, ...]
     root: Ints  # the first decision point of each tree, (E,)
     ids: tuple[str, ...]  # the ids of the decision points
     tree: Ints  # the tree of each decision point, (N,)
@@ -48,7 +53,9 @@ class Forest:
     drivers: Mapping[str, Ints]  # the index of each reference driver's action, (N,)
 
     @classmethod
-    def of(cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters) -> "Forest":
+    def of(
+        cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters
+    ) -> "Forest":
         action_index = {action: n for n, action in enumerate(actions)}
         starts, total = [], 0  # the first index of each level of each tree
         for tree in trees:
@@ -58,9 +65,11 @@ class Forest:
         edges: list[Edge] = []
         points = [point for tree in trees for level in tree.levels for point in level]
         following = [
-            start for tree, tree_starts in zip(trees, starts, strict=True)
-            for level, start in zip(tree.levels, tree_starts[1:], strict=True) for _ in level
-        ]  # fmt: skip
+            start
+            for tree, tree_starts in zip(trees, starts, strict=True)
+            for level, start in zip(tree.levels, tree_starts[1:], strict=True)
+            for _ in level
+        ]
         for point, start in zip(points, following, strict=True):
             taken, leads = [-1] * len(actions), [-1] * len(actions)
             for branch in point.edges:
@@ -72,15 +81,24 @@ class Forest:
             child.append(leads)
         sizes = [list(map(len, tree.levels)) for tree in trees]
         return cls(
-            actions, np.array([parameters.allowance_s(t.danger.sector) for t in trees]),
-            parameters.time_limit_s, np.array([t.episode for t in trees]),
-            np.array([t.episode_seed for t in trees]), tuple(t.danger.sector for t in trees),
-            np.array([tree_starts[0] for tree_starts in starts]), tuple(point.scene for point in points),
+            actions,
+            np.array([parameters.allowance_s(t.danger.sector) for t in trees]),
+            parameters.time_limit_s,
+            np.array([t.episode for t in trees]),
+            np.array([t.episode_seed for t in trees]),
+            tuple(t.danger.sector for t in trees),
+            np.array([tree_starts[0] for tree_starts in starts]),
+            tuple(point.scene for point in points),
             np.repeat(np.arange(len(trees)), list(map(sum, sizes))),
             np.concatenate([np.repeat(np.arange(len(s)), s) for s in sizes]),
-            np.array(child), np.array(edge), tuple(edges),
-            {name: np.array([action_index[p.drivers[name]] for p in points]) for name in points[0].drivers},
-        )  # fmt: skip
+            np.array(child),
+            np.array(edge),
+            tuple(edges),
+            {
+                name: np.array([action_index[p.drivers[name]] for p in points])
+                for name in points[0].drivers
+            },
+        )
 
     @cached_property
     def place(self) -> Mapping[str, int]:
@@ -90,7 +108,10 @@ class Forest:
     def cleared_s(self) -> Floats:
         """When each edge reaches the goal, (edges,); inf if it ends otherwise or leads on."""
         return np.array(
-            [edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf for edge in self.edges]
+            [
+                edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf
+                for edge in self.edges
+            ]
         )
 
     @cached_property
@@ -102,17 +123,23 @@ class Forest:
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
-        """How near others come to the ego in time on each edge, (edges,), as columns of decisions."""
+        """How near others come to the ego in time on each edge, (edges,),
+        as columns of decisions.
+        """
 
         def known(measure_s: float | UnsetType | None) -> float:
             return np.nan if measure_s is UNSET else np.inf if measure_s is None else measure_s
 
-        ttc_s, pet_s = zip(*((known(edge.ttc_s), known(edge.pet_s)) for edge in self.edges), strict=True)
+        ttc_s, pet_s = zip(
+            *((known(edge.ttc_s), known(edge.pet_s)) for edge in self.edges), strict=True
+        )
         return columns(np.array(ttc_s), np.array(pet_s))
 
     @cached_property
     def earliest_s(self) -> Floats:
-        """The earliest time at which the goal can be reached after each action, (N, A); inf for never."""
+        """The earliest time at which the goal can be reached after each action, (N, A);
+        inf for never.
+        """
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
             leads = self.child[rows] >= 0
@@ -122,7 +149,9 @@ class Forest:
 
     @cached_property
     def avoids_harm(self) -> Bools:
-        """Whether an end without a collision and on the road is still possible after each action, (N, A)."""
+        """Whether an end without a collision and on the road is still possible after each action,
+        (N, A).
+        """
         avoids = ~self.harms[self.edge]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -136,7 +165,9 @@ class Forest:
 
     @cached_property
     def false_alarm(self) -> Bools:
-        """Whether each action gives success away, though harm can still be avoided after it, (N, A)."""
+        """Whether each action gives success away,
+        though harm can still be avoided after it, (N, A).
+        """
         return np.asarray(self.value[:, None] & ~self.safe & self.avoids_harm)
 
     @cached_property
@@ -149,7 +180,9 @@ class Forest:
         return last
 
     def _levels_backwards(self) -> list[Ints]:
-        return [np.flatnonzero(self.step == step) for step in reversed(range(int(self.step.max()) + 1))]
+        return [
+            np.flatnonzero(self.step == step) for step in reversed(range(int(self.step.max()) + 1))
+        ]
 
     @cached_property
     def reference_s(self) -> Floats:
@@ -168,17 +201,25 @@ class Forest:
 
     @cached_property
     def value(self) -> Bools:
-        """Whether success is possible at each decision point, (N,): whether the best policy succeeds."""
+        """Whether success is possible at each decision point, (N,):
+        whether the best policy succeeds.
+        """
         return np.asarray(self.safe.any(axis=-1))
 
     @cached_property
     def delay_s(self) -> Floats:
-        """The seconds by which a safe action puts off the earliest success, (N, A); NaN if it is not safe."""
+        """The seconds by which a safe action puts off the earliest success, (N, A);
+        NaN if it is not safe.
+        """
         with np.errstate(invalid="ignore"):
-            return np.where(self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan)
+            return np.where(
+                self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan
+            )
 
     def last_edge(self, chosen: Ints) -> Ints:
-        """Return the edge at which each episode ends, (E,), if `chosen` (N,) is taken at each point."""
+        """Return the edge at which each episode ends, (E,),
+        if `chosen` (N,) is taken at each point.
+        """
         at, last = self.root.copy(), np.full(len(self.root), -1)
         while (undecided := at >= 0).any():
             action = chosen[at[undecided]]
@@ -187,7 +228,9 @@ class Forest:
         return last
 
     def visited(self, chosen: Ints) -> Ints:
-        """Return the decision points that the episodes visit, ascending, if `chosen` (N,) is taken."""
+        """Return the decision points that the episodes visit, ascending,
+        if `chosen` (N,) is taken.
+        """
         visited, at = [], self.root
         while len(at):
             visited.append(at)
@@ -217,11 +260,15 @@ class Forest:
         return self._success(np.full(len(self.tree), self.actions.index(action)))
 
     def sequence_success(self, actions: Sequence[str]) -> Bools:
-        """Return whether an ego that takes one action after the other, and then the last, succeeds, (E,)."""
+        """Return whether an ego that takes one action after the other, and then the last,
+        succeeds, (E,).
+        """
         return self._success(self.sequence(actions))
 
     def sequence(self, actions: Sequence[str]) -> Ints:
-        """Return what is taken at each point, (N,): one action after the other, then the last again."""
+        """Return what is taken at each point, (N,):
+        one action after the other, then the last again.
+        """
         indices = np.array([self.actions.index(action) for action in actions])
         return np.asarray(indices[np.minimum(self.step, len(indices) - 1)])
 
@@ -229,19 +276,23 @@ class Forest:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 
     def uniform_success(self) -> Floats:
-        """Return with what probability each episode succeeds, (E,), if every action is equally likely."""
+        """Return with what probability each episode succeeds, (E,),
+        if every action is equally likely.
+        """
         return np.asarray(self.worth[self.root].mean(axis=-1))
 
     @cached_property
     def worth(self) -> Floats:
-        """The `chance` of each action if all later ones are drawn evenly, (N, A); 0 if none saves it."""
+        """The `chance` of each action if all later ones are drawn evenly, (N, A);
+        0 if none saves it.
+        """
         return self.chance(np.ones(self.child.shape))
 
     def chance(self, policy: Floats) -> Floats:
         """Return with what probability an episode succeeds after each action, (N, A).
 
-        What follows is drawn by a policy's weights of the actions at each decision point, (N, A). A pass
-        from the leaves backwards gives that exactly: no action is drawn.
+        What follows is drawn by a policy's weights of the actions at each decision point, (N, A). A
+        pass from the leaves backwards gives that exactly: no action is drawn.
         """
         chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)
         for rows in self._levels_backwards():

@@ -1,9 +1,10 @@
-"""Freeze layouts: compute the decision tree of each, with every course that the ego's decisions can take.
+"""Freeze layouts: compute the decision tree of each,
+with every course that the ego's decisions can take.
 
-From the first decision point on, every meta-action is taken one lag after it, and the decision points that
-follow are frozen. Those in the same state are one, whatever led there, and actions that set the same target
-are one edge. So the tree of six decisions has some hundred decision points, and each of its leaves is
-a decided episode.
+From the first decision point on, every meta-action is taken one lag after it, and the decision
+points that follow are frozen. Those in the same state are one, whatever led there, and actions that
+set the same target are one edge. So the tree of six decisions has some hundred decision points, and
+each of its leaves is a decided episode.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,14 +26,18 @@ from harness.world.world import Target, World
 
 
 class Frozen(NamedTuple):
-    """A layout's decision tree, and the scene of each of its decision points, both level by level."""
+    """A layout's decision tree, and the scene of each of its decision points,
+    both level by level.
+    """
 
     branchings: list[list[Branching]]
     scenes: list[list[Record]]
 
 
 def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
-    """Return the decision trees of some layouts, whose seeds are by episode, in the order of the episodes."""
+    """Return the decision trees of some layouts, whose seeds are by episode,
+    in the order of the episodes.
+    """
     level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
     trees = {episode: Frozen([], []) for episode in seeds}
     facts = dict(scenario.road().facts)
@@ -40,11 +45,16 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
         episodes, worlds = zip(*level, strict=True)
         out_edges, following = edges(worlds, episodes)
         states = [world.state() for world in worlds]
-        records = records_of(scenario, [
-            (world, state, episode, (state.ego, *state.helpers))
-            for world, state, episode in zip(worlds, states, episodes, strict=True)
-        ])  # fmt: skip
-        drivers = _drivers(scenario, states, [record.graphs[record.state.ego.id] for record in records])
+        records = records_of(
+            scenario,
+            [
+                (world, state, episode, (state.ego, *state.helpers))
+                for world, state, episode in zip(worlds, states, episodes, strict=True)
+            ],
+        )
+        drivers = _drivers(
+            scenario, states, [record.graphs[record.state.ego.id] for record in records]
+        )
         for tree in (trees[episode] for episode in dict.fromkeys(episodes)):
             tree.branchings.append([])
             tree.scenes.append([])
@@ -59,7 +69,8 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
 def edges(
     worlds: Sequence[World], episodes: Sequence[int]
 ) -> tuple[list[list[Edge]], list[tuple[int, World]]]:
-    """Return where each action leads from the decision points of a step, and the points that follow.
+    """Return where each action leads from the decision points of a step,
+    and the points that follow.
 
     The points that follow stand beside their episode; edges count those of their own episode.
     """
@@ -76,7 +87,9 @@ def edges(
         [_edge(*part, episode, following[episode]) for part in parts]
         for parts, episode in zip(parts_of_world, episodes, strict=True)
     ]
-    return out_edges, [(episode, world) for episode, of in following.items() for _, world in of.values()]
+    return out_edges, [
+        (episode, world) for episode, of in following.items() for _, world in of.values()
+    ]
 
 
 def _branches(world: World) -> Iterator[tuple[list[str], World]]:
@@ -91,32 +104,47 @@ def _branches(world: World) -> Iterator[tuple[list[str], World]]:
         yield actions, branch
 
 
-def _edge(actions: list[str], branch: World, episode: int, following: dict[str, tuple[int, World]]) -> Edge:
+def _edge(
+    actions: list[str], branch: World, episode: int, following: dict[str, tuple[int, World]]
+) -> Edge:
     outcome, end, child = branch.outcome, None, None
     if outcome.ended:
         assert outcome.time_s is not None
         contact = outcome.partner, outcome.striker, outcome.fault
         end = End(outcome.result, outcome.time_s, *contact)  # type: ignore[arg-type]
     else:
-        # Where several edges lead to one state, the post-encroachment times after it are by the past of the
-        # first. No tree that ships has such edges.
+        # Where several edges lead to one state, the post-encroachment times after it are by the
+        # past of the first. No tree that ships has such edges.
         child, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
     gap_m = round(outcome.least_gap_m, 3)
     conflicts_s = rounded(branch.journey.conflicts.ttc_s), rounded(branch.journey.conflicts.pet_s)
-    return Edge(actions, child, end, gap_m, branch.journey.hard_brakings, outcome.other_crashes, *conflicts_s)
+    return Edge(
+        actions,
+        child,
+        end,
+        gap_m,
+        branch.journey.hard_brakings,
+        outcome.other_crashes,
+        *conflicts_s,
+    )
 
 
 def _drivers(
     scenario: Scenario, states: Sequence[WorldState], seen: Sequence[SceneGraph]
 ) -> list[dict[str, str]]:
-    """Return each reference driver's action at some decision points; `seen` has the ego's scene graphs."""
+    """Return each reference driver's action at some decision points;
+    `seen` has the ego's scene graphs.
+    """
     known = list(zip(seen, truth_graphs(scenario, states), strict=True))
     actions = iter(choices(scenario, [(driver, *graphs) for graphs in known for driver in DRIVERS]))
     return [dict(zip(DRIVERS, actions, strict=False)) for _ in known]
 
 
-def record_of(world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]) -> Record:
-    """Return a decision point's state, and what the viewers see of it; the ego is the first of them.
+def record_of(
+    world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]
+) -> Record:
+    """Return a decision point's state, and what the viewers see of it;
+    the ego is the first of them.
 
     Distances to the conflict zone and to the ego are as the ego knows them.
     """
@@ -137,17 +165,26 @@ def records_of(
 
 
 def _record(
-    world: World, state: WorldState, episode: int, graphs: dict[str, SceneGraph], zone: tuple[float, float]
+    world: World,
+    state: WorldState,
+    episode: int,
+    graphs: dict[str, SceneGraph],
+    zone: tuple[float, float],
 ) -> Record:
     ego_id, *helpers = graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}
     return Record(
-        scene=scene_id(episode, state), episode=episode, episode_seed=world.seed, step=state.step,
-        danger=Danger(world.layout.danger, world.layout.danger_id), state=state, graphs=graphs,
+        scene=scene_id(episode, state),
+        episode=episode,
+        episode_seed=world.seed,
+        step=state.step,
+        danger=Danger(world.layout.danger, world.layout.danger_id),
+        state=state,
+        graphs=graphs,
         distance_m={name: _distance_m(v, *zone) for name, v in known_states.items()},
         range_m={name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in helpers},
-    )  # fmt: skip
+    )
 
 
 def _distance_m(v: VehicleState, x_m: float, y_m: float) -> float:

@@ -75,7 +75,9 @@ class Scene:
         return tuple(self.graphs)
 
     def viewer(self, name: str | None) -> str:
-        """Return a viewer's id, the ego's for None. Raises UserError if nobody of that name answers here."""
+        """Return a viewer's id, the ego's for None.
+        Raises UserError if nobody of that name answers here.
+        """
         if name is not None and name not in self.viewers:
             raise unknown(f"viewer of scene {printable(self.id, 40)}", name, self.viewers)
         return self.viewers[0] if name is None else name
@@ -166,9 +168,13 @@ class Dataset:
     def lost(self) -> int:
         """In how many episodes the ego collides before its first action, whatever that is."""
         lag_s = self.scenario.parameters.decision_lag_s
-        firsts = [[self.forest.edges[n].end for n in edges] for edges in self.forest.edge[self.forest.root]]
+        firsts = [
+            [self.forest.edges[n].end for n in edges]
+            for edges in self.forest.edge[self.forest.root]
+        ]
         return sum(
-            all(end and end.result == "collision" and end.time_s <= lag_s for end in ends) for ends in firsts
+            all(end and end.result == "collision" and end.time_s <= lag_s for end in ends)
+            for ends in firsts
         )
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
@@ -183,9 +189,11 @@ class Dataset:
         return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
 
     def reference_success(self) -> dict[str, Floats]:
-        """Return the success of each reference in each episode, (E,): 0 or 1, of `uniform` its probability.
+        """Return the success of each reference in each episode, (E,):
+        0 or 1, of `uniform` its probability.
 
-        The references are the drivers, `uniform`, and where their actions are known `constant`, `open-loop`.
+        The references are the drivers, `uniform`,
+        and where their actions are known `constant`, `open-loop`.
         """
         parts: dict[str, list[Floats]] = {}
         action, actions = constant(self.scenario), open_loop(self.scenario)
@@ -196,12 +204,16 @@ class Dataset:
             if action in forest.actions:
                 parts.setdefault(CONSTANT, []).append(forest.constant_success(action).astype(float))
             if actions and set(actions) <= set(forest.actions):
-                parts.setdefault(OPEN_LOOP, []).append(forest.sequence_success(actions).astype(float))
+                parts.setdefault(OPEN_LOOP, []).append(
+                    forest.sequence_success(actions).astype(float)
+                )
             parts.setdefault(UNIFORM, []).append(forest.uniform_success())
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
-        """Return decision points' scenes. Raises UserError for a damaged one, KeyError for an unknown id."""
+        """Return decision points' scenes.
+        Raises UserError for a damaged one, KeyError for an unknown id.
+        """
         missing: dict[tuple[int, int], list[int]] = {}  # indices within each level of each tree
         for name in ids:
             if name not in self._scenes:
@@ -225,7 +237,9 @@ class Dataset:
         return True
 
     def _place(self, name: str) -> tuple[int, int, int]:
-        """Return a point's episode, step and index in that level. Raises KeyError for an unknown id."""
+        """Return a point's episode, step and index in that level.
+        Raises KeyError for an unknown id.
+        """
         if match := re.match("([0-9]{5})-([0-9])", name):
             episode, step = map(int, match.groups())
             levels = self.trees.read(episode).levels if episode in self.trees.known else []
@@ -234,7 +248,9 @@ class Dataset:
                     return episode, step, place
         raise KeyError(name)
 
-    def _records(self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]) -> Iterator[Record]:
+    def _records(
+        self, file: ZipFile, tree: Tree, step: int, places: Sequence[int]
+    ) -> Iterator[Record]:
         try:
             lines = read_level(file, tree, step)
         except Damaged as damage:
@@ -257,7 +273,9 @@ class Dataset:
         matches = [name for name in ids if name.startswith(scene_id)] if scene_id else []
         if len(matches) != 1:
             shown = (matches or ids)[:12]
-            raise unknown("scene", scene_id, shown, " … (first dozen)" if len(matches or ids) > 12 else "")
+            raise unknown(
+                "scene", scene_id, shown, " … (first dozen)" if len(matches or ids) > 12 else ""
+            )
         return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
@@ -268,7 +286,9 @@ class Dataset:
 
 
 def find(name: str) -> Path:
-    """Return the folder of a dataset, given by its path, or by its name if it is shipped or the project's."""
+    """Return the folder of a dataset, given by its path,
+    or by its name if it is shipped or the project's.
+    """
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         sayable("dataset", os.path.basename(name))
         return Path(name)
@@ -277,19 +297,23 @@ def find(name: str) -> Path:
         return beside("datasets", name)
     if name in released():
         raise UserError(
-            f"dataset {printable(name)} is not in this installation, which has the newest of each family; "
+            f"dataset {printable(name)} is not in this installation, which has the newest of each "
+            "family; "
             "clone the repository, which has all"
         )
     if os.path.isfile(name):
         raise UserError(
-            f"dataset {printable(name)} is a file; a dataset is a folder that `harness dataset build` makes, "
+            f"dataset {printable(name)} is a file; a dataset is a folder that `harness dataset "
+            "build` makes, "
             "and files of other programs are not read"
         )
     raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 
 
 def argument(path: Path) -> str:
-    """Return what finds a dataset again: its name, else its path, relative if below the current folder."""
+    """Return what finds a dataset again:
+    its name, else its path, relative if below the current folder.
+    """
     try:
         if find(path.name).resolve() == path.resolve():
             return path.name
@@ -300,7 +324,9 @@ def argument(path: Path) -> str:
 
 
 def released() -> dict[str, str]:
-    """Return the digest of each released dataset's manifest by name, from `datasets/released.toml`."""
+    """Return the digest of each released dataset's manifest by name,
+    from `datasets/released.toml`.
+    """
     pins = folder("datasets") / "released.toml"
     return tomllib.loads(text_of(pins)) if pins.is_file() else {}
 
@@ -309,9 +335,9 @@ def released() -> dict[str, str]:
 def load(path: Path, limit: int | None = None) -> Dataset:
     """Read a dataset; with `limit`, only its first episodes.
 
-    Every file and every tree must have the digest in the manifest, and a tree pins its scenes. For a released
-    dataset, whose manifest is pinned, this is enough; the content of any other dataset is checked as well.
-    Raises UserError if a file is missing, changed or broken.
+    Every file and every tree must have the digest in the manifest, and a tree pins its scenes. For
+    a released dataset, whose manifest is pinned, this is enough; the content of any other dataset
+    is checked as well. Raises UserError if a file is missing, changed or broken.
     """
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):
@@ -325,7 +351,9 @@ def load(path: Path, limit: int | None = None) -> Dataset:
 
 @dataclass(frozen=True)
 class _Folder:
-    """Reads an episode's tree from a dataset's folder. Raises UserError if the dataset is damaged."""
+    """Reads an episode's tree from a dataset's folder.
+    Raises UserError if the dataset is damaged.
+    """
 
     path: Path
     manifest: Manifest
@@ -341,7 +369,9 @@ class _Folder:
             return self._kept[number]
         try:
             with opened(self.path) as file:
-                tree = read_tree(file, self.manifest, number, self.trusted or number in self._checked)
+                tree = read_tree(
+                    file, self.manifest, number, self.trusted or number in self._checked
+                )
         except Damaged as damage:
             raise unusable(self.path, str(damage)) from None
         self._checked.add(number)

@@ -1,4 +1,6 @@
-"""Publish datasets in forms that other programs load: Parquet tables, a card and a Croissant file."""
+"""Publish datasets in forms that other programs load:
+Parquet tables, a card and a Croissant file.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -28,9 +30,12 @@ Chat = Callable[[SceneGraph], list[dict[str, str]]]  # what asks a viewer, as me
 
 
 def publish(
-    folders: Sequence[Path], out: Path, ask: Callable[[Scenario], tuple[str, Chat]], progress: Progress,
+    folders: Sequence[Path],
+    out: Path,
+    ask: Callable[[Scenario], tuple[str, Chat]],
+    progress: Progress,
     suite: str | None = None,
-) -> Sequence[Table]:  # fmt: skip
+) -> Sequence[Table]:
     """Write the tables of some datasets, their card and their Croissant file to a new folder.
 
     Equal datasets and prompts give equal bytes, with one version of the harness and of Arrow.
@@ -42,18 +47,21 @@ def publish(
         progress: counts layouts.
         suite: how the datasets together are named; by the first of them if None.
 
-    Raises UserError if the folder is there, the name will not do, two datasets have one name, or one is
-    damaged, and OSError if the folder cannot be written.
+    Raises UserError if the folder is there, the name will not do, two datasets have one name, or
+    one is damaged, and OSError if the folder cannot be written.
     """
     refuse_taken("--out", out)
     manifests = [read_manifest(folder)[0] for folder in folders]
     names = [manifest.name for manifest in manifests]
     if twice := next((name for name in names if names.count(name) > 1), None):
-        raise UserError(f"two datasets are named {printable(twice)}; build one again under another name")
+        raise UserError(
+            f"two datasets are named {printable(twice)}; build one again under another name"
+        )
     name = suite or names[0]
     if not re.fullmatch(FILE_NAME, name):
         raise UserError(
-            f"suite {printable(name)} cannot name what is published; use letters, digits, '.', '_' and '-', "
+            f"suite {printable(name)} cannot name what is published; use letters, digits, '.', '_' "
+            "and '-', "
             "a letter or digit first"
         )
     progress.more(sum(manifest.episodes for manifest in manifests))
@@ -79,9 +87,17 @@ def _table(
             progress(len(layouts.episodes))
     references = {key: rate_interval(success) for key, success in data.reference_success().items()}
     return Table(
-        data.manifest, data.sha256, title(scenario), scenario.parameters.decision_lag_s, data.trusted, prompt,
-        count, sha256_file(file, "rows"), file.stat().st_size, references,
-    )  # fmt: skip
+        data.manifest,
+        data.sha256,
+        title(scenario),
+        scenario.parameters.decision_lag_s,
+        data.trusted,
+        prompt,
+        count,
+        sha256_file(file, "rows"),
+        file.stat().st_size,
+        references,
+    )
 
 
 def _rows(data: Dataset, chat: Chat) -> list[dict[str, Any]]:
@@ -90,34 +106,45 @@ def _rows(data: Dataset, chat: Chat) -> list[dict[str, Any]]:
     ids = [*forest.ids, None]  # -1 leads nowhere
     ends = [edge.end.result if edge.end else None for edge in forest.edges]
     of_trees = zip(
-        forest.safe.tolist(), forest.avoids_harm.tolist(), forest.worth.tolist(),
+        forest.safe.tolist(),
+        forest.avoids_harm.tolist(),
+        forest.worth.tolist(),
         [list(map(known, delays_s)) for delays_s in forest.delay_s.tolist()],
         [[ids[n] for n in child] for child in forest.child.tolist()],
-        [[ends[n] for n in edge] for edge in forest.edge.tolist()], strict=True,
-    )  # fmt: skip
+        [[ends[n] for n in edge] for edge in forest.edge.tolist()],
+        strict=True,
+    )
     keys = ("safe", "avoids_harm", "value", "delay_s", "next_scene", "result")
     chosen = {name: places.tolist() for name, places in forest.drivers.items()}
     actions = list(forest.actions)
     return [
         {
-            **_row(scene, chat), "scenario": data.scenario.name, "actions": actions,
+            **_row(scene, chat),
+            "scenario": data.scenario.name,
+            "actions": actions,
             **dict(zip(keys, of_actions, strict=True)),
             "drivers": _json({name: actions[places[n]] for name, places in chosen.items()}),
         }
         for n, (scene, of_actions) in enumerate(zip(data.scenes(forest.ids), of_trees, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def _row(scene: Scene, chat: Chat) -> dict[str, Any]:
     record, viewers = scene.record, scene.viewers
     return {
-        "scene": scene.id, "layout_seed": record.episode_seed, "episode": record.episode, "step": record.step,
-        "danger_sector": record.danger.sector, "danger_vehicle": record.danger.vehicle,
-        "prompt": chat(scene.graphs[viewers[0]]), "viewers": list(viewers),
+        "scene": scene.id,
+        "layout_seed": record.episode_seed,
+        "episode": record.episode,
+        "step": record.step,
+        "danger_sector": record.danger.sector,
+        "danger_vehicle": record.danger.vehicle,
+        "prompt": chat(scene.graphs[viewers[0]]),
+        "viewers": list(viewers),
         "scene_graphs": [_json(graph) for graph in scene.graphs.values()],
         "distance_m": [record.distance_m.get(viewer) for viewer in viewers],
-        "range_m": [record.range_m.get(viewer) for viewer in viewers], "state": _json(record.state),
-    }  # fmt: skip
+        "range_m": [record.range_m.get(viewer) for viewer in viewers],
+        "state": _json(record.state),
+    }
 
 
 def _json(value: Any) -> str:

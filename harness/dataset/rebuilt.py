@@ -1,11 +1,12 @@
 """Rebuild a few layouts of a dataset from the seeds that it states, so that its purpose is a fact.
 
-A folder can state any seeds, and layouts that numbers are reported of might be called tune layouts. What
-learns from a dataset, or chooses by it, holds it against the simulator first, and against others' scenes.
+A folder can state any seeds, and layouts that numbers are reported of might be called tune layouts.
+What learns from a dataset, or chooses by it, holds it against the simulator first, and against
+others' scenes.
 
-First scenes are held against what their seeds give, in milliseconds each. Whole trees take a second or more,
-so that only a few are built. Which ones follows from the dataset and from the name of this machine: typing
-a command again draws no others, and who made the dataset does not know them.
+First scenes are held against what their seeds give, in milliseconds each. Whole trees take a second
+or more, so that only a few are built. Which ones follows from the dataset and from the name of this
+machine: typing a command again draws no others, and who made the dataset does not know them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -49,19 +50,24 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
         theirs = _starts(other)
         for start in starts.keys() & theirs.keys():
             raise UserError(
-                f"dataset {printable(dataset.path)} has scene {starts[start]}, which is {theirs[start]} of "
-                f"{printable(other.name)}, and numbers are reported of that; build one of other seeds"
+                f"dataset {printable(dataset.path)} has scene {starts[start]}, which is "
+                f"{theirs[start]} of "
+                f"{printable(other.name)}, and numbers are reported of that; build one of other "
+                "seeds"
             )
 
 
 def differences(dataset: Dataset) -> Iterator[str]:
     """Yield which layouts of a dataset are not those of the seeds that it states.
 
-    None where the simulator is not installed. If layouts begin as they should, a few are built whole.
+    None where the simulator is not installed.
+    If layouts begin as they should, a few are built whole.
     """
     if find_spec("highway_env") is None:
         return
-    numbers = _other_starts(dataset, drawn(dataset, BEGUN)) or _other_trees(dataset, drawn(dataset, REBUILT))
+    numbers = _other_starts(dataset, drawn(dataset, BEGUN)) or _other_trees(
+        dataset, drawn(dataset, REBUILT)
+    )
     if numbers:
         from importlib.metadata import version
 
@@ -85,7 +91,11 @@ def _other_starts(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     ids = [forest.ids[root] for root in forest.root.tolist()]
     first = dict(zip(dataset.episodes, ids, strict=True))
     dataset.scenes([first[number] for number in numbers])  # checks their content
-    return [n for n in sorted(numbers) if scene_id(n, World.start(scenario, seed + n).state()) != first[n]]
+    return [
+        n
+        for n in sorted(numbers)
+        if scene_id(n, World.start(scenario, seed + n).state()) != first[n]
+    ]
 
 
 def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
@@ -102,20 +112,26 @@ def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
         if (
             tree.danger != built[0].danger
             or _courses(frozen.branchings, tree) != _courses(tree.levels, tree)
-            or any(_seen(ours) != _seen(scene.record) for ours, scene in zip(built, there, strict=True))
+            or any(
+                _seen(ours) != _seen(scene.record) for ours, scene in zip(built, there, strict=True)
+            )
         ):
             wrong.append(number)
     return wrong
 
 
 def _courses(levels: Sequence[Sequence[Branching]], stated: Tree) -> list[list[object]]:
-    """Return the decision points of a layout by step, what drivers do there, and where each action leads.
+    """Return the decision points of a layout by step, what drivers do there,
+    and where each action leads.
 
     Without what an older dataset, as its tree is stated, does not have of an edge.
     """
     later = {"ttc_s": UNSET, "pet_s": UNSET} if stated.levels[0][0].edges[0].ttc_s is UNSET else {}
     return [
-        [(point.scene, point.drivers, [replace(edge, **later) for edge in point.edges]) for point in of]
+        [
+            (point.scene, point.drivers, [replace(edge, **later) for edge in point.edges])
+            for point in of
+        ]
         for of in levels
     ]
 
@@ -129,18 +145,26 @@ def _reported(scenario: str) -> Iterator[Dataset]:
     """Yield the released datasets of a scenario, all of which are of report seeds."""
     for path in sorted(folder("datasets").glob("*/manifest.json")):
         manifest, sha256 = read_manifest(path.parent)
-        if sha256 in released().values() and manifest.scenario == scenario and manifest.purpose == "report":
+        if (
+            sha256 in released().values()
+            and manifest.scenario == scenario
+            and manifest.purpose == "report"
+        ):
             yield load(path.parent)
 
 
 def _starts(dataset: Dataset) -> dict[str, str]:
-    """Return the ids of all first scenes by the digest of what is there, to 1 cm, whatever the seeds are."""
+    """Return the ids of all first scenes by the digest of what is there, to 1 cm,
+    whatever the seeds are.
+    """
     forest = dataset.forest
     scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
     return {digest([*map(_coarse, scene.state.vehicles)]): scene.id for scene in scenes}
 
 
 def _coarse(vehicle: VehicleState) -> dict[str, object]:
-    """Return a vehicle with its numbers to 0.01, since a difference of a rounding makes no other layout."""
+    """Return a vehicle with its numbers to 0.01,
+    since a difference of a rounding makes no other layout.
+    """
     stated = to_builtins(vehicle).items()
     return {key: round(value, 2) if isinstance(value, float) else value for key, value in stated}

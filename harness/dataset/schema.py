@@ -33,7 +33,9 @@ SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
 
 
 def scene_id(episode: int, state: WorldState) -> str:
-    """Return `<episode>-<step>-<digest>`; equal states have equal ids, frozen and in the closed loop."""
+    """Return `<episode>-<step>-<digest>`;
+    equal states have equal ids, frozen and in the closed loop.
+    """
     return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
@@ -49,7 +51,9 @@ class Danger(Closed, frozen=True):
 
 
 class Record(Closed, frozen=True):
-    """A decision point: a line of `<episode>/<step>.jsonl`. `record_type` has a scenario's own names."""
+    """A decision point: a line of `<episode>/<step>.jsonl`.
+    `record_type` has a scenario's own names.
+    """
 
     scene: SceneId  # `<episode>-<step>-<digest>`
     episode: Episode  # number of the episode
@@ -58,11 +62,13 @@ class Record(Closed, frozen=True):
     danger: Danger  # the vehicle that the layout sends against the ego, if any
     state: WorldState  # the state of everything, seen or not
     graphs: dict[VehicleId, SceneGraph]  # what each viewer knows, by its id
-    distance_m: dict[VehicleId, Number]  # distance of each viewer to the conflict zone, as the ego knows it
+    # distance of each viewer to the conflict zone, as the ego knows it
+    distance_m: dict[VehicleId, Number]
     range_m: dict[VehicleId, Number]  # distance of each helper to the ego, as the ego knows it
     # what the scenario says of its road; like the next, in datasets only
     road: dict[str, str | Number] | UnsetType = UNSET
-    snapshot: Snapshot | UnsetType = UNSET  # what the simulator needs beyond the state to go on from here
+    # what the simulator needs beyond the state to go on from here
+    snapshot: Snapshot | UnsetType = UNSET
 
 
 class EnvironmentRecord(Record, frozen=True):
@@ -91,7 +97,8 @@ class Edge(Closed, frozen=True):
         least_gap_m: smallest distance to another vehicle's outline on the way.
         hard_brakings: times the ego begins to brake harder than 4 m/s² on the way.
         other_crashes: vehicles that crash without the ego on the way.
-        ttc_s: least time to collision on the way; None where none was near, unset in older datasets.
+        ttc_s: least time to collision on the way;
+            None where none was near, unset in older datasets.
         pet_s: least post-encroachment time of arrivals on the way; as `ttc_s`.
     """
 
@@ -106,7 +113,9 @@ class Edge(Closed, frozen=True):
 
 
 class Branching(Closed, frozen=True):
-    """A decision point in its tree: what each reference driver does there, and where actions lead."""
+    """A decision point in its tree: what each reference driver does there,
+    and where actions lead.
+    """
 
     scene: SceneId
     drivers: dict[str, Text]
@@ -132,7 +141,8 @@ class Tree(Closed, frozen=True):
 
 
 class Manifest(Closed, frozen=True):
-    """`manifest.json`: what a dataset was built from, and the sha256 of every file and of every tree.
+    """`manifest.json`: what a dataset was built from,
+    and the sha256 of every file and of every tree.
 
     Of an environment it holds the whole configuration.
     """
@@ -159,13 +169,17 @@ def plain_type(scenario: Scenario) -> type[Record]:
 
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
-    """Return `Record` narrowed to the approaches, routes, sectors and facts of the scenario's road."""
+    """Return `Record` narrowed to the approaches, routes,
+    sectors and facts of the scenario's road.
+    """
     road = scenario.road()
     approach = _choice(approach for approach, _ in road.paths)
     route = _choice(route for _, route in road.paths)
     sector = _choice(road.sectors)
     signal = _choice([*(r for _, r in road.paths if indicator(r) == r), "off"])
-    section = Annotated[int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)]
+    section = Annotated[
+        int, Meta(ge=0, le=max(len(path.lanes) for path in road.paths.values()) - 1)
+    ]
     vehicle = _narrowed(VehicleState, approach=approach, route=route)
     sensors = Literal["camera", "lidar", "radar", "v2x"]
     graph = _narrowed(
@@ -176,11 +190,15 @@ def record_type(scenario: Scenario) -> type[Record]:
     )
     kind: type[Record] = _narrowed(
         Record,
-        road=_narrowed(Road, **{k: str if isinstance(v, str) else Number for k, v in road.facts.items()}),
+        road=_narrowed(
+            Road, **{k: str if isinstance(v, str) else Number for k, v in road.facts.items()}
+        ),
         danger=_narrowed(Danger, sector=sector | None),
         state=_narrowed(WorldState, vehicles=Annotated[_tuple(vehicle), Meta(min_length=1)]),
         graphs=GenericAlias(dict, (VehicleId, graph)),
-        snapshot=ActionsTaken if scenario.is_environment else _narrowed(Snapshot, sections=_tuple(section)),
+        snapshot=ActionsTaken
+        if scenario.is_environment
+        else _narrowed(Snapshot, sections=_tuple(section)),
     )
     return kind
 

@@ -21,7 +21,8 @@ class Selection:
     limit: int | None = None  # keeps the first so many of those that the other conditions leave
     only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end
     danger: str | None = None  # the sector that the hidden danger comes from, or `none`
-    sample: int | None = None  # how many to draw; a larger sample with the same seed contains the smaller one
+    # how many to draw; a larger sample with the same seed contains the smaller one
+    sample: int | None = None
     sample_seed: int = 0  # seed of the draw
 
     def __post_init__(self) -> None:
@@ -32,14 +33,18 @@ class Selection:
     def given(self) -> dict[str, int | str]:
         """The conditions that are set, except `limit`, by name."""
         conditions = {
-            key: value for key, value in asdict(self).items() if key != "limit" and value is not None
+            key: value
+            for key, value in asdict(self).items()
+            if key != "limit" and value is not None
         }
         if self.sample is None:
             del conditions["sample_seed"]
         return conditions
 
     def of(self, dataset: Dataset) -> Dataset:
-        """Return the dataset with only these episodes. Raises UserError for none, or an unknown danger."""
+        """Return the dataset with only these episodes.
+        Raises UserError for none, or an unknown danger.
+        """
         numbers = list(dataset.episodes)
         if self.only is not None:
             chosen = _numbers(self.only, max(numbers) + 1)
@@ -54,7 +59,9 @@ class Selection:
             numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
         if not numbers:
             shown = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
-            raise UserError(f"{shown}: no episode of {printable(dataset.name)} matches; give other values")
+            raise UserError(
+                f"{shown}: no episode of {printable(dataset.name)} matches; give other values"
+            )
         return dataset.of_episodes(frozenset(numbers[: self.limit]))
 
 
@@ -62,7 +69,9 @@ ALL = Selection()
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
-    """Draw some of the episodes' numbers, all below `end`. Raises UserError if there are too few."""
+    """Draw some of the episodes' numbers, all below `end`.
+    Raises UserError if there are too few.
+    """
     if not 1 <= sample <= len(numbers):
         raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")
     order = noise.generator("sample of episodes", seed).random(end)
@@ -70,7 +79,9 @@ def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]
 
 
 def _numbers(text: str, end: int) -> set[int]:
-    """Parse a text such as `3,10:20`. Raises UserError for any other text, or for numbers from `end` on."""
+    """Parse a text such as `3,10:20`. Raises UserError for any other text,
+    or for numbers from `end` on.
+    """
     numbers: set[int] = set()
     for part in text.split(","):
         first, colon, last = part.partition(":")
@@ -80,7 +91,8 @@ def _numbers(text: str, end: int) -> set[int]:
             span = range(0)
         if not span or span.start < 0 or span.stop > end:
             raise UserError(
-                f"--only {printable(text)}: give episodes from 0 to {end - 1}, such as 3,10:20, which is "
+                f"--only {printable(text)}: give episodes from 0 to {end - 1}, such as 3,10:20, "
+                "which is "
                 "3 and 10 to 19"
             )
         numbers.update(span)
@@ -88,7 +100,8 @@ def _numbers(text: str, end: int) -> set[int]:
 
 
 def spot_check(items: Sequence[T], sha256: str, most: int) -> list[T]:
-    """Draw some of the items of a file, always the same on a machine; who made the file does not know them.
+    """Draw some of the items of a file, always the same on a machine;
+    who made the file does not know them.
 
     Args:
         items: what is drawn from.

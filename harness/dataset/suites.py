@@ -39,9 +39,10 @@ def named(text: str) -> Suite | None:
     wrong = [read for read in results.values() if isinstance(read, UserError)]
     tables = [
         (file, key, table)
-        for file, read in results.items() if not isinstance(read, UserError)
+        for file, read in results.items()
+        if not isinstance(read, UserError)
         for key, table in read.items()
-    ]  # fmt: skip
+    ]
     matches = [(file, table) for file, key, table in tables if key == name]
     if not matches and wrong:
         raise wrong[0]
@@ -49,7 +50,8 @@ def named(text: str) -> Suite | None:
         raise unknown("suite", name, {key for _, key, _ in tables})
     if len(matches) > 1:
         raise UserError(
-            f"suite {printable(name)} is in this project and ships with the harness; give yours another name"
+            f"suite {printable(name)} is in this project and ships with the harness; give yours "
+            "another name"
         )
     [(file, table)] = matches
     where = f"suite {printable(name)} in {printable(file)}"
@@ -59,7 +61,9 @@ def named(text: str) -> Suite | None:
 
 
 def datasets(text: str) -> Sequence[str]:
-    """Return the datasets that `--dataset` names: those of a suite, or one. Raises what `named` raises."""
+    """Return the datasets that `--dataset` names: those of a suite, or one.
+    Raises what `named` raises.
+    """
     suite = named(text)
     return suite.datasets if suite else (text,)
 

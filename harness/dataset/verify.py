@@ -1,4 +1,6 @@
-"""Verify a dataset: its files by digest, and each tree and decision point by type and consistency."""
+"""Verify a dataset: its files by digest,
+and each tree and decision point by type and consistency.
+"""
 
 import os
 import zipfile
@@ -18,7 +20,15 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, refuse_bomb, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
-from harness.dataset.schema import LAYOUTS, Manifest, Record, Tree, plain_type, record_type, scene_id
+from harness.dataset.schema import (
+    LAYOUTS,
+    Manifest,
+    Record,
+    Tree,
+    plain_type,
+    record_type,
+    scene_id,
+)
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.environments import environment
@@ -40,7 +50,8 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
         manifest = _MANIFEST.decode(data)
     except FileNotFoundError:
         raise UserError(
-            f"{printable(path)} is no dataset (no manifest.json); build one with `harness dataset build`"
+            f"{printable(path)} is no dataset (no manifest.json); build one with `harness dataset "
+            "build`"
         ) from None
     except msgspec.ValidationError as error:
         what = misfit(error, data, Manifest, "manifest")
@@ -63,20 +74,34 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
     if len(set(manifest.actions)) < len(manifest.actions):
         yield "[actions]: an action stands there twice"
     if len(manifest.trees_sha256) != manifest.episodes:
-        yield f"[trees_sha256] has {len(manifest.trees_sha256)} digests for {manifest.episodes} episodes"
+        yield (
+            f"[trees_sha256] has {len(manifest.trees_sha256)} digests for {manifest.episodes} "
+            "episodes"
+        )
     expected = asdict(scenario.parameters)
     for name, value in manifest.parameters.items():
         if name not in expected:
             yield f"[parameters]: {unknown('parameter', name, expected)}"
         elif any(
-            isinstance(value, a) != isinstance(expected[name], b) for a, b in ((list, tuple), (str, str))
+            isinstance(value, a) != isinstance(expected[name], b)
+            for a, b in ((list, tuple), (str, str))
         ):
-            yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {expected[name]}"
+            yield (
+                f"[parameters]: {name} = {printable(value)}; wanted is a value such as "
+                f"{expected[name]}"
+            )
     if missing := expected.keys() - dict(LATER).keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
-    if scenario.is_environment and manifest.environment != (here := environment.config(scenario.name)):
-        differing = sorted(k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v)
-        yield f"[environment]: here its configuration has another {', '.join(differing) or 'set of keys'}"
+    if scenario.is_environment and manifest.environment != (
+        here := environment.config(scenario.name)
+    ):
+        differing = sorted(
+            k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v
+        )
+        yield (
+            "[environment]: here its configuration has another "
+            f"{', '.join(differing) or 'set of keys'}"
+        )
 
 
 def scenario_of(manifest: Manifest) -> Scenario:
@@ -128,7 +153,9 @@ class Damaged(Exception):
 
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
-    """Open a dataset's layouts. Digests pin the content; the compressed bytes may differ by machine."""
+    """Open a dataset's layouts. Digests pin the content;
+    the compressed bytes may differ by machine.
+    """
     file = path / LAYOUTS
     try:
         now = file.stat()
@@ -141,8 +168,8 @@ def opened(path: Path) -> Iterator[ZipFile]:
 def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
     """Open a file and keep it open, since listing the content of a large one takes long.
 
-    A changed `state` opens it anew. So does another `process`, since a forked one shares its parent's
-    position in the file.
+    A changed `state` opens it anew. So does another `process`,
+    since a forked one shares its parent's position in the file.
     """
     data = opened_file(file, "rows")
     try:
@@ -156,12 +183,21 @@ def _layouts(file: Path, state: tuple[int, int, int], process: int) -> ZipFile:
 
 
 def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
-    """Read a file in `layouts.zip`. Raises Damaged if it does not have the digest that was pinned."""
+    """Read a file in `layouts.zip`. Raises Damaged if it does not have the digest that was
+    pinned.
+    """
     try:
         if file.getinfo(name).file_size > LARGEST_ENTRY:
             raise Damaged(f"{LAYOUTS} {name}: too large")
         data = file.read(name)
-    except (KeyError, OSError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        KeyError,
+        OSError,
+        RuntimeError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise Damaged(f"{LAYOUTS} {name}: cannot be read ({printable(error)})") from None
     if sha256_bytes(data) != sha256:
         raise Damaged(f"{LAYOUTS} {name}: changed, its sha256 is not the one that was pinned")
@@ -184,11 +220,15 @@ def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = F
 
 
 def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
-    """Read the scenes of one level of a tree, one line each, in the level's order. Raises Damaged."""
+    """Read the scenes of one level of a tree, one line each, in the level's order.
+    Raises Damaged.
+    """
     name = level_name(tree.episode, step)
     lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
     if len(lines) != len(tree.levels[step]):
-        raise Damaged(f"{LAYOUTS} {name}: {len(lines)} scenes, the tree has {len(tree.levels[step])}")
+        raise Damaged(
+            f"{LAYOUTS} {name}: {len(lines)} scenes, the tree has {len(tree.levels[step])}"
+        )
     return lines
 
 
@@ -223,12 +263,16 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
         "two decision points have one id": len(set(ids)) == len(ids),
         "an id is not <episode>-<step>-<digest>": all(
             point.scene.startswith(f"{number:05d}-{step}-")
-            for step, level in enumerate(tree.levels) for point in level
+            for step, level in enumerate(tree.levels)
+            for point in level
         ),
-        "a reference driver is missing": all(point.drivers.keys() == set(DRIVERS) for point in points),
+        "a reference driver is missing": all(
+            point.drivers.keys() == set(DRIVERS) for point in points
+        ),
         "a reference driver's action is not one of the manifest's": chosen <= actions.keys(),
         "the edges of a decision point are not one an action": all(
-            Counter(action for edge in point.edges for action in edge.actions) == actions for point in points
+            Counter(action for edge in point.edges for action in edge.actions) == actions
+            for point in points
         ),
         "an edge leads nowhere, or goes on after the end": all(
             (edge.to is None) != (edge.end is None) for edge in edges
@@ -236,17 +280,21 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
         "an edge leads to a decision point that is not there": all(to < n for to, n in continuing),
         "some edges have measures of conflicts, and some have not": len(
             {each is msgspec.UNSET for edge in edges for each in (edge.ttc_s, edge.pet_s)}
-        ) <= 1,
+        )
+        <= 1,
         "a collision is no conflict": all(
             edge.ttc_s is msgspec.UNSET or (edge.ttc_s, edge.pet_s) == (0.0, 0.0)
-            for edge in edges if edge.end and edge.end.result == "collision"
+            for edge in edges
+            if edge.end and edge.end.result == "collision"
         ),
-    }  # fmt: skip
+    }
     return [problem for problem, holds in conditions.items() if not holds]
 
 
 def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
-    """Return a scene's record and what is wrong with it; the record is usable only if nothing is."""
+    """Return a scene's record and what is wrong with it;
+    the record is usable only if nothing is.
+    """
     scenario = scenarios.get(manifest.scenario)
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:
@@ -262,7 +310,8 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
 def unusable(path: Path, problem: str) -> UserError:
     """Return the error for a dataset with a problem."""
     return UserError(
-        f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or rebuild it"
+        f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or "
+        "rebuild it"
     )
 
 
@@ -285,7 +334,11 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     viewers = {v.id for v in state.vehicles if v.part != "other"}
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
-    speeds, road, snapshot = manifest.parameters["target_speeds_mps"], scenario.road(), record.snapshot
+    speeds, road, snapshot = (
+        manifest.parameters["target_speeds_mps"],
+        scenario.road(),
+        record.snapshot,
+    )
     own_snapshot = snapshot if isinstance(snapshot, Snapshot) else None
     conditions = {
         "it is the scene of another decision point": record.scene == name,
@@ -298,17 +351,23 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "state is of another step": state.step == record.step,
         "state is of another episode seed": state.episode_seed == record.episode_seed,
         "two vehicles have one id": len(set(ids)) == len(ids),
-        "the ego is not the first vehicle alone": [n for n, v in enumerate(state.vehicles) if v.part == "ego"]
+        "the ego is not the first vehicle alone": [
+            n for n, v in enumerate(state.vehicles) if v.part == "ego"
+        ]
         == [0],
         "graphs are not those of the ego and the helpers": graphs.keys() == viewers,
-        "a graph is of another viewer": all(graph.viewer == viewer for viewer, graph in graphs.items()),
+        "a graph is of another viewer": all(
+            graph.viewer == viewer for viewer, graph in graphs.items()
+        ),
         "distances are not those of the ego and the helpers": record.distance_m.keys() == viewers,
         "a conflict is on a path that does not meet the ego's": all(
             (c.sector, c.route) in (road.crossings if c.meets else road.paths) for c in conflicts
         ),
-        "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts} <= set(ids),
+        "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts}
+        <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
-        "sections are not one a vehicle": not own_snapshot or len(own_snapshot.sections) == len(ids),
+        "sections are not one a vehicle": not own_snapshot
+        or len(own_snapshot.sections) == len(ids),
     }
     return [problem for problem, holds in conditions.items() if not holds]

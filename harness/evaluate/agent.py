@@ -22,21 +22,23 @@ class Agent:
 
     card: Card  # the model
     prompt: Prompt  # the prompt version
-    # how the model answers: free `json`, `constrained` to the schema, a `readout` of letters, or a `decision`
+    # how the model answers: free `json`, `constrained` to the schema, a `readout` of letters, or a
+    # `decision`
     answer: AnswerMode = "json"
     thinking: bool = False  # whether the model thinks before it answers
-    # the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another` scene,
-    # or `none`, which leaves only the text
+    # the picture that an image prompt shows: the viewer's `own`, a `blank` one, one of `another`
+    # scene, or `none`, which leaves only the text
     image: ImageMode = "own"
-    # how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of the
-    # list as there are actions; None takes the card's, or else cyclic. Always raw for what is no
-    # read-out of letters.
+    # how a read-out's letters are read: `raw`, once, or `cyclic`, averaged over as many orders of
+    # the list as there are actions; None takes the card's, or else cyclic. Always raw for what is
+    # no read-out of letters.
     letters: Letters | None = None
-    # what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1: `refuse`
-    # counts it as failed, `divide` divides them by their sum
+    # what becomes of an answer in `json` whose only fault is that its numbers do not sum to 1:
+    # `refuse` counts it as failed, `divide` divides them by their sum
     sums: Sums = "refuse"
     # whether each read-out is asked once more with the list of actions reversed, to see whether its
-    # likeliest action changes (`harness.evaluate.flip`); the answer is that of the list as it stands
+    # likeliest action changes (`harness.evaluate.flip`); the answer is that of the list as it
+    # stands
     flip: bool = False
 
     def __post_init__(self) -> None:
@@ -46,16 +48,25 @@ class Agent:
         lists = self.answer in BARE and self.can.language_model
         if not (lists and "readout" in self.can.answer_modes):
             cyclic = self.letters == "cyclic"
-            if option := "--letters cyclic" if cyclic else "--flip" if self.flip and not lists else "":
+            if (
+                option := "--letters cyclic"
+                if cyclic
+                else "--flip"
+                if self.flip and not lists
+                else ""
+            ):
                 reason = "reads no letters" if lists else "is no language model"
                 reason = reason if self.answer in BARE else f"answers in {self.answer}"
                 raise UserError(
-                    f"{option}: {name} {reason}; leave it out, or give a language model and --answer readout"
+                    f"{option}: {name} {reason}; leave it out, or give a language model and "
+                    "--answer readout"
                 )
             object.__setattr__(self, "letters", "raw")
         elif self.letters is None:
             object.__setattr__(self, "letters", self.card.letters or "cyclic")
-        thinks = self.can.thinks == "always" or (self.can.thinks == "card" and self.card.thinking != "none")
+        thinks = self.can.thinks == "always" or (
+            self.can.thinks == "card" and self.card.thinking != "none"
+        )
         if self.thinking and not thinks:
             raise UserError(f"--thinking: {name} cannot think; leave it out")
         if self.card.thinking == "always":  # its answers hold a thought even if none was asked for
@@ -66,9 +77,15 @@ class Agent:
             raise UserError(
                 f"--image {self.image}: prompt {self.prompt.version} shows no picture; leave it out"
             )
-        if self.prompt.image and self.image != "none" and self.can.renders and self.card.vision is None:
+        if (
+            self.prompt.image
+            and self.image != "none"
+            and self.can.renders
+            and self.card.vision is None
+        ):
             raise UserError(
-                f"--prompt {self.prompt.version}: it shows a picture, and {name} reads texts alone (its card "
+                f"--prompt {self.prompt.version}: it shows a picture, and {name} reads texts alone "
+                "(its card "
                 "has no [vision]); give another model or prompt, or --image none"
             )
         if self.answer not in get_args(AnswerMode):
@@ -79,19 +96,22 @@ class Agent:
             raise UserError(f"--answer {self.answer}: {name} {reason}; use {modes}")
         if self.answer == "decision" and self.prompt.examples:
             raise UserError(
-                f"--answer decision: prompt {self.prompt.version} has examples, and a decision is one "
+                f"--answer decision: prompt {self.prompt.version} has examples, and a decision is "
+                "one "
                 "question; give a prompt without any"
             )
         if self.sums not in get_args(Sums):
             raise unknown("sums", str(self.sums), get_args(Sums))
         if self.sums == "divide" and self.answer != "json":
             raise UserError(
-                f"--sums divide: {name} answers in {self.answer}, whose sums need no declaration; leave it "
+                f"--sums divide: {name} answers in {self.answer}, whose sums need no declaration; "
+                "leave it "
                 "out, or use --answer json"
             )
         if self.answer != "json" and self.thinking:
             raise UserError(
-                f"--answer {self.answer}: {name} thinks first, and only json leaves room for that; use "
+                f"--answer {self.answer}: {name} thinks first, and only json leaves room for that; "
+                "use "
                 "--answer json"
             )
 
@@ -114,43 +134,60 @@ class Agent:
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"
 
     def most_tokens(self, role: Role) -> int:
-        """Return the most tokens that an answer may have, the thought included if the model thinks first."""
+        """Return the most tokens that an answer may have,
+        the thought included if the model thinks first.
+        """
         answer = self.card.max_new_tokens or self.prompt.most_answer_tokens(role)
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
         """Return a request in a role, without what differs between such requests."""
         return Request(
-            id="", messages=(), role=role, actions=actions, max_tokens=self.most_tokens(role),
-            form=self.prompt.form(role), extension=self.prompt.extension.get(role, ""),
+            id="",
+            messages=(),
+            role=role,
+            actions=actions,
+            max_tokens=self.most_tokens(role),
+            form=self.prompt.form(role),
+            extension=self.prompt.extension.get(role, ""),
             placeholders=self.prompt.placeholders[role],
-            answer=self.answer, sums=self.sums, thinking=self.thinking,
+            answer=self.answer,
+            sums=self.sums,
+            thinking=self.thinking,
             reasons_first=role in self.prompt.reasons_first,
-        )  # fmt: skip
+        )
 
     def chats(
-        self, graph: SceneGraph, actions: tuple[str, ...], words: Mapping[str, str],
+        self,
+        graph: SceneGraph,
+        actions: tuple[str, ...],
+        words: Mapping[str, str],
         heard: Sequence[Mapping[str, Any]] = (),
-    ) -> dict[str, Any]:  # fmt: skip
-        """Return the chat about a scene graph and what was heard in the agent's answer mode, for a request.
+    ) -> dict[str, Any]:
+        """Return the chat about a scene graph and what was heard in the agent's answer mode,
+        for a request.
 
-        They are the `messages`, those of the further `orders` and the `flips` of a read-out's letters, and
-        the `question` of a decision.
+        They are the `messages`, those of the further `orders` and the `flips` of a read-out's
+        letters, and the `question` of a decision.
         """
         rendered = self.rendered(graph, actions, heard, words)
         if self.answer != "decision":
             return self.in_orders(
-                actions, lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words)
+                actions,
+                lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words),
             )
         question = decision.question(rendered, graph, actions, words)
         chats = self.in_orders(actions, lambda order: decision.asked(question, rendered, order))
         return {**chats, "question": question}
 
     def in_orders(
-        self, actions: tuple[str, ...],
+        self,
+        actions: tuple[str, ...],
         chat: Callable[[Sequence[str]], tuple[Mapping[str, str], ...]],
-    ) -> dict[str, Any]:  # fmt: skip
-        """Return a chat in each order of the actions in which letters are read, as fields of a request."""
+    ) -> dict[str, Any]:
+        """Return a chat in each order of the actions in which letters are read,
+        as fields of a request.
+        """
 
         def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
             return [*map(chat, readout.cyclic(listed) if self.letters == "cyclic" else [listed])]
@@ -164,11 +201,18 @@ class Agent:
         return chats
 
     def rendered(
-        self, graph: SceneGraph, actions: tuple[str, ...], heard: Sequence[Mapping[str, Any]],
+        self,
+        graph: SceneGraph,
+        actions: tuple[str, ...],
+        heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
-    ) -> tuple[Mapping[str, str], ...]:  # fmt: skip
-        """Return the chat about a scene graph and the messages heard, before the answer mode changes it."""
-        return shown(self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE))
+    ) -> tuple[Mapping[str, str], ...]:
+        """Return the chat about a scene graph and the messages heard,
+        before the answer mode changes it.
+        """
+        return shown(
+            self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE)
+        )
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides its answers, as plain values."""
@@ -189,13 +233,17 @@ def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[st
 
 
 def in_mode(
-    answer: str, prompt: Prompt, messages: Sequence[Mapping[str, str]], graph: SceneGraph,
-    actions: Sequence[str], words: Mapping[str, str],
-) -> tuple[Mapping[str, str], ...]:  # fmt: skip
+    answer: str,
+    prompt: Prompt,
+    messages: Sequence[Mapping[str, str]],
+    graph: SceneGraph,
+    actions: Sequence[str],
+    words: Mapping[str, str],
+) -> tuple[Mapping[str, str], ...]:
     """Return a prompt's chat about a scene graph in an answer mode.
 
-    In a read-out, the examples answer by a letter, too. A decision keeps of the chat what it says of the
-    scene; the scenario's `words` ask.
+    In a read-out, the examples answer by a letter, too.
+    A decision keeps of the chat what it says of the scene; the scenario's `words` ask.
     """
     if answer == "decision":
         asked = decision.question(messages, graph, actions, words)
@@ -206,14 +254,17 @@ def in_mode(
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """Return the likeliest action of a role's examples. Raises UserError if one parses with repairs only."""
+    """Return the likeliest action of a role's examples.
+    Raises UserError if one parses with repairs only.
+    """
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):
         first = role in prompt.reasons_first
         parsed = parse(example.answer, **prompt.shape(role, actions)._asdict(), reasons_first=first)
         if parsed.status is not Status.STRICT or parsed.intent is None:
             raise UserError(
-                f"prompt {prompt.version} examples.json: the answer of {role} example {number} is not as a "
+                f"prompt {prompt.version} examples.json: the answer of {role} example {number} is "
+                "not as a "
                 f"model should state it ({parsed.status}: {parsed.detail}); fix it"
             )
         likeliest.append(actions[parsed.intent.index(max(parsed.intent))])

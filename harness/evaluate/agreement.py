@@ -9,10 +9,11 @@ from harness.evaluate.walk import Decided
 
 
 def broken_words(decided: Decided[Any]) -> Floats:
-    """Return whether each agent breaks its word, (n,): its action is not the likeliest of the plan it sent.
+    """Return whether each agent breaks its word, (n,):
+    its action is not the likeliest of the plan it sent.
 
-    It breaks its word if that holds for anybody who got a plan, of the last that this one fused. NaN for an
-    agent whose plan nobody got.
+    It breaks its word if that holds for anybody who got a plan,
+    of the last that this one fused. NaN for an agent whose plan nobody got.
     """
     broken, intents = np.full(len(decided.due.at), np.nan), decided.said.intents
     if decided.due.senders is None or intents.plans is None:

@@ -1,4 +1,6 @@
-"""Ask the agents: one answer for each viewer at each decision point, kept so that a run can resume."""
+"""Ask the agents: one answer for each viewer at each decision point,
+kept so that a run can resume.
+"""
 
 import math
 import shlex
@@ -27,7 +29,14 @@ from harness.core.files import canonical_bytes, sha256_bytes
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
-from harness.evaluate.fusion import FusionAnswers, heard_in, key_of, messages_of, plan_keys, source_of
+from harness.evaluate.fusion import (
+    FusionAnswers,
+    heard_in,
+    key_of,
+    messages_of,
+    plan_keys,
+    source_of,
+)
 from harness.evaluate.kept_answers import KeptAnswers
 from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
@@ -44,7 +53,8 @@ from harness.world.scene_graph import SceneGraph
 T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
-IN_A_ROW = CHUNK  # questions without an answer, one after the other, after which nothing more is asked
+# questions without an answer, one after the other, after which nothing more is asked
+IN_A_ROW = CHUNK
 WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
 EGO = (0,)
 _TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where there is no number
@@ -59,7 +69,10 @@ def requests(
     With `places`, only those of the viewers at these places of each scene, the ego at 0.
     """
     agents, actions = spec.agents, spec.actions
-    privileged, sees = any(agent.card.privileged for agent in agents), any(agent.sees for agent in agents)
+    privileged, sees = (
+        any(agent.card.privileged for agent in agents),
+        any(agent.sees for agent in agents),
+    )
     blank = cache(partial(_blank, spec))
     for scene, asked in zip(scenes, places or repeat(None), strict=False):
         scenario = spec.scenario_of(scene)
@@ -73,14 +86,19 @@ def requests(
                 graph = graph.blinded()
             agent = agents[index]
             yield blank(index, graph.role).alike(
-                id=_id(scene, viewer, blind), **agent.chats(graph, actions, words),
-                image=picture(spec, index, scene, viewer, blind) if sees else None, view=graph,
-                truth=truth if agent.card.privileged else None, scenario=scenario,
-            )  # fmt: skip
+                id=_id(scene, viewer, blind),
+                **agent.chats(graph, actions, words),
+                image=picture(spec, index, scene, viewer, blind) if sees else None,
+                view=graph,
+                truth=truth if agent.card.privileged else None,
+                scenario=scenario,
+            )
 
 
 def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
-    """Return the scenes where a helper is wanted, (n, H), and the places of those helpers in each."""
+    """Return the scenes where a helper is wanted, (n, H),
+    and the places of those helpers in each.
+    """
     rows = np.flatnonzero(wanted.any(axis=1)).tolist()
     return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
 
@@ -99,10 +117,14 @@ def _blank(spec: Spec, index: int, role: Role) -> Request:
 
 
 def fusion_request(
-    spec: Spec, scene: Scene, answers: Mapping[str, Answer], senders: Sequence[str],
+    spec: Spec,
+    scene: Scene,
+    answers: Mapping[str, Answer],
+    senders: Sequence[str],
     graph: SceneGraph | None = None,
-) -> Request:  # fmt: skip
-    """Return the fusion call with these senders' messages; `answers` has the same keys as `senders`.
+) -> Request:
+    """Return the fusion call with these senders' messages;
+    `answers` has the same keys as `senders`.
 
     With a `graph`, the ego is asked with this one instead of its own.
     """
@@ -125,12 +147,16 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 
 @cache  # once: a run has an asker for each of its parts
 def _say_unread(card: Card, prompt: str) -> None:
-    """Say on stderr that none of the first answers could be read, and which prompt to try instead."""
+    """Say on stderr that none of the first answers could be read,
+    and which prompt to try instead.
+    """
     other = WITH_EXAMPLES if prompt != WITH_EXAMPLES else "VERSION"
     command = shlex.join(["harness", "prompt", "check", other, "--model", cards.argument(card)])
     print(
-        f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could be read, "
-        f"and the run goes on; try another: `{printable(command, 300)}`; `harness prompt list` shows all",
+        f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could be "
+        "read, "
+        f"and the run goes on; try another: `{printable(command, 300)}`; `harness prompt list` "
+        "shows all",
         file=sys.stderr,
     )
 
@@ -142,27 +168,47 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     viewer, *heard = viewers.split("+")
     role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
     parsed = parse(
-        raw, **request.shape._asdict(),
-        thinking=request.thinking, reasons_first=request.reasons_first, divides=request.divides,
-        finish_reason=completion.finish_reason, error=completion.error,
-    )  # fmt: skip
+        raw,
+        **request.shape._asdict(),
+        thinking=request.thinking,
+        reasons_first=request.reasons_first,
+        divides=request.divides,
+        finish_reason=completion.finish_reason,
+        error=completion.error,
+    )
     return Answer(
-        scene=scene, viewer=viewer.removesuffix(BLIND), heard=tuple(heard), role=role, raw=raw,
-        finish_reason=completion.finish_reason, error=completion.error,
-        prompt_tokens=completion.prompt_tokens, completion_tokens=completion.completion_tokens,
-        seconds=completion.seconds, batch_size=completion.batch_size, label_mass=completion.label_mass,
-        retries=completion.retries, cached=completion.cached, slow_s=completion.slow_s,
-        first_token_s=completion.first_token_s, token_s=completion.token_s,
+        scene=scene,
+        viewer=viewer.removesuffix(BLIND),
+        heard=tuple(heard),
+        role=role,
+        raw=raw,
+        finish_reason=completion.finish_reason,
+        error=completion.error,
+        prompt_tokens=completion.prompt_tokens,
+        completion_tokens=completion.completion_tokens,
+        seconds=completion.seconds,
+        batch_size=completion.batch_size,
+        label_mass=completion.label_mass,
+        retries=completion.retries,
+        cached=completion.cached,
+        slow_s=completion.slow_s,
+        first_token_s=completion.first_token_s,
+        token_s=completion.token_s,
         letter_share=_or_unset(completion.letter_share),
-        follows_letter=_or_unset(completion.follows_letter), flipped=_or_unset(completion.flipped),
+        follows_letter=_or_unset(completion.follows_letter),
+        flipped=_or_unset(completion.flipped),
         prompt_sha256=sha256_bytes(_TEXTS.encode(request.messages)),
         image_sha256=request.image_sha256 or UNSET,
-        status=str(parsed.status), verdict=parsed.verdict,
-        repairs=tuple(map(str, parsed.repairs)), intent=parsed.intent, mass=parsed.mass,
-        message=parsed.message, detail=parsed.detail,
+        status=str(parsed.status),
+        verdict=parsed.verdict,
+        repairs=tuple(map(str, parsed.repairs)),
+        intent=parsed.intent,
+        mass=parsed.mass,
+        message=parsed.message,
+        detail=parsed.detail,
         faults=tuple(map(str, parsed.faults)) if len(parsed.faults) > 1 else UNSET,
         extension=_or_unset(parsed.extension),
-    )  # fmt: skip
+    )
 
 
 def _or_unset(value: T | None) -> T | UnsetType:
@@ -194,8 +240,9 @@ class Asker:
     ) -> None:
         """Create an asker. `backend` opens the backend, at the first request.
 
-        `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets the number
-        of new answers, those kept by a stopped run included; `more` that of requests before they are made.
+        `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets
+        the number of new answers, those kept by a stopped run included; `more` that of requests
+        before they are made.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
@@ -209,8 +256,9 @@ class Asker:
     def ask(self, asked: Sequence[Request]) -> None:
         """Ask for the missing answers, each once, and keep each chunk as soon as it is answered.
 
-        Raises Unanswered if a question of the ego or a fusion call got no answer, once all others of these
-        were asked; or if none of the first questions was answered, or none of the last `IN_A_ROW`.
+        Raises Unanswered if a question of the ego or a fusion call got no answer, once all others
+        of these were asked; or if none of the first questions was answered, or none of the last
+        `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
             self.answers = self._kept.recall(cut=True) | self.answers
@@ -219,13 +267,15 @@ class Asker:
             self._progress(len(asked) - len(missing))
         if not missing:
             return
-        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at all, and
-        # all but the last are equally long. So what a resumed run lacks falls into the same chunks.
+        # An answer may depend on the other requests in its batch. Chunks are kept whole or not at
+        # all, and all but the last are equally long. So what a resumed run lacks falls into the
+        # same chunks.
         backend, batch = self._backend(), self.spec.settings.batch_size
         size = batch * math.ceil(CHUNK / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
-            chunks[-2:] = [missing[size * (len(chunks) - 2) :]]  # a short last chunk would not fill a batch
+            # a short last chunk would not fill a batch
+            chunks[-2:] = [missing[size * (len(chunks) - 2) :]]
         waves, first = [chunks], self._first()
         if window(backend) and self._refused_so_far() and len(chunks[0]) >= first + batch:
             chunks[:1] = [chunks[0][:first], chunks[0][first:]]
@@ -255,8 +305,8 @@ class Asker:
     def _take(self, answers: Collection[Answer], single: bool) -> None:
         """Count and keep the answers of a chunk; stop if nothing is answered any more.
 
-        Unless each question stands `single`, an answer may depend on the others of its chunk, which is then
-        kept only if all of it was answered.
+        Unless each question stands `single`, an answer may depend on the others of its chunk,
+        which is then kept only if all of it was answered.
         """
         answered = [answer for answer in answers if answer.error is None]
         if self._kept and answered and (single or len(answered) == len(answers)):
@@ -294,7 +344,9 @@ class Asker:
         return self.tally.asked == self.tally.unanswered
 
     def _answered(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
-        """Answer each request, and ask what its answer calls for: a repair turn, or the reversed list."""
+        """Answer each request, and ask what its answer calls for:
+        a repair turn, or the reversed list.
+        """
         with strangers(f"the engine of {printable(self.spec.ego.card.name, 40)}"):
             return self._answers(backend, chunk)
 
@@ -339,17 +391,27 @@ class Asker:
         return self.laid_out(scenes, blind=True)
 
     def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        """Ask the helpers wanted, (n, H), and return the intents of the scenes where any is wanted."""
+        """Ask the helpers wanted, (n, H),
+        and return the intents of the scenes where any is wanted.
+        """
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, blind)
         return self.laid_out(scenes, blind, 1 + wanted.shape[1])
 
-    def lacks(self, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None) -> list[bool]:
-        """For each scene, whether an answer of these viewers is missing; with `blind`, a blind helper's."""
+    def lacks(
+        self, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None
+    ) -> list[bool]:
+        """For each scene, whether an answer of these viewers is missing;
+        with `blind`, a blind helper's.
+        """
         return list(self._lacking(scenes, self.answers, blind, places))
 
-    def _ask_at(self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
-        """Ask what is missing of the viewers at these places of each scene; None for all of them."""
+    def _ask_at(
+        self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False
+    ) -> None:
+        """Ask what is missing of the viewers at these places of each scene;
+        None for all of them.
+        """
         if not any(self._lacking(scenes, self.answers, blind, places)):
             return
         # Only the prompts of scenes whose answers were not all given are rendered.
@@ -359,9 +421,12 @@ class Asker:
         self.answer(list(requests(self.spec, scenes, blind, asked)))
 
     def _lacking(
-        self, scenes: Sequence[Scene], available: Container[str], blind: bool = False,
+        self,
+        scenes: Sequence[Scene],
+        available: Container[str],
+        blind: bool = False,
         places: Places | None = None,
-    ) -> Iterator[bool]:  # fmt: skip
+    ) -> Iterator[bool]:
         for scene, asked in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
@@ -371,9 +436,12 @@ class Asker:
             )
 
     def laid_out(self, scenes: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
-        """Return the answers so far as arrays of at least `width` vehicles; NaN without an intent."""
+        """Return the answers so far as arrays of at least `width` vehicles;
+        NaN without an intent.
+        """
         answers = [
-            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)] for s in scenes
+            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)]
+            for s in scenes
         ]
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
@@ -386,7 +454,9 @@ class Asker:
             row += [None] * absent
             p.append([answer.intent or unknown if answer else unknown for answer in row])
             distance_m, range_m = record.distance_m, record.range_m
-            distances_m.append([distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent])
+            distances_m.append(
+                [distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent]
+            )
             ranges_m.append([*[range_m[v] for v in helpers], *[math.nan] * absent])
             bits.append([_bits(scene, answer) if answer else 0 for answer in row[1:]])
             texts_b.append([len(_text(answer).encode()) for answer in row[1:]])
@@ -398,17 +468,23 @@ class Asker:
         if any(point.content.plan for point in self.spec.points):
             own = [row[0] for row in answers]
             own_bits = np.array(
-                [_bits(scene, a) if a else 0.0 for scene, a in zip(scenes, own, strict=True)], dtype=float
+                [_bits(scene, a) if a else 0.0 for scene, a in zip(scenes, own, strict=True)],
+                dtype=float,
             )
             own_text_bytes = np.array([len(_text(a).encode()) for a in own], dtype=float)
         return Intents(
-            intents[:, 0], intents[:, 1:], valid if not_yet is None else valid | not_yet,
-            np.array(distances_m, dtype=float), np.array(ranges_m, dtype=float).reshape(shape),
-            np.array(bits, dtype=float).reshape(shape), inference_s(self.latency, answers, models),
+            intents[:, 0],
+            intents[:, 1:],
+            valid if not_yet is None else valid | not_yet,
+            np.array(distances_m, dtype=float),
+            np.array(ranges_m, dtype=float).reshape(shape),
+            np.array(bits, dtype=float).reshape(shape),
+            inference_s(self.latency, answers, models),
             unasked=not_yet,
             text_bytes=np.array(texts_b, dtype=float).reshape(shape),
-            own_bits=own_bits, own_text_bytes=own_text_bytes,
-        )  # fmt: skip
+            own_bits=own_bits,
+            own_text_bytes=own_text_bytes,
+        )
 
     def _models(self, scene: Scene, width: int) -> list[int]:
         """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
@@ -416,7 +492,9 @@ class Asker:
         places = [scene.place(n) for n in there] if self.spec.helpers else [*there]
         return [*places, *range(len(places), width)]
 
-    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+    def fusion_call(
+        self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Fuses:
         sets = list(_heard_sets(scenes, codes, rewrites))
         ids = [fusion_id(*each) for each in sets]
         if not self.answers.keys() >= set(ids):
@@ -424,7 +502,9 @@ class Asker:
         return FusionAnswers(codes, *self._after([scene for scene, _ in sets], ids)).at
 
     def _after(self, scenes: Sequence[Scene], ids: Sequence[str]) -> tuple[Floats, Floats]:
-        """Return the intents (K, A) after the fusion calls of these ids in scenes, and their seconds (K,)."""
+        """Return the intents (K, A) after the fusion calls of these ids in scenes,
+        and their seconds (K,).
+        """
         answers = [self.answers[name] for name in ids]
         models = [self._models(scene, 1)[0] for scene in scenes]
         unknown = [np.nan] * len(self.spec.actions)
@@ -434,14 +514,20 @@ class Asker:
     def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         return partial(self._of_plans, [scenes[n] for n in at.tolist()], intents)
 
-    def _of_plans(self, scenes: Sequence[Scene], intents: Intents, on_time: Bools) -> tuple[Floats, Floats]:
-        """Ask those who have heard plans, (n, H); return their intents and seconds, NaN for the others."""
+    def _of_plans(
+        self, scenes: Sequence[Scene], intents: Intents, on_time: Bools
+    ) -> tuple[Floats, Floats]:
+        """Ask those who have heard plans, (n, H);
+        return their intents and seconds, NaN for the others.
+        """
         after, seconds = np.full(intents.own.shape, np.nan), np.full(len(scenes), np.nan)
         rows = np.flatnonzero(on_time.any(axis=1)).tolist()
         sets = [(scenes[n], plan_keys(scenes[n].viewers[1:], intents, n, on_time[n])) for n in rows]
         by_id = {fusion_id(*each): each for each in sets}
         if not self.answers.keys() >= by_id.keys():
-            self.answer([fusion_request(self.spec, scene, {}, senders) for scene, senders in by_id.values()])
+            self.answer(
+                [fusion_request(self.spec, scene, {}, senders) for scene, senders in by_id.values()]
+            )
         ids = [fusion_id(*each) for each in sets]
         after[rows], seconds[rows] = self._after([scenes[n] for n in rows], ids)
         return after, seconds
@@ -456,26 +542,34 @@ class Asker:
         graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks)), by_id))
         calls = []
         for (scene, senders), lacking in zip(sets, lacks, strict=True):
-            source, keys = source_of(scene.id, senders), (key.partition(REWRITTEN)[0] for key in senders)
+            source, keys = (
+                source_of(scene.id, senders),
+                (key.partition(REWRITTEN)[0] for key in senders),
+            )
             sent = {key: a for key in keys if (a := self.answers.get(f"{source}/{key}"))}
-            calls.append(fusion_request(self.spec, scene, sent, senders, next(graphs) if lacking else None))
+            calls.append(
+                fusion_request(self.spec, scene, sent, senders, next(graphs) if lacking else None)
+            )
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
         """Announce the requests whose answers were not given, and ask for what is missing."""
-        # Requests whose answers were kept stay, so that the chunks begin at the same places as before.
+        # Requests whose answers were kept stay, so that the chunks begin at the same places as
+        # before.
         asked = [request for request in requests if request.id not in self._given]
         self._more(len(asked))
         self.ask(asked)
 
 
 def _answer_chunks(
-    work: Callable[[Sequence[Request]], dict[str, Answer]], chunks: Sequence[Sequence[Request]], calls: int
+    work: Callable[[Sequence[Request]], dict[str, Answer]],
+    chunks: Sequence[Sequence[Request]],
+    calls: int,
 ) -> Generator[dict[str, Answer], None, None]:
     """Yield the answers of each chunk as they come, by request id.
 
-    Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of another.
-    Raises Unanswered if nothing more may be asked, once what was asked already has come.
+    Up to `calls` chunks are asked at the same time, so that no chunk waits for the last answer of
+    another. Raises Unanswered if nothing more may be asked, once what was asked already has come.
     """
     if calls == 1 or len(chunks) == 1:
         yield from map(work, chunks)
@@ -515,7 +609,8 @@ def _bits(scene: Scene, answer: Answer) -> int:
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Return the bits of a helper's message: id, position, intent, evidence and risk, as compact JSON.
+    """Return the bits of a helper's message:
+    id, position, intent, evidence and risk, as compact JSON.
 
     Positions have one decimal and probabilities two at most.
     """

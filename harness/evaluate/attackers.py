@@ -1,8 +1,9 @@
 """Draw the attackers of a condition, and return what the ego then hears.
 
-Attackers are drawn once for each seed of the channel and layout. So every rule, prompt and model faces the
-same ones, in frozen scenes, sweeps and the closed loop. Where several agents decide, they are those whom the
-ego faces where it alone decides: each is one vehicle that attacks whoever asks, and the ego attacks nobody.
+Attackers are drawn once for each seed of the channel and layout. So every rule, prompt and model
+faces the same ones, in frozen scenes, sweeps and the closed loop. Where several agents decide, they
+are those whom the ego faces where it alone decides: each is one vehicle that attacks whoever asks,
+and the ego attacks nobody.
 """
 
 from collections.abc import Sequence
@@ -37,24 +38,30 @@ class SentIntents:
 
 
 class Attackers:
-    """The attackers under one condition; they remember what helpers intended in each episode and seed."""
+    """The attackers under one condition;
+    they remember what helpers intended in each episode and seed.
+    """
 
     def __init__(self, point: OperatingPoint) -> None:
         self._attacks = attacks_of(point.guard.attack)
         self._steps = max((attack.steps for attack in self._attacks), default=0)
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
-    def said(self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]) -> SentIntents:
+    def said(
+        self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]
+    ) -> SentIntents:
         """Return what is said in decisions (n,), given what the vehicles intend.
 
-        `truth` is what every vehicle intends, of H helpers; `episodes` has the number and seed of each
-        decision's episode. Raises UserError if the world has no layouts to draw attackers for.
+        `truth` is what every vehicle intends, of H helpers; `episodes` has the number and seed of
+        each decision's episode. Raises UserError if the world has no layouts to draw attackers for.
         """
         none_attack = np.zeros(truth.valid.shape, dtype=bool)
         if not self._attacks:
             return SentIntents(truth, draws, none_attack)
         if draws.trips is None:
-            raise UserError("attacks need layouts, and the paper's study has none; leave attack out")
+            raise UserError(
+                "attacks need layouts, and the paper's study has none; leave attack out"
+            )
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         first, past = self._remembered(truth, episodes)
         present, said, attacking = np.isfinite(truth.range_m), truth, none_attack
@@ -66,14 +73,19 @@ class Attackers:
         for intents, episode in zip(truth.helpers, episodes, strict=True):
             intended = self._intended.setdefault(episode, [])
             intended.append(intents)
-            del intended[1 : -self._steps or None]  # keep the first step and those that an attack looks at
+            # keep the first step and those that an attack looks at
+            del intended[1 : -self._steps or None]
         if said.voice_of is None:
             return SentIntents(said, draws, attacking)
         voices = np.take_along_axis(attacking, said.voice_of, axis=-1)
         return SentIntents(said, draws.of_helpers(said.voice_of), voices)
 
-    def _remembered(self, truth: Intents, episodes: Sequence[tuple[int, int]]) -> tuple[Floats, Floats]:
-        """Return the first intents (n, H, A) and those of K past steps (n, K, H, A); NaN without a step."""
+    def _remembered(
+        self, truth: Intents, episodes: Sequence[tuple[int, int]]
+    ) -> tuple[Floats, Floats]:
+        """Return the first intents (n, H, A) and those of K past steps (n, K, H, A);
+        NaN without a step.
+        """
         first = truth.helpers.copy()
         past = np.full((len(first), self._steps, *first.shape[1:]), np.nan)
         for decision, episode in enumerate(episodes):
@@ -86,9 +98,11 @@ class Attackers:
 
 
 def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
-    """Let an attack act. A package's cannot write to what it gets, and says only what a message can hold.
+    """Let an attack act. A package's cannot write to what it gets,
+    and says only what a message can hold.
 
-    Raises UserError if it fails, changes what is not an attacker's, or lets a voice say no distribution.
+    Raises UserError if it fails, changes what is not an attacker's,
+    or lets a voice say no distribution.
     """
     kind = type(attack)
     if kind.__module__.startswith("harness."):
@@ -109,7 +123,9 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
 
 
 def _refuse_of_others(said: Intents, after: Intents, attackers: Bools) -> None:
-    """Raise ValueError if an attack changes what is the ego's, or a helper's that is no attacker."""
+    """Raise ValueError if an attack changes what is the ego's,
+    or a helper's that is no attacker.
+    """
     nobody = np.zeros(attackers.shape, dtype=bool)
     before, now = ({"silent": nobody, **each.arrays(), **_claimed(each)} for each in (said, after))
     if changed := sorted(before.keys() ^ now.keys()):
@@ -118,7 +134,9 @@ def _refuse_of_others(said: Intents, after: Intents, attackers: Bools) -> None:
         check_shape("intents" if name == "helpers" else name, values, before[name].shape)
         if values.dtype.kind not in ("b" if before[name].dtype == bool else "iuf"):
             raise ValueError(f"{name} of type {values.dtype}, not {before[name].dtype}")
-        others = ~np.insert(attackers, 0, False, axis=1) if name in (*WITH_EGO, "xy_m") else ~attackers
+        others = (
+            ~np.insert(attackers, 0, False, axis=1) if name in (*WITH_EGO, "xy_m") else ~attackers
+        )
         if name in (*OF_EGO, "time_s", "error_m"):
             others = np.ones(len(attackers), dtype=bool)
         if not np.array_equal(values[others], before[name][others], equal_nan=True):
@@ -128,30 +146,42 @@ def _refuse_of_others(said: Intents, after: Intents, attackers: Bools) -> None:
 def _claimed(intents: Intents) -> dict[str, Any]:
     """Return the arrays of what helpers claim, by name."""
     claims = intents.claims
-    return {} if claims is None else {k: v for k, v in vars(claims).items() if isinstance(v, np.ndarray)}
+    return (
+        {}
+        if claims is None
+        else {k: v for k, v in vars(claims).items() if isinstance(v, np.ndarray)}
+    )
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:
-    """Return two draws for each helper of the ego, one of the episode and one of the step, (n, H, 2)."""
+    """Return two draws for each helper of the ego, one of the episode and one of the step,
+    (n, H, 2).
+    """
     keys = zip(trips.seed.tolist(), (trips.layout_seed % OF_ANOTHER_AGENT).tolist(), strict=True)
-    uniforms = np.array([_helper_uniforms(seed, layout, trips.steps, helpers) for seed, layout in keys])
+    uniforms = np.array(
+        [_helper_uniforms(seed, layout, trips.steps, helpers) for seed, layout in keys]
+    )
     of_step = uniforms[np.arange(len(uniforms)), :, 1 + trips.step]
     return np.stack([uniforms[..., 0], of_step], axis=-1)
 
 
 def _of_helpers(values: Any, trips: Trips) -> Any:
-    """Return values (n, H) of the ego's helpers as those of who decides, whose first helper is the ego.
+    """Return values (n, H) of the ego's helpers as those of who decides,
+    whose first helper is the ego.
 
     Of the ego itself they are 0, or False.
     """
     agent, helper = trips.layout_seed[:, None] // OF_ANOTHER_AGENT, np.arange(values.shape[1])
     if not agent.any():
         return values
-    theirs = np.take_along_axis(values, np.where((helper < agent) & (helper > 0), helper - 1, helper), axis=1)
+    theirs = np.take_along_axis(
+        values, np.where((helper < agent) & (helper > 0), helper - 1, helper), axis=1
+    )
     return np.where((agent > 0) & (helper == 0), 0, theirs).astype(values.dtype)
 
 
-# The draws of one helper follow those of another, so more helpers in a batch change no earlier draw.
+# The draws of one helper follow those of another, so more helpers in a batch change no earlier
+# draw.
 @lru_cache(maxsize=1 << 14)
 def _helper_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
     return noise.uniforms((helpers, 1 + steps), "attackers", seed, layout_seed)

@@ -1,8 +1,10 @@
-"""Share one world among the closed-loop episodes that have acted alike so far, and branch it when they part.
+"""Share one world among the closed-loop episodes that have acted alike so far,
+and branch it when they part.
 
-Episodes of one layout differ only in condition and seed. They are in one world, which is simulated and
-observed once, until one of them takes another action than the rest, or takes it in another frame. Then the
-world branches. A branch continues exactly as the undivided world would, to the last bit.
+Episodes of one layout differ only in condition and seed. They are in one world, which is simulated
+and observed once, until one of them takes another action than the rest, or takes it in another
+frame. Then the world branches. A branch continues exactly as the undivided world would, to the last
+bit.
 """
 
 import math
@@ -22,7 +24,8 @@ class Decision:
     action: str  # the meta-action
     frame: int  # the frame in which it acts
     acted: bool = False  # whether it has acted
-    # least time to collision and post-encroachment time until the next decision begins; inf for none
+    # least time to collision and post-encroachment time until the next decision begins; inf for
+    # none
     ttc_s: float = math.inf
     pet_s: float = math.inf
 
@@ -33,10 +36,12 @@ class Course:
 
     point: OperatingPoint  # the condition
     seed: int  # seed of the channel's draws
-    # the decision of each agent that has not acted yet; until it does, the agent keeps to its last action
+    # the decision of each agent that has not acted yet; until it does, the agent keeps to its last
+    # action
     open: dict[int, Decision] = field(default_factory=dict)
     last: dict[int, Decision] = field(default_factory=dict)  # the decision of each that began last
-    skipped: int = 0  # how many decisions did not begin, since one was still open when they were due
+    # how many decisions did not begin, since one was still open when they were due
+    skipped: int = 0
 
 
 @dataclass
@@ -50,7 +55,9 @@ class Trajectory:
     @property
     def under_way(self) -> list[int]:
         """The agents whose journey is not decided."""
-        return [agent for agent, journey in self.world.journeys.items() if not journey.outcome.ended]
+        return [
+            agent for agent, journey in self.world.journeys.items() if not journey.outcome.ended
+        ]
 
     def measure(self) -> None:
         """Add each agent's conflicts to its last decision in each course, and begin them anew."""
@@ -61,11 +68,14 @@ class Trajectory:
             journey.conflicts = journey.conflicts.anew()
 
     def act(self) -> list["Trajectory"]:
-        """Let the decisions that are ready act; return one trajectory for each set of targets that follow."""
+        """Let the decisions that are ready act;
+        return one trajectory for each set of targets that follow.
+        """
         world, agents = self.world, tuple(self.world.journeys)
         now = tuple(world.target(agent) for agent in agents)
         courses: dict[tuple[Target, ...], list[Course]] = {now: []}
-        taken: dict[tuple[Target, ...], dict[int, str]] = {}  # the actions by agent that set the targets
+        # the actions by agent that set the targets
+        taken: dict[tuple[Target, ...], dict[int, str]] = {}
         target_after: dict[tuple[int, str], Target] = {}
         for course in self.courses:
             ready = {
@@ -83,7 +93,9 @@ class Trajectory:
                 aims[agent], decision.acted = target_after[key], True
             following = tuple(aims.values())
             courses.setdefault(following, []).append(course)
-            taken.setdefault(following, {agent: decision.action for agent, decision in ready.items()})
+            taken.setdefault(
+                following, {agent: decision.action for agent, decision in ready.items()}
+            )
         parts = []
         waiting = [targets for targets, of in courses.items() if targets != now and of]
         for n, targets in enumerate(waiting, 1):
@@ -101,14 +113,18 @@ def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajec
 
     There is one trajectory for each way in which an episode continues, in the order of those given.
     """
-    running: list[tuple[tuple[int, ...], Trajectory]] = [((n,), t) for n, t in enumerate(trajectories)]
+    running: list[tuple[tuple[int, ...], Trajectory]] = [
+        ((n,), t) for n, t in enumerate(trajectories)
+    ]
     arrived = []
     while running:
         frames = [
             min((d.frame for c in t.courses for d in c.open.values()), default=until_frame + 1)
             for _, t in running
         ]
-        lockstep.advance([t.world for _, t in running], [min(frame, until_frame) for frame in frames])
+        lockstep.advance(
+            [t.world for _, t in running], [min(frame, until_frame) for frame in frames]
+        )
         branched = []
         for (order, trajectory), frame in zip(running, frames, strict=True):
             if trajectory.world.ended or frame > until_frame:

@@ -25,13 +25,19 @@ class Asking:
         if self.answer not in get_args(Form):
             raise unknown("answer", str(self.answer), get_args(Form))
         if self.prompt.image:
-            raise UserError(f"prompt {version} shows pictures, and here are texts alone; give another")
+            raise UserError(
+                f"prompt {version} shows pictures, and here are texts alone; give another"
+            )
         if reason := unfit(self.prompt, self.scenario):
-            raise UserError(f"prompt {version} {reason}; give another, such as {self.scenario.prompt}")
+            raise UserError(
+                f"prompt {version} {reason}; give another, such as {self.scenario.prompt}"
+            )
 
     @classmethod
     def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Ask by a prompt version, the scenario's own for None. Raises UserError if that cannot be."""
+        """Ask by a prompt version, the scenario's own for None.
+        Raises UserError if that cannot be.
+        """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 
     def chat(self, graph: SceneGraph) -> list[dict[str, str]]:

@@ -1,4 +1,6 @@
-"""Collect what helpers claim about themselves at decision points, and what the ego can check it against."""
+"""Collect what helpers claim about themselves at decision points,
+and what the ego can check it against.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,7 +38,9 @@ def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
 
 
 def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
-    """Return places (1+H, 2), speeds (H,) and sensed distances (H,); kept with the immutable scene."""
+    """Return places (1+H, 2), speeds (H,) and sensed distances (H,);
+    kept with the immutable scene.
+    """
     if (notes := scene.notes.get("claims")) is None:
         state, (ego, *names) = scene.state, scene.viewers
         helpers = [known(state, name, ego) for name in names]
@@ -64,7 +68,8 @@ def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
 def _map(scenario: Scenario) -> Callable[[Floats], Floats]:
     """Return the function from places (..., 2) to metres to the nearest path.
 
-    Places are relative to the centroid of the conflict zone. An absent vehicle, at NaN, is infinitely far.
+    Places are relative to the centroid of the conflict zone.
+    An absent vehicle, at NaN, is infinitely far.
     """
     road = scenario.road()
     paths = shapely.MultiLineString([path.points - road.zone_m for path in road.paths.values()])

@@ -1,8 +1,8 @@
 """What a run's questions cost, by the price in a card; and the most that a command may spend.
 
-Every completion that a model with a price is asked for counts, whatever becomes of it; one from the cache
-costs nothing. Each part of a run appends to a file in the working folder, so that a stopped run goes on
-counting.
+Every completion that a model with a price is asked for counts, whatever becomes of it; one from the
+cache costs nothing. Each part of a run appends to a file in the working folder, so that a stopped
+run goes on counting.
 """
 
 import math
@@ -57,17 +57,19 @@ class Budget:
         spent = math.fsum(map(float, text_of(self.file, "rows").split()))
         if spent >= self.most:
             raise Unanswered(
-                f"{spent:.4g} {self.currency} of --max-cost {self.most:g} are spent; all answers are kept, "
+                f"{spent:.4g} {self.currency} of --max-cost {self.most:g} are spent; all answers "
+                "are kept, "
                 "and the same command goes on, and may spend as much again"
             )
 
 
 @contextmanager
 def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | None]:
-    """Give the evaluations of a command what they may spend together; None for as much as they like.
+    """Give the evaluations of a command what they may spend together;
+    None for as much as they like.
 
-    Says on stderr which servers' models it does not count, since their cards state no price. Raises UserError
-    if it is not above 0, or no card states a price, or several currencies.
+    Says on stderr which servers' models it does not count, since their cards state no price. Raises
+    UserError if it is not above 0, or no card states a price, or several currencies.
     """
     if most is None:
         yield None
@@ -79,10 +81,16 @@ def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | Non
     if len(currencies := {price.currency for price in prices}) != 1:
         names = ", ".join(sorted({printable(card.name) for spec in specs for card in spec.cards}))
         reason = f"has prices in {' and '.join(sorted(currencies))}" if prices else "has no price"
-        raise UserError(f"{shown}: {names} {reason}; give its card a [price] with input, output and currency")
+        raise UserError(
+            f"{shown}: {names} {reason}; give its card a [price] with input, output and currency"
+        )
     cards = {card.name: card for spec in specs for card in spec.cards}
-    if free := sorted(printable(name) for name, card in cards.items() if card.server and not card.price):
-        print(f"harness: {shown}: {', '.join(free)} has no price and is not counted", file=sys.stderr)
+    if free := sorted(
+        printable(name) for name, card in cards.items() if card.server and not card.price
+    ):
+        print(
+            f"harness: {shown}: {', '.join(free)} has no price and is not counted", file=sys.stderr
+        )
     with tempfile.TemporaryDirectory(prefix="swarmdrive-") as folder:
         file = Path(folder) / "spent"
         file.touch()
@@ -105,8 +113,8 @@ def metered(
 class Metered:
     """A backend whose completions are counted; it is like the backend in all else.
 
-    `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many tokens
-    the last answers took, which a budget would never notice.
+    `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many
+    tokens the last answers took, which a budget would never notice.
     """
 
     def __init__(
@@ -124,21 +132,25 @@ class Metered:
             self._limit.check()
             if self._unsaid:
                 raise Unanswered(
-                    f"{printable(self._model)} does not say how many tokens its answers take, so --max-cost "
+                    f"{printable(self._model)} does not say how many tokens its answers take, so "
+                    "--max-cost "
                     "cannot hold; all answers are kept, and the same command without it goes on"
                 )
         completions = self._backend.complete(requests)
         counted = [
-            (each.prompt_tokens, each.completion_tokens) for each in completions
+            (each.prompt_tokens, each.completion_tokens)
+            for each in completions
             if each.prompt_tokens is not None and each.completion_tokens is not None
-        ]  # fmt: skip
+        ]
         read, written = (sum(n) for n in zip(*counted, strict=True)) if counted else (0, 0)
         uncounted = len(completions) - len(counted)
         self._unsaid = not counted and any(each.error is None for each in completions)
         if self._work:
             with appending(self._work / FILE) as file:
                 file.write(
-                    msgspec.json.encode(Asked(self._model, len(completions), uncounted, read, written))
+                    msgspec.json.encode(
+                        Asked(self._model, len(completions), uncounted, read, written)
+                    )
                     + b"\n"
                 )
         if self._limit:
@@ -147,7 +159,9 @@ class Metered:
 
 
 def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]:
-    """Return what the working folders' questions cost, by model; none without a price or a question."""
+    """Return what the working folders' questions cost, by model;
+    none without a price or a question.
+    """
     prices = {}
     for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):
         if price := model.get("price"):
@@ -160,8 +174,13 @@ def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]
                 sums.setdefault(asked.pop("model"), Counter()).update(asked)
     return {
         name: Cost(
-            prices[name].currency, round(prices[name].of(n["read"], n["written"]), 9),
-            n["asked"], n["uncounted"], n["read"], n["written"],
+            prices[name].currency,
+            round(prices[name].of(n["read"], n["written"]), 9),
+            n["asked"],
+            n["uncounted"],
+            n["read"],
+            n["written"],
         )
-        for name, n in sums.items() if name in prices
-    }  # fmt: skip
+        for name, n in sums.items()
+        if name in prices
+    }

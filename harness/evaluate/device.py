@@ -1,7 +1,8 @@
-"""Compute what answers cost on a declared computer, from their own tokens: seconds, and joules of a decision.
+"""Compute what answers cost on a declared computer, from their own tokens:
+seconds, and joules of a decision.
 
-Which helpers are in time follows from these seconds, never from the speed of this machine. A prefix that two
-prompts share is counted as read each time.
+Which helpers are in time follows from these seconds, never from the speed of this machine. A prefix
+that two prompts share is counted as read each time.
 """
 
 import math
@@ -35,12 +36,15 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
     for agent in agents:
         name = printable(agent.card.name)
         if not agent.can.language_model:
-            raise UserError(f"{flag}: {name} is no language model and counts no tokens; leave it out")
+            raise UserError(
+                f"{flag}: {name} is no language model and counts no tokens; leave it out"
+            )
         row = devices.find_row(device, model or agent.card.name.partition(":")[0])
         for rate in devices.RATES if row.answer_ms is None else ():
             if getattr(row, rate) is None:
                 raise UserError(
-                    f"{flag} states no {rate} of {printable(row.model)}, so it cannot time answers; "
+                    f"{flag} states no {rate} of {printable(row.model)}, so it cannot time "
+                    "answers; "
                     "give another device, or another --device-model"
                 )
         rows.append(row)
@@ -48,7 +52,9 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
 
 
 def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> Latency:
-    """Return the latency of answers timed by their own tokens on a device; arguments as in `rows_of`."""
+    """Return the latency of answers timed by their own tokens on a device;
+    arguments as in `rows_of`.
+    """
     rows, descriptions = rows_of(device, model, agents), []
     for agent, row in zip(agents, rows, strict=True):
         own_row = agent.card.name.partition(":")[0] == row.model
@@ -56,7 +62,9 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
         timed = ["answer_ms"] if row.answer_ms else devices.RATES
         rates = [cast("Constant", getattr(row, name)) for name in timed]
         origin = "; ".join(dict.fromkeys(f"{rate.status}: {rate.source}" for rate in rates))
-        joules = {c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES}
+        joules = {
+            c.status for name, c in devices.constants(device, row) if c and name in devices.JOULES
+        }
         descriptions.append(
             f"{answerer} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
             f"{' and '.join(sorted(joules)) or 'unknown'}; rates {origin})"
@@ -66,12 +74,15 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
 
 
 def answer_s(speed: Speed, answer: Answer) -> float:
-    """Return the seconds of one answer by its tokens, its repair turn included; NaN if the engine failed.
+    """Return the seconds of one answer by its tokens, its repair turn included;
+    NaN if the engine failed.
 
     Raises UserError if the answer has no token counts, and its model's time goes by them.
     """
     if speed.answer_s is not None:
-        return math.nan if answer.error is not None else speed.answer_s * answer.turns + answer.slow_s
+        return (
+            math.nan if answer.error is not None else speed.answer_s * answer.turns + answer.slow_s
+        )
     return devices.seconds(speed, *tokens(answer)) + answer.slow_s
 
 
@@ -80,10 +91,13 @@ def answer_j(speed: Speed, answer: Answer) -> float:
     return math.nan if speed.answer_s is not None else devices.joules(speed, *tokens(answer))
 
 
-def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]) -> Floats:
+def vehicles_j(
+    latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]
+) -> Floats:
     """Return the joules of each vehicle's own answer, (n, 1+H), the ego first.
 
-    It is NaN for an answer that is missing or that no tokens are known of, and 0 where there is no vehicle.
+    It is NaN for an answer that is missing or that no tokens are known of,
+    and 0 where there is no vehicle.
     """
     joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
     for n, scene in enumerate(scenes):
@@ -96,8 +110,8 @@ def vehicles_j(latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str
 def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
     """Return the joules of the helpers that infer, (n,).
 
-    `infers` (n, H) says who does; an attacker's further voices, behind the H vehicles, run no model.
-    `vehicles` (n, 1+H) has the joules of each vehicle's answer, the ego first.
+    `infers` (n, H) says who does; an attacker's further voices, behind the H vehicles, run no
+    model. `vehicles` (n, 1+H) has the joules of each vehicle's answer, the ego first.
     """
     count = min(infers.shape[1], vehicles.shape[1] - 1)
     own = vehicles[:, 1 : 1 + count]
@@ -107,7 +121,9 @@ def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
 def decided_helpers_j(
     latency: Latency, decided: "Sequence[Decided[Scene]]", answers: Mapping[str, Answer]
 ) -> Floats:
-    """Return the joules of the helpers that infer for each decision, (n,), in the order of `decided`."""
+    """Return the joules of the helpers that infer for each decision, (n,),
+    in the order of `decided`.
+    """
     of: dict[int, Floats] = {}
     parts = []
     for part in decided:
@@ -118,7 +134,8 @@ def decided_helpers_j(
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
-    """Return an answer's tokens in and out, of both turns if there were two; NaN if the engine failed.
+    """Return an answer's tokens in and out, of both turns if there were two;
+    NaN if the engine failed.
 
     Raises UserError if the answer has no token counts.
     """
@@ -133,14 +150,18 @@ def tokens(answer: Answer) -> tuple[float, float]:
 
 
 def energy(
-    device: Device, latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions,
+    device: Device,
+    latency: Latency,
+    points: "Sequence[OperatingPoint]",
+    decisions: Decisions,
     answers: Mapping[str, Answer],
-) -> dict[str, Floats]:  # fmt: skip
-    """Return the energy of each decision as columns (n,) by name; NaN where a part of it is unknown.
+) -> dict[str, Floats]:
+    """Return the energy of each decision as columns (n,) by name;
+    NaN where a part of it is unknown.
 
     `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call; `radio_mj`
-    millijoules to send the request and the replies; `waiting_j` joules of the ego's computer while it waits
-    for messages and does not infer. The decisions have `helpers_j` (`decided_helpers_j`).
+    millijoules to send the request and the replies; `waiting_j` joules of the ego's computer while
+    it waits for messages and does not infer. The decisions have `helpers_j` (`decided_helpers_j`).
     """
     ego_j, ego_s, call_j = _inference(latency, points, decisions, answers)
     sent_mj, idle_watts = np.full(len(decisions), np.nan), np.nan
@@ -148,8 +169,11 @@ def energy(
     sent = decisions["requests"] + decisions["messages"]
     for place, point in enumerate(points):
         here = condition == place
-        sent_mj[here] = 1000 * radio_j(device, point, decisions["airtime_ms"][here] / 1000, sent[here])
-        if point.cloud.round_trip_s is not None or point.cloud.round_trip:  # the ego's model is in a cloud
+        sent_mj[here] = 1000 * radio_j(
+            device, point, decisions["airtime_ms"][here] / 1000, sent[here]
+        )
+        # the ego's model is in a cloud
+        if point.cloud.round_trip_s is not None or point.cloud.round_trip:
             ego_j[condition == place], ego_s[condition == place] = np.nan, 0.0
     if device.idle_watts:
         idle_watts = device.idle_watts.value
@@ -164,8 +188,9 @@ def energy(
 def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages: Floats) -> Floats:
     """Return the joules to send messages, (n,), from their number and their total time on air.
 
-    A radio model has frames of its own, with what they hold besides a message. A declared channel has bits
-    and a bandwidth alone, so there each message takes a frame of the device profile at least.
+    A radio model has frames of its own, with what they hold besides a message. A declared channel
+    has bits and a bandwidth alone, so there each message takes a frame of the device profile at
+    least.
     """
     if device.frame_ms is not None and not point.physical:
         airtime_s = np.maximum(airtime_s, messages * device.frame_ms.value / 1000)
@@ -173,7 +198,9 @@ def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages
 
 
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
-    """Return the watts of a sending radio, by the channel's power or else the profile's; NaN if unknown."""
+    """Return the watts of a sending radio, by the channel's power or else the profile's;
+    NaN if unknown.
+    """
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
     dbm = float(getattr(innermost(point.channel), "power_dbm", device.transmit_dbm.value))
@@ -181,7 +208,10 @@ def transmit_watts(device: Device, point: "OperatingPoint") -> float:
 
 
 def _inference(
-    latency: Latency, points: "Sequence[OperatingPoint]", decisions: Decisions, answers: Mapping[str, Answer]
+    latency: Latency,
+    points: "Sequence[OperatingPoint]",
+    decisions: Decisions,
+    answers: Mapping[str, Answer],
 ) -> tuple[Floats, Floats, Floats]:
     """Return the ego's joules and seconds, and the joules of fusion calls, (n,) each."""
     egos = {answer.scene: answer for answer in answers.values() if answer.role == "ego"}

@@ -10,7 +10,8 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 
-# Added, where draws are keyed, to the numbers of episode and layout, once for each place after the ego's.
+# Added, where draws are keyed, to the numbers of episode and layout, once for each place after the
+# ego's.
 OF_ANOTHER_AGENT = 1 << 40
 
 
@@ -22,20 +23,25 @@ def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> 
 def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
     """Return the channel's draws for decisions (n,).
 
-    A link is up or down for a whole episode; jitter is drawn for each decision. The key is the seed and the
-    episode's layout, so every condition, prompt and model has the same draws, frozen and in the closed loop.
+    A link is up or down for a whole episode; jitter is drawn for each decision. The key is the seed
+    and the episode's layout, so every condition, prompt and model has the same draws, frozen and in
+    the closed loop.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)
     # One number for each pair: `np.unique` of rows takes several times as long.
-    pairs, pair_of_decision = np.unique(seed_index * len(layouts) + layout_index, return_inverse=True)
+    pairs, pair_of_decision = np.unique(
+        seed_index * len(layouts) + layout_index, return_inverse=True
+    )
     pair_index = np.divmod(pairs, max(len(layouts), 1))
     keys = zip(seeds[pair_index[0]].tolist(), layouts[pair_index[1]].tolist(), strict=True)
     uniforms = np.array([_channel_uniforms(s, layout, steps, helpers) for s, layout in keys])
     uniforms = uniforms.reshape(len(pairs), 2 + steps, helpers)
     trips = Trips(seed, layout_seed, step, steps)
     return Draws(
-        uniforms[pair_of_decision, :2].transpose(0, 2, 1), uniforms[pair_of_decision, 2 + step], trips
+        uniforms[pair_of_decision, :2].transpose(0, 2, 1),
+        uniforms[pair_of_decision, 2 + step],
+        trips,
     )
 
 
@@ -56,7 +62,10 @@ def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
     def drawn(tied: Bools) -> Floats:
         keys = (key[tied].tolist() for key in (trips.seed, trips.layout_seed, trips.step))
         return np.array(
-            [_tie_uniforms(seed, layout, trips.steps)[step] for seed, layout, step in zip(*keys, strict=True)]
+            [
+                _tie_uniforms(seed, layout, trips.steps)[step]
+                for seed, layout, step in zip(*keys, strict=True)
+            ]
         )
 
     return drawn

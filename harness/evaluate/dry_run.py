@@ -15,12 +15,13 @@ from harness.evaluate.spec import Spec
 
 
 def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any]:
-    """Return the settings, how many requests would be asked about the scenes, and the tokens of prompts.
+    """Return the settings, how many requests would be asked about the scenes,
+    and the tokens of prompts.
 
-    Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most. So are
-    fusion calls, of which there is one for each set of helpers that may be heard. `cost` has, by model with a
-    price, what the prompts cost, if their tokens can be counted, and answers of the greatest length; fusion
-    calls and repair turns are not in it.
+    Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most.
+    So are fusion calls, of which there is one for each set of helpers that may be heard. `cost`
+    has, by model with a price, what the prompts cost, if their tokens can be counted, and answers
+    of the greatest length; fusion calls and repair turns are not in it.
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
@@ -41,23 +42,35 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
             of = costs.setdefault(
                 card.name, {"currency": card.price.currency, "prompts": 0.0, "answers": 0.0}
             )
-            of["prompts"] = None if tokens is None else of["prompts"] + card.price.of(times * tokens, 0)
+            of["prompts"] = (
+                None if tokens is None else of["prompts"] + card.price.of(times * tokens, 0)
+            )
             of["answers"] += card.price.of(0, times * request.max_tokens)
     if calls := sum(1 for scene in scenes for _ in _fusion_calls(spec, scene)):
         asked["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
     return {
-        **spec.record(), "requests": asked.total(), "requests_by_role": dict(asked),
-        "scenes": len(scenes), "prompt_tokens": stats or None, **({"cost": costs} if costs else {}),
-    }  # fmt: skip
+        **spec.record(),
+        "requests": asked.total(),
+        "requests_by_role": dict(asked),
+        "scenes": len(scenes),
+        "prompt_tokens": stats or None,
+        **({"cost": costs} if costs else {}),
+    }
 
 
-def lacking(spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Container[str]) -> dict[str, int]:
-    """Return how many questions about some scenes have no answer yet, by role; `answers` are request ids.
+def lacking(
+    spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Container[str]
+) -> dict[str, int]:
+    """Return how many questions about some scenes have no answer yet, by role;
+    `answers` are request ids.
 
     All are counted that may be asked there, whoever is heard.
     """
-    lacks, sends = Counter[str](), any(point.asks and point.content.asks_helpers for point in spec.points)
+    lacks, sends = (
+        Counter[str](),
+        any(point.asks and point.content.asks_helpers for point in spec.points),
+    )
     for scene in dataset.scenes(scenes):
         viewers = spec.viewers(scene)
         own = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
@@ -70,7 +83,8 @@ def lacking(spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Contai
 def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
     """Yield the ids of the fusion calls that a scene needs at most.
 
-    Where messages are shuffled, each condition and seed may hear another layout, whose id stands open.
+    Where messages are shuffled, each condition and seed may hear another layout,
+    whose id stands open.
     """
     most, sources = dict[Rewrites, int](), dict[Rewrites, list[str]]()
     for point in spec.points:
@@ -78,7 +92,9 @@ def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
             rewrites = point.rewrites
             most[rewrites] = max(point.ask.max_helpers, most.get(rewrites, 0))
             open_ids = [f"{point.name}-{seed}" for seed in spec.seeds]
-            sources[rewrites] = [*sources.get(rewrites, ()), *open_ids] if rewrites.shuffled else [""]
+            sources[rewrites] = (
+                [*sources.get(rewrites, ()), *open_ids] if rewrites.shuffled else [""]
+            )
     helpers = scene.viewers[1:]
     for rewrites, others in most.items():
         for n in range(1, min(others, len(helpers)) + 1):
@@ -86,4 +102,6 @@ def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
                 for attacks in product((False, True) if rewrites.attack else (False,), repeat=n):
                     those = list(zip(heard, attacks, strict=True))
                     for source in sources[rewrites]:
-                        yield fusion_id(scene, [key_of(helper, rewrites, a, source) for helper, a in those])
+                        yield fusion_id(
+                            scene, [key_of(helper, rewrites, a, source) for helper, a in those]
+                        )

@@ -1,7 +1,7 @@
 """Ask a read-out once more with the list of actions reversed: does its likeliest action change?
 
-It measures how much the place in the list decides. It is a request of its own, so that the answer, its tokens
-and its time stay those of the list as it stands.
+It measures how much the place in the list decides. It is a request of its own, so that the answer,
+its tokens and its time stay those of the list as it stands.
 """
 
 from msgspec import UNSET, structs
@@ -9,18 +9,23 @@ from msgspec import UNSET, structs
 from harness.backends.base import Request
 from harness.runs.records import Answer
 
-STEP = 1.5e-6  # shares that differ by the last digit of a read-out's text, a millionth, are equally likely
+# shares that differ by the last digit of a read-out's text, a millionth, are equally likely
+STEP = 1.5e-6
 
 
 def wanted(request: Request, answer: Answer) -> bool:
-    """Return whether the reversed list is to be asked for: there is an answer to compare it with."""
+    """Return whether the reversed list is to be asked for:
+    there is an answer to compare it with.
+    """
     return bool(request.flips) and answer.intent is not None and answer.flipped is UNSET
 
 
 def asked(request: Request) -> Request:
     """Return the request whose list of actions is reversed."""
     messages, *orders = request.flips
-    return request.alike(messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1])
+    return request.alike(
+        messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1]
+    )
 
 
 def compared(answer: Answer, mirror: Answer) -> Answer:
@@ -30,7 +35,9 @@ def compared(answer: Answer, mirror: Answer) -> Answer:
     """
     if answer.intent is None or mirror.intent is None:
         return answer
-    return structs.replace(answer, flipped=not _likeliest(answer.intent) & _likeliest(mirror.intent[::-1]))
+    return structs.replace(
+        answer, flipped=not _likeliest(answer.intent) & _likeliest(mirror.intent[::-1])
+    )
 
 
 def _likeliest(p: tuple[float, ...]) -> set[int]:

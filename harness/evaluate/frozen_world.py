@@ -27,7 +27,8 @@ from harness.world.outcome import rating
 from harness.world.parameters import ROUNDING_FRAMES
 from harness.world.scenario import Scenario
 
-MOST_KNOWN = 20  # layouts for each that is asked: more would cost time, and hardly make an interval narrower
+# layouts for each that is asked: more would cost time, and hardly make an interval narrower
+MOST_KNOWN = 20
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,17 @@ class FrozenSource:
     def record(self) -> FrozenScenes:
         p = self.scenario.parameters
         return FrozenScenes(
-            name=self.dataset.name, sha256=self.dataset.sha256, nodes=self.dataset.nodes,
-            episodes=len(self.dataset.episodes), limit=self.selection.limit,
-            delay_allowance_s=p.delay_allowance_s, decision_lag_s=p.decision_lag_s,
-            path=str(self.dataset.path), selection=self.selection.given,
+            name=self.dataset.name,
+            sha256=self.dataset.sha256,
+            nodes=self.dataset.nodes,
+            episodes=len(self.dataset.episodes),
+            limit=self.selection.limit,
+            delay_allowance_s=p.delay_allowance_s,
+            decision_lag_s=p.decision_lag_s,
+            path=str(self.dataset.path),
+            selection=self.selection.given,
             looks=self.until.record(len(self.dataset.episodes)) if self.until else None,
-        )  # fmt: skip
+        )
 
     @property
     def numbers(self) -> Sequence[int]:
@@ -75,11 +81,15 @@ class FrozenSource:
         numbers, selection = self.dataset.episodes[: looks.at[-1]], self.selection
         if len(numbers) < looks.layouts:
             selection = replace(selection, limit=len(numbers))
-        dataset, until = self.dataset.of_episodes(frozenset(numbers)), self.until and self.until.after(looks)
+        dataset, until = (
+            self.dataset.of_episodes(frozenset(numbers)),
+            self.until and self.until.after(looks),
+        )
         return FrozenSource(dataset, selection, until)
 
     def layouts(self, asked: int) -> list[Layout]:
-        """Return how hard the layouts are that might have been asked; the source's first so many were.
+        """Return how hard the layouts are that might have been asked;
+        the source's first so many were.
 
         There are none if no others might have been, or so few were that nothing can be corrected.
         """
@@ -104,9 +114,11 @@ class FrozenSource:
     def settings(self) -> FrozenSettings:
         given: dict[str, Any] = self.selection.given
         return FrozenSettings(
-            dataset=str(argument(self.dataset.path)), limit=self.selection.limit, **given,
+            dataset=str(argument(self.dataset.path)),
+            limit=self.selection.limit,
+            **given,
             **(self.until.settings() if self.until else {}),
-        )  # fmt: skip
+        )
 
 
 class _Walks:
@@ -140,14 +152,18 @@ class _Layout(NamedTuple):
 class FrozenWorld(SceneWorld):
     """Walks every episode of a dataset under all conditions and seeds.
 
-    An action always takes effect one lag of the dataset after its decision point, however long it took.
+    An action always takes effect one lag of the dataset after its decision point,
+    however long it took.
     """
 
-    def __init__(self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]) -> None:
+    def __init__(
+        self, dataset: Dataset, points: Sequence[OperatingPoint], seeds: Sequence[int]
+    ) -> None:
         self._dataset, self._forest, self._seeds = dataset, dataset.forest, np.array(seeds)
         self.scenario = dataset.scenario
         self._walks = {point: _Walks(len(seeds), self._forest.root) for point in points}
-        self._decided: list[tuple[Ints, Ints, Floats]] = []  # where, which action, after how many seconds
+        # where, which action, after how many seconds
+        self._decided: list[tuple[Ints, Ints, Floats]] = []
         self._luck: tuple[Bools, Draws] | None = None  # of the decision points just shown
 
     def observe(self) -> Sequence[Scene]:
@@ -169,7 +185,8 @@ class FrozenWorld(SceneWorld):
         return Due(at, forest.episodes[tree], self._seeds[seed_index], draws)
 
     def _draws(self) -> tuple[Bools, Draws]:
-        """Return which seeds and episodes have a decision now under any condition, (S, E), and their draws.
+        """Return which seeds and episodes have a decision now under any condition,
+        (S, E), and their draws.
 
         All decisions of an episode that are due now are of one step, whatever their condition.
         """
@@ -204,20 +221,24 @@ class FrozenWorld(SceneWorld):
             self._decided.append((at, action, part.result.latency_s))
 
     def columns(self) -> dict[str, Any]:
-        """Return as columns what each decision and every other action was worth, in decision order."""
+        """Return as columns what each decision and every other action was worth,
+        in decision order.
+        """
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
         taken = np.ceil(np.nan_to_num(latency_s) * p.simulation_hz - ROUNDING_FRAMES)  # as `frames`
         return {
-            "value": forest.value[at], "safe": forest.safe[at, action],
+            "value": forest.value[at],
+            "safe": forest.safe[at, action],
             "regret": np.where(forest.value[at], ~forest.safe[at, action], np.nan),
             "delay_s": forest.delay_s[at, action],
-            "miss": forest.miss[at, action], "false_alarm": forest.false_alarm[at, action],
+            "miss": forest.miss[at, action],
+            "false_alarm": forest.false_alarm[at, action],
             "off_lag": np.where(np.isnan(latency_s), np.nan, taken != p.lag_frames),
             **{name: values[forest.edge[at, action]] for name, values in forest.conflicts.items()},
             **by_action("safe", forest.safe[at], forest.actions),
             **by_action("delay_s", forest.delay_s[at], forest.actions),
-        }  # fmt: skip
+        }
 
     @property
     def numbers(self) -> Ints:
@@ -225,14 +246,17 @@ class FrozenWorld(SceneWorld):
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
-        """Return success, failure and lateness under a condition, (S, E); NaN where a walk was left out.
+        """Return success, failure and lateness under a condition, (S, E);
+        NaN where a walk was left out.
 
         Success with a danger and without is NaN in the other episodes as well.
         """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
-        unsafe = ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
+        unsafe = (
+            ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
+        )
         ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
         known = {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
         dangerous = np.array([danger is not None for danger in self._forest.dangers])
@@ -243,23 +267,37 @@ class FrozenWorld(SceneWorld):
         seeds, earliest_s = forest.seeds.tolist(), forest.earliest_s[forest.root].min(axis=-1)
         layouts = [
             _Layout(
-                number, seed, danger or "none", earliest_s=earliest, reference_s=reference,
+                number,
+                seed,
+                danger or "none",
+                earliest_s=earliest,
+                reference_s=reference,
                 radios=radios(self.scenario, seed, danger),
             )
             for number, seed, danger, earliest, reference in zip(
-                forest.episodes.tolist(), seeds, forest.dangers, earliest_s.tolist(),
-                forest.reference_s.tolist(), strict=True,
+                forest.episodes.tolist(),
+                seeds,
+                forest.dangers,
+                earliest_s.tolist(),
+                forest.reference_s.tolist(),
+                strict=True,
             )
-        ]  # fmt: skip
+        ]
         return [
-            self._episode(point.name, seed, layout, [forest.edges[n] for n in taken if n >= 0], success)
+            self._episode(
+                point.name, seed, layout, [forest.edges[n] for n in taken if n >= 0], success
+            )
             for point, walks in self._walks.items()
-            for seed, taken_here, successes in zip(self._seeds.tolist(), *self._taken(walks), strict=True)
+            for seed, taken_here, successes in zip(
+                self._seeds.tolist(), *self._taken(walks), strict=True
+            )
             for layout, taken, success in zip(layouts, taken_here, successes, strict=True)
         ]
 
     def _taken(self, walks: _Walks) -> tuple[list[list[list[int]]], list[list[bool]]]:
-        """Return the edges that each walk took, (S, E, steps) with -1 after its end, and its success."""
+        """Return the edges that each walk took, (S, E, steps) with -1 after its end,
+        and its success.
+        """
         success = self._forest.succeeds(walks.last, np.arange(len(self._forest.root)))
         return np.stack(walks.edges, axis=-1).tolist(), success.tolist()
 
@@ -272,14 +310,24 @@ class FrozenWorld(SceneWorld):
         failure = "" if success else "late" if cleared else end.result
         reference_s = layout.reference_s
         return Episode(
-            condition=condition, seed=seed, episode=layout.episode, layout_seed=layout.seed,
-            danger=layout.danger, success=success, failure=failure,
+            condition=condition,
+            seed=seed,
+            episode=layout.episode,
+            layout_seed=layout.seed,
+            danger=layout.danger,
+            success=success,
+            failure=failure,
             outcome=rating(failure, self.scenario.parameters),
             time_lost_s=round(end.time_s - layout.earliest_s, 3) if cleared else None,
-            delay_s=round(end.time_s - reference_s, 3) if cleared and isfinite(reference_s) else None,
-            time_s=end.time_s, partner=end.partner, striker=end.striker, fault=end.fault,
+            delay_s=round(end.time_s - reference_s, 3)
+            if cleared and isfinite(reference_s)
+            else None,
+            time_s=end.time_s,
+            partner=end.partner,
+            striker=end.striker,
+            fault=end.fault,
             least_gap_m=min([edge.least_gap_m for edge in edges]),
             hard_brakings=sum([edge.hard_brakings for edge in edges]),
             other_crashes=sum([edge.other_crashes for edge in edges]),
             **layout.radios,
-        )  # fmt: skip
+        )

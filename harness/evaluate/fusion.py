@@ -1,8 +1,9 @@
 """Make fusion calls: the ego's model answers with the messages that arrived in its prompt.
 
-Who is heard depends on the channel and not on the fusion. So the sets of messages that any condition and seed
-hears are known before the first call, and each set needs one call. What a plan says depends on the rounds
-before, so it stands in its sender's key, and equal plans are one question.
+Who is heard depends on the channel and not on the fusion. So the sets of messages that any
+condition and seed hears are known before the first call, and each set needs one call. What a plan
+says depends on the rounds before, so it stands in its sender's key, and equal plans are one
+question.
 """
 
 import json
@@ -31,15 +32,20 @@ WORDS = "words"  # in a key, after what the graph is extended by: the prompt sho
 class FusionAnswers:
     """The ego's answers to K sets of messages; H helpers, A actions."""
 
-    codes: Ints  # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
+    # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
+    codes: Ints
     intents: Floats  # the intent after each set, (K, A); NaN where the answer failed
     seconds: Floats  # time of each fusion call, (K,)
 
     def at(self, points: Ints, attackers: Bools | None = None) -> FusionCall:
-        """Return the call for decisions at points (n,), with attackers (n, H) if the text shows them."""
+        """Return the call for decisions at points (n,),
+        with attackers (n, H) if the text shows them.
+        """
         return partial(self._of_heard, points, attackers)
 
-    def _of_heard(self, points: Ints, attackers: Bools | None, on_time: Bools) -> tuple[Floats, Floats]:
+    def _of_heard(
+        self, points: Ints, attackers: Bools | None, on_time: Bools
+    ) -> tuple[Floats, Floats]:
         """Return intents (n, A) and seconds (n,) by who was heard (n, H); NaN if nobody was."""
         heard_any = on_time.any(axis=1)
         codes = codes_of(on_time, points, attackers)[heard_any]
@@ -48,7 +54,9 @@ class FusionAnswers:
         if len(codes):
             index = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
             if not len(self.codes) or not np.array_equal(self.codes[index], codes):
-                raise LookupError("the ego's model was never asked about a set of messages that was heard")
+                raise LookupError(
+                    "the ego's model was never asked about a set of messages that was heard"
+                )
             intents[heard_any], seconds[heard_any] = self.intents[index], self.seconds[index]
         return intents, seconds
 
@@ -63,7 +71,9 @@ def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> In
 
 
 def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
-    """Decode a number: the decision point, the helpers heard, from 0, and those of them that attack."""
+    """Decode a number: the decision point, the helpers heard, from 0,
+    and those of them that attack.
+    """
     bits = helpers * (1 + attacked)
     heard = [h for h in range(helpers) if code >> h & 1]
     return code >> bits, heard, [h for h in heard if attacked and code >> (helpers + h) & 1]
@@ -72,8 +82,9 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
     """Return the key of a helper's message in a fusion call.
 
-    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, `v2!objects` where the
-    ego's graph has its objects, or `v2!objects&from:00012-3` where it comes from another scene, the `source`.
+    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, `v2!objects`
+    where the ego's graph has its objects, or `v2!objects&from:00012-3` where it comes from another
+    scene, the `source`.
     """
     changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
     if rewrites.graph:
@@ -86,10 +97,11 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
 
 
 def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools) -> list[str]:
-    """Return the keys of the plans that an agent, the one of this row, has heard by `on_time`, (H,).
+    """Return the keys of the plans that an agent, the one of this row,
+    has heard by `on_time`, (H,).
 
-    Such as `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: its sender's number, its intent, and the seconds in which it
-    reaches the conflict, and that it has lost.
+    Such as `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: its sender's number, its intent, and the seconds in
+    which it reaches the conflict, and that it has lost.
     """
     plans = intents.plans
     assert plans is not None
@@ -112,17 +124,23 @@ def _plan_of(key: str) -> dict[str, Any] | None:
     try:
         number, intent, reaches_s, lost_s = parts
         return {
-            "sender": sender, "number": int(number), "intent": [float(share) for share in intent.split(",")],
-            "reaches_s": None if reaches_s == "inf" else float(reaches_s), "lost_s": float(lost_s),
-        }  # fmt: skip
+            "sender": sender,
+            "number": int(number),
+            "intent": [float(share) for share in intent.split(",")],
+            "reaches_s": None if reaches_s == "inf" else float(reaches_s),
+            "lost_s": float(lost_s),
+        }
     except ValueError:
         raise UserError(
-            f"answers.jsonl has an answer that heard {printable(key)!r}, which is no plan; make the run again"
+            f"answers.jsonl has an answer that heard {printable(key)!r}, which is no plan; make "
+            "the run again"
         ) from None
 
 
 def changes_of(key: str) -> list[str]:
-    """Return how the message of a sender's key was changed, and what it holds if not an intent alone."""
+    """Return how the message of a sender's key was changed,
+    and what it holds if not an intent alone.
+    """
     changes = key.partition(REWRITTEN)[2].split("&")
     return [change for change in changes if change and not change.startswith(FROM)]
 
@@ -136,10 +154,12 @@ def source_of(scene: str, senders: Sequence[str]) -> str:
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return these helpers' messages as a prompt takes them; `answers` are those of their scene, by key.
+    """Return these helpers' messages as a prompt takes them;
+    `answers` are those of their scene, by key.
 
-    One that holds words alone has a `sender` and `evidence`, in one line. An agent's plan has a `sender`, its
-    `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`; it needs no answer.
+    One that holds words alone has a `sender` and `evidence`, in one line. An agent's plan has a
+    `sender`, its `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`; it
+    needs no answer.
     """
     messages = []
     for sender in senders:
@@ -173,9 +193,16 @@ def _rewritten(message: dict[str, Any], change: str, actions: Sequence[str]) -> 
         return message
     p = np.array([[message["intent"]]])
     one_helper = Intents(
-        np.full((1, p.shape[-1]), np.nan), p, np.ones((1, 1), dtype=bool), np.zeros((1, 2)), np.zeros((1, 1)),
-        np.zeros((1, 1)), np.zeros((1, 2)),
-    )  # fmt: skip
-    turn = Turn(one_helper, np.ones((1, 1), dtype=bool), p, np.empty((1, 0, *p.shape[1:])), np.zeros((1, 1)))
+        np.full((1, p.shape[-1]), np.nan),
+        p,
+        np.ones((1, 1), dtype=bool),
+        np.zeros((1, 2)),
+        np.zeros((1, 1)),
+        np.zeros((1, 1)),
+        np.zeros((1, 2)),
+    )
+    turn = Turn(
+        one_helper, np.ones((1, 1), dtype=bool), p, np.empty((1, 0, *p.shape[1:])), np.zeros((1, 1))
+    )
     intent = attack.act(one_helper, turn).helpers[0, 0].tolist()
     return {**attack.rewritten(message, actions), "intent": intent}

@@ -1,7 +1,8 @@
 """Hooks that follow a run while it goes, of which a user chooses some by name.
 
-A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails, ends the program or
-hangs costs a run nothing but time: one line on stderr says so, and it follows that run no further.
+A package adds one by an entry point in the group `swarmdrive.hooks`. A hook that fails, ends the
+program or hangs costs a run nothing but time: one line on stderr says so, and it follows that run
+no further.
 """
 
 import os
@@ -23,7 +24,8 @@ from harness.core.strangers import strangers
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
 
-CHOSEN = "SWARMDRIVE_TRACKERS"  # environment variable: names, with commas, where a command names none
+# environment variable: names, with commas, where a command names none
+CHOSEN = "SWARMDRIVE_TRACKERS"
 PATIENCE_S = 20.0  # within which a hook must come back: its server may be away
 SENDING_S = 120.0  # the same at the end of a run: it may send a page over a slow line
 STOPPED_S = 10.0  # the same where the run was stopped, and somebody waits
@@ -45,7 +47,9 @@ class Hook(Protocol):
         ...
 
     def answered(self, total: int) -> None:
-        """Take note that there are so many answers, or in closed loop episodes, kept ones included."""
+        """Take note that there are so many answers, or in closed loop episodes,
+        kept ones included.
+        """
         ...
 
     def end(self, done: "Evaluated | None") -> None:
@@ -72,12 +76,15 @@ def chosen(names: Iterable[str]) -> dict[str, Hook]:
     for name, hook in hooks.items():
         needs = getattr(hook, "needs", ())
         if isinstance(needs, tuple):  # a package's may be anything
-            extras.need(f"{where}{name}", *(module for module in extras.OPTIONAL if module in needs))
+            extras.need(
+                f"{where}{name}", *(module for module in extras.OPTIONAL if module in needs)
+            )
     return hooks
 
 
 class _Caller:
-    """A thread that calls one hook, in the order in which it is asked to, since hooks keep things by thread.
+    """A thread that calls one hook, in the order in which it is asked to,
+    since hooks keep things by thread.
 
     A hook that hangs leaves its thread, which ends with the program.
     """
@@ -90,8 +97,9 @@ class _Caller:
     def call(self, method: str, arguments: tuple[Any, ...], patience_s: float) -> None:
         """Call a method.
 
-        Raises what it raises, and TimeoutError if it takes longer than `patience_s`. An interrupt that comes
-        meanwhile gets a note: a hook can send it as well as Ctrl-C, and nothing tells them apart.
+        Raises what it raises, and TimeoutError if it takes longer than `patience_s`. An interrupt
+        that comes meanwhile gets a note: a hook can send it as well as Ctrl-C, and nothing tells
+        them apart.
         """
         try:
             self._call(method, arguments, patience_s)
@@ -123,9 +131,13 @@ class _Caller:
 
 
 class Followers:
-    """Some hooks during one run. It begins for them with its first answer, or when it ends with none new."""
+    """Some hooks during one run. It begins for them with its first answer,
+    or when it ends with none new.
+    """
 
-    def __init__(self, hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> None:
+    def __init__(
+        self, hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]
+    ) -> None:
         self._callers = {name: _Caller(name, hook) for name, hook in hooks.items()}
         self._begun, self._total = False, 0
         self._folder, self._settings = folder, settings
@@ -165,7 +177,9 @@ class Followers:
 
 
 @contextmanager
-def following(hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]) -> Iterator[Followers]:
+def following(
+    hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]
+) -> Iterator[Followers]:
     """Have hooks follow a run; if it is stopped, they learn that it ended so."""
     followers = Followers(hooks, folder, settings)
     try:

@@ -1,4 +1,6 @@
-"""Keep the answers of unfinished work in a file of chunks, so that a killed run resumes where it was."""
+"""Keep the answers of unfinished work in a file of chunks,
+so that a killed run resumes where it was.
+"""
 
 import math
 import os
@@ -18,17 +20,20 @@ _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
 class KeptAnswers:
-    """A file of answers, one a line, whose last chunk may be torn; one process at a time may append."""
+    """A file of answers, one a line, whose last chunk may be torn;
+    one process at a time may append.
+    """
 
     def __init__(self, file: Path) -> None:
         self.file = file
         self._read_b, self._on_disk_s = 0, -math.inf  # bytes that were read or written here
 
     def recall(self, cut: bool = False) -> dict[str, Answer]:
-        """Read the answers by request id; none if the file has nothing new. `cut` removes a torn chunk.
+        """Read the answers by request id; none if the file has nothing new.
+        `cut` removes a torn chunk.
 
-        A question without an answer does not count, wherever the file comes from. Raises UserError if the
-        file is damaged.
+        A question without an answer does not count, wherever the file comes from.
+        Raises UserError if the file is damaged.
         """
         if not self.file.is_file() or (size_b := self.file.stat().st_size) == self._read_b:
             return {}
@@ -39,7 +44,8 @@ class KeptAnswers:
             answers = [_DECODER.decode(line) for line in lines]
         except (ValueError, RecursionError) as error:
             raise UserError(
-                f"{printable(self.file)} is damaged ({printable(error)}); delete its folder and start again"
+                f"{printable(self.file)} is damaged ({printable(error)}); delete its folder and "
+                "start again"
             ) from None
         self._read_b = sum(map(len, lines))
         if cut and self._read_b < size_b:

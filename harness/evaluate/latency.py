@@ -1,7 +1,8 @@
 """Choose the inference times that decide which helpers are heard in time.
 
-They come from the paper, a card, the user or a device profile, or are measured. They are fixed before a run,
-so that its own speed changes none of its rows. The times that its answers took are recorded beside them.
+They come from the paper, a card, the user or a device profile, or are measured. They are fixed
+before a run, so that its own speed changes none of its rows. The times that its answers took are
+recorded beside them.
 """
 
 import math
@@ -27,8 +28,11 @@ NAMES = ("card", MEASURED, "paper")
 EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 
-def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]) -> Latency | None:
-    """Return the latency that `--latency` chooses for the ego's agent, then the helpers'; None to measure it.
+def known(
+    choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]
+) -> Latency | None:
+    """Return the latency that `--latency` chooses for the ego's agent, then the helpers';
+    None to measure it.
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
     """
@@ -36,7 +40,9 @@ def known(choice: str | None, agents: Sequence[Agent], backends: Sequence[Backen
         return declared(choice)
     if choice == MEASURED:
         return None
-    latencies = [_of_agent(choice, agent, backend) for agent, backend in zip(agents, backends, strict=True)]
+    latencies = [
+        _of_agent(choice, agent, backend) for agent, backend in zip(agents, backends, strict=True)
+    ]
     return mixed(latencies[0], latencies[1:])
 
 
@@ -55,37 +61,49 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
         return ego
     if any(each.speeds for each in (ego, *helpers)):
         raise UserError(
-            "a replay of a run with a device profile has that run's times; give --device-profile anew, or "
+            "a replay of a run with a device profile has that run's times; give --device-profile "
+            "anew, or "
             "--latency"
         )
     basis = " + ".join(dict.fromkeys(each.basis for each in helpers))
     return replace(
-        ego, basis=ego.basis if basis == ego.basis else f"ego: {ego.basis}; helpers: {basis}",
+        ego,
+        basis=ego.basis if basis == ego.basis else f"ego: {ego.basis}; helpers: {basis}",
         helper_s=helpers[0].helper_s,
-        helpers_s=tuple(each.helper_s for each in helpers) if len(helpers) > 1 else helpers[0].helpers_s,
-    )  # fmt: skip
+        helpers_s=tuple(each.helper_s for each in helpers)
+        if len(helpers) > 1
+        else helpers[0].helpers_s,
+    )
 
 
 def declared(text: str) -> Latency:
-    """Parse a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds; a role left out has the ego's.
+    """Parse a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds;
+    a role left out has the ego's.
 
-    Several helper models have one time each: `helper=0.164:0.2`. Raises UserError for any other text.
+    Several helper models have one time each: `helper=0.164:0.2`.
+    Raises UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     try:
         seconds = {role: [float(part) for part in value.split(":")] for role, _, value in pairs}
     except ValueError:
         seconds = {}
-    ego, helper, fusion = (seconds.get(r, seconds.get("ego", [np.nan])) for r in ("ego", "helper", "fusion"))
+    ego, helper, fusion = (
+        seconds.get(r, seconds.get("ego", [np.nan])) for r in ("ego", "helper", "fusion")
+    )
     roles_once = len(seconds) == len(pairs) and seconds.keys() <= {"ego", "helper", "fusion"}
     one_each = len(ego) == len(fusion) == 1
     if not (roles_once and one_each and all(0 <= s <= LONGEST_S for s in (*ego, *helper, *fusion))):
         raise UserError(
-            f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or by role the seconds of one "
-            f"answer, 0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed; a role left out has its time)"
+            f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or by role the seconds of "
+            "one "
+            f"answer, 0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed; a role left out has "
+            "its time)"
         )
     several = tuple(helper) if len(helper) > 1 else ()
-    return Latency("declared", "declared: --latency " + text, ego[0], helper[0], fusion[0], helpers_s=several)
+    return Latency(
+        "declared", "declared: --latency " + text, ego[0], helper[0], fusion[0], helpers_s=several
+    )
 
 
 def as_declared(latency: Latency) -> str:
@@ -99,14 +117,20 @@ def inference_s(
 ) -> Floats:
     """Return the seconds of inference, (n, 1+H), of who decides first; NaN without an answer.
 
-    `places` say whose model answers, as in `Latency.speed`: with one model for all, the role alone counts.
-    A repair turn takes the time of one more answer. An answer's own declared delay (`slow_s`) is added.
+    `places` say whose model answers, as in `Latency.speed`: with one model for all, the role alone
+    counts. A repair turn takes the time of one more answer. An answer's own declared delay
+    (`slow_s`) is added.
     """
     if latency.speeds:
-        return np.array([
-            [answer_s(latency.speed(place), a) if a else np.nan for place, a in zip(of, row, strict=True)]
-            for of, row in zip(places, answers, strict=True)
-        ])  # fmt: skip
+        return np.array(
+            [
+                [
+                    answer_s(latency.speed(place), a) if a else np.nan
+                    for place, a in zip(of, row, strict=True)
+                ]
+                for of, row in zip(places, answers, strict=True)
+            ]
+        )
     turns = np.array([[a.turns if a else np.nan for a in row] for row in answers])
     slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
     by_place = [latency.ego_s, *islice(cycle(latency.helper_times_s()), slow.shape[1] - 1)]
@@ -119,14 +143,18 @@ def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int])
     A vehicle with a helper model takes as long as for any other answer.
     """
     if latency.speeds:
-        return np.array([answer_s(latency.speed(n), a) for n, a in zip(places, answers, strict=True)])
+        return np.array(
+            [answer_s(latency.speed(n), a) for n, a in zip(places, answers, strict=True)]
+        )
     by_place = [latency.fusion_s, *islice(cycle(latency.helper_times_s()), max(places, default=0))]
     seconds = [cast("float", by_place[n]) for n in places]
     return np.array([s * a.turns + a.slow_s for s, a in zip(seconds, answers, strict=True)])
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """Return, by role, how long answers took; only those that were timed and came at the first attempt."""
+    """Return, by role, how long answers took;
+    only those that were timed and came at the first attempt.
+    """
     by_role: dict[str, list[Answer | AnswerFacts]] = {}
     for answer in answers:
         if answer.seconds is not None and answer.error is None and not answer.retries:
@@ -143,7 +171,9 @@ def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
 
 def _times(answers: Sequence[Answer | AnswerFacts], which: str) -> Times | None:
     """Return percentiles of the answers' time in the field `which`; None if no answer has it."""
-    timed = [(s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None]
+    timed = [
+        (s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None
+    ]
     if not timed:
         return None
     values, episodes = np.array([s for s, _ in timed]), [episode for _, episode in timed]

@@ -39,10 +39,19 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
         msgspec.structs.force_setattr(self, "versions", formats.versions(self.versions))
 
     def facts(self) -> dict[str, Any]:
-        """Return what must be the same in all shards of a run, by the name that an error gives it."""
-        versions = {f"version of {name}": v for name, v in self.versions.items() if name != "platform"}
+        """Return what must be the same in all shards of a run,
+        by the name that an error gives it.
+        """
+        versions = {
+            f"version of {name}": v for name, v in self.versions.items() if name != "platform"
+        }
         latency = msgspec.to_builtins(self.latency)
-        return {**_comparable(self.settings), "model": self.identity, "inference times": latency, **versions}
+        return {
+            **_comparable(self.settings),
+            "model": self.identity,
+            "inference times": latency,
+            **versions,
+        }
 
 
 @dataclass(frozen=True)
@@ -55,15 +64,25 @@ class Evaluated:
 
 
 def begin(
-    spec: Spec, out: Path, begun: RunStart | None, identity: dict[str, Any], latency: Latency, shard: str = ""
+    spec: Spec,
+    out: Path,
+    begun: RunStart | None,
+    identity: dict[str, Any],
+    latency: Latency,
+    shard: str = "",
 ) -> RunStart:
     """Return `begun`, or a new record. Raises UserError if the run began with another model."""
     if begun is None:
         return RunStart(
-            settings=spec.record(), shard=shard, created=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=words(spec.settings), identity=identity, tags=spec.settings.tag, latency=latency,
+            settings=spec.record(),
+            shard=shard,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=words(spec.settings),
+            identity=identity,
+            tags=spec.settings.tag,
+            latency=latency,
             versions=versions(),
-        )  # fmt: skip
+        )
     if not same_model(begun.identity, identity):
         raise UserError(
             f"--out {printable(out)} was begun with {another_model(spec)}; delete it, or choose "
@@ -79,9 +98,11 @@ def another_model(spec: Spec) -> str:
 
 
 def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunStart:
-    """Return the record of a run that finishes: tags of both commands, and where its dataset is now.
+    """Return the record of a run that finishes:
+    tags of both commands, and where its dataset is now.
 
-    One that was looked at states the layouts that it stopped after; its command still says when to stop.
+    One that was looked at states the layouts that it stopped after;
+    its command still says when to stop.
     """
     spec = spec.changed(tag=tuple(dict.fromkeys((*begun.tags, *spec.settings.tag))))
     # A repeat must not measure: other times would make other rows.
@@ -89,7 +110,11 @@ def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunS
         spec = spec.changed(latency=latencies.as_declared(begun.latency))
     record = {**_stopped(spec, looks).record(), "settings": msgspec.to_builtins(spec.settings)}
     return msgspec.structs.replace(
-        begun, settings=record, tags=spec.settings.tag, command=words(spec.settings), versions=versions()
+        begun,
+        settings=record,
+        tags=spec.settings.tag,
+        command=words(spec.settings),
+        versions=versions(),
     )
 
 
@@ -98,7 +123,9 @@ def _stopped(spec: Spec, looks: Looks | None) -> Spec:
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
-    """Return the record of a stopped run in a folder, or None. Raises UserError if it is another run."""
+    """Return the record of a stopped run in a folder, or None.
+    Raises UserError if it is another run.
+    """
     begun = work.begun(out, RunStart)
     if begun:
         now = {**_comparable(spec.record()), "shard": shard}
@@ -109,7 +136,9 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
 
 
 def _options(spec: Spec, command: str) -> str:
-    """Return in which options a run's command differs from this one; empty for none, or no such command."""
+    """Return in which options a run's command differs from this one;
+    empty for none, or no such command.
+    """
     with suppress(UserError, ValueError):  # a stranger's run may state any command
         before, now = difference(of_words(shlex.split(command)), spec.settings)
         return before and f"{before}, and not with {now}"
@@ -117,7 +146,9 @@ def _options(spec: Spec, command: str) -> str:
 
 
 def _rules(versions: Mapping[str, str]) -> dict[str, str]:
-    """Return the versions of the rules that make decisions of answers: parts of a run have the same."""
+    """Return the versions of the rules that make decisions of answers:
+    parts of a run have the same.
+    """
     return {f"version of {name}": versions[name] for name in formats.VERSIONS}
 
 
@@ -133,7 +164,8 @@ def refuse_finished(out: Path) -> None:
     """Raise UserError if a folder holds a finished run."""
     if (out / "run.json").exists():
         raise UserError(
-            f"--out {printable(out)} already holds a finished run; choose another folder or delete it"
+            f"--out {printable(out)} already holds a finished run; choose another folder or delete "
+            "it"
         )
 
 
@@ -146,7 +178,8 @@ def finished(spec: Spec, out: Path) -> Evaluated:
 def finished_with(
     settings: Mapping[str, Any], out: Path, typed: Callable[[str], str] = lambda command: ""
 ) -> Evaluated:
-    """Return the finished run in a folder, checked against settings. Raises UserError as `finished`.
+    """Return the finished run in a folder, checked against settings.
+    Raises UserError as `finished`.
 
     `typed` says of the run's command in which options this one differs.
     """
@@ -161,13 +194,16 @@ def finished_with(
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return what must be the same when a run resumes, by the names that an error gives it.
 
-    Of its settings these are those that open nothing. The dataset's path is left out, since its folder may
-    move between two commands. What is no table, as in a damaged record, is another world.
+    Of its settings these are those that open nothing. The dataset's path is left out, since its
+    folder may move between two commands. What is no table, as in a damaged record, is another
+    world.
     """
     world, plain = (_named(settings.get(name)) for name in ("world", "settings"))
     return {
         **{
-            key: value for key, value in settings.items() if key not in ("world", "settings", *formats.BESIDE)
+            key: value
+            for key, value in settings.items()
+            if key not in ("world", "settings", *formats.BESIDE)
         },
         **{key: value for key, value in plain.items() if key in PLAIN},
         **_named(plain.get(EXTENSIONS)),

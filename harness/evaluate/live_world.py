@@ -1,8 +1,10 @@
-"""Drive the closed loop: a decision is made from what vehicles see when it is due, and acts when it is ready.
+"""Drive the closed loop: a decision is made from what vehicles see when it is due,
+and acts when it is ready.
 
-Decision k is due at k decision periods. The model answers from what each vehicle sees then. The action is
-taken in the first frame that begins after the decision's latency; until then the ego keeps to its last one. A
-decision that is still open when the next one is due continues, and the next one is skipped.
+Decision k is due at k decision periods. The model answers from what each vehicle sees then. The
+action is taken in the first frame that begins after the decision's latency; until then the ego
+keeps to its last one. A decision that is still open when the next one is due continues, and the
+next one is skipped.
 """
 
 import json
@@ -45,7 +47,8 @@ from harness.world.world import World
 class LiveSource:
     """The layouts of a scenario that are driven; episode e has layout seed `first_seed` + e.
 
-    With a `sample`, only that many of the episodes are driven: those that `harness eval` draws from as many.
+    With a `sample`, only that many of the episodes are driven:
+    those that `harness eval` draws from as many.
     """
 
     first_seed: int
@@ -63,7 +66,9 @@ class LiveSource:
 
     @cached_property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes that are driven. Raises UserError if there are fewer than the sample."""
+        """Numbers of the episodes that are driven.
+        Raises UserError if there are fewer than the sample.
+        """
         numbers = range(self.episodes)
         if self.sample is None:
             return numbers
@@ -78,16 +83,19 @@ class LiveSource:
         return [self.first_seed + number for number in self.numbers]
 
     def record(self) -> ClosedLoop:
-        # As a run's file has them, so that one that is read is of the same scenes: lists, and no tuples.
+        # As a run's file has them, so that one that is read is of the same scenes: lists, and no
+        # tuples.
         parameters = json.loads(json.dumps(self.scenario.parameters.stated()))
         return ClosedLoop(
-            scenario={"name": self.scenario.name, "parameters": parameters}, first_seed=self.first_seed,
+            scenario={"name": self.scenario.name, "parameters": parameters},
+            first_seed=self.first_seed,
             episodes=len(self.numbers),
             late_against="full-view driver, whose decisions act after decision_lag_s",
-            selection={} if self.sample is None
+            selection={}
+            if self.sample is None
             else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
             looks=self.until.record(self.episodes) if self.until else None,
-        )  # fmt: skip
+        )
 
     def stopped(self, looks: Looks) -> "LiveSource":
         """Return what was driven when it was looked at last."""
@@ -95,16 +103,21 @@ class LiveSource:
 
     def settings(self) -> DriveSettings:
         return DriveSettings(
-            scenario=scenarios.argument(self.scenario), episodes=self.episodes, first_seed=self.first_seed,
-            sample=self.sample, sample_seed=0 if self.sample is None else self.sample_seed,
+            scenario=scenarios.argument(self.scenario),
+            episodes=self.episodes,
+            first_seed=self.first_seed,
+            sample=self.sample,
+            sample_seed=0 if self.sample is None else self.sample_seed,
             **(self.until.settings() if self.until else {}),
-        )  # fmt: skip
+        )
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield one decision point of each of up to `most` episodes, at different times."""
         p = self.scenario.parameters
         for number in self.numbers[:most]:
-            trajectory = Trajectory(number, World.start(self.scenario, self.first_seed + number), [])
+            trajectory = Trajectory(
+                number, World.start(self.scenario, self.first_seed + number), []
+            )
             trajectory.world.advance(round(number * p.decision_period_s * p.simulation_hz / 2))
             yield look(trajectory.world, 0, number, 0, ego_alone)
 
@@ -113,13 +126,18 @@ class LiveWorld(SceneWorld):
     """Drives episodes under all conditions and seeds; those that act alike share a world."""
 
     def __init__(
-        self, scenario: Scenario, first_seed: int, numbers: Sequence[int],
-        points: Sequence[OperatingPoint], seeds: Sequence[int], ego_alone: bool,
-    ) -> None:  # fmt: skip
+        self,
+        scenario: Scenario,
+        first_seed: int,
+        numbers: Sequence[int],
+        points: Sequence[OperatingPoint],
+        seeds: Sequence[int],
+        ego_alone: bool,
+    ) -> None:
         """Start the episodes.
 
-        Episode 0 has layout seed `first_seed`. With `ego_alone` helpers are never asked, and no scene graphs
-        of theirs are made.
+        Episode 0 has layout seed `first_seed`.
+        With `ego_alone` helpers are never asked, and no scene graphs of theirs are made.
         """
         self.scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone
@@ -134,11 +152,15 @@ class LiveWorld(SceneWorld):
 
     def observe(self) -> Sequence[Scene]:
         while self._going and self._step < self._p.decisions:
-            due = [(t, agent) for t in self._going for agent in t.under_way if self._is_due(t, agent)]
+            due = [
+                (t, agent) for t in self._going for agent in t.under_way if self._is_due(t, agent)
+            ]
             for trajectory, agent in due:
                 for course in trajectory.courses:
                     course.skipped += agent in course.open
-            self._deciding = [(t, agent) for t, agent in due if any(agent not in c.open for c in t.courses)]
+            self._deciding = [
+                (t, agent) for t, agent in due if any(agent not in c.open for c in t.courses)
+            ]
             if self._deciding:
                 points = [(t.world, agent, t.number) for t, agent in self._deciding]
                 self.scenes = looks(points, self._step, self._ego_alone)
@@ -150,10 +172,12 @@ class LiveWorld(SceneWorld):
         places = self._places(point)
         at = np.array([n for n, _ in places], dtype=int)
         seed = np.array([course.seed for _, course in places], dtype=int)
-        number = np.array([
-            t.number + scene.agent * OF_ANOTHER_AGENT
-            for (t, _), scene in zip(self._deciding, self.scenes, strict=True)
-        ])  # fmt: skip
+        number = np.array(
+            [
+                t.number + scene.agent * OF_ANOTHER_AGENT
+                for (t, _), scene in zip(self._deciding, self.scenes, strict=True)
+            ]
+        )
         episode = number[at]
         helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)
@@ -174,13 +198,20 @@ class LiveWorld(SceneWorld):
     def plans(self) -> Plans | None:
         if not agent_share(self.scenario):
             return None
-        road, vehicles = self.scenario.road(), [t.world.vehicles[agent] for t, agent in self._deciding]
+        road, vehicles = (
+            self.scenario.road(),
+            [t.world.vehicles[agent] for t, agent in self._deciding],
+        )
         spawns, egos = [v.spawn for v in vehicles], [scene.state.ego for scene in self.scenes]
         x_m, y_m, heading_rad, speed_mps, time_s = np.array(
-            [(v.x_m, v.y_m, v.heading_rad, v.speed_mps, s.state.time_s)
-             for v, s in zip(egos, self.scenes, strict=True)]
-        ).T  # fmt: skip
-        ahead_m = (road.zone_m[0] - x_m) * np.cos(heading_rad) + (road.zone_m[1] - y_m) * np.sin(heading_rad)
+            [
+                (v.x_m, v.y_m, v.heading_rad, v.speed_mps, s.state.time_s)
+                for v, s in zip(egos, self.scenes, strict=True)
+            ]
+        ).T
+        ahead_m = (road.zone_m[0] - x_m) * np.cos(heading_rad) + (road.zone_m[1] - y_m) * np.sin(
+            heading_rad
+        )
         distance_m = np.hypot(road.zone_m[0] - x_m, road.zone_m[1] - y_m)
         reaches_s = distance_m / np.maximum(speed_mps, STANDING_MPS)
         reaches_s[(speed_mps < STANDING_MPS) | (ahead_m <= 0)] = np.inf
@@ -188,7 +219,9 @@ class LiveWorld(SceneWorld):
         driven_s = (arc_m - [s.arc_m for s in spawns]) / [s.speed_mps for s in spawns]
         number = np.array([agent for _, agent in self._deciding])
         nobody = np.empty((len(number), 0), dtype=int)
-        return Plans(nobody, number[:, None], reaches_s[:, None], np.maximum(time_s - driven_s, 0.0)[:, None])
+        return Plans(
+            nobody, number[:, None], reaches_s[:, None], np.maximum(time_s - driven_s, 0.0)[:, None]
+        )
 
     def step(self, decided: Sequence[Decided[Scene]]) -> None:
         actions, hz = self.scenario.actions, self._p.simulation_hz
@@ -205,12 +238,16 @@ class LiveWorld(SceneWorld):
 
     def _places(self, point: OperatingPoint) -> list[tuple[int, Course]]:
         return [
-            (n, course) for n, (trajectory, agent) in enumerate(self._deciding)
-            for course in trajectory.courses if agent not in course.open and course.point is point
-        ]  # fmt: skip
+            (n, course)
+            for n, (trajectory, agent) in enumerate(self._deciding)
+            for course in trajectory.courses
+            if agent not in course.open and course.point is point
+        ]
 
     def _is_due(self, trajectory: Trajectory, agent: int) -> bool:
-        """Return whether an agent decides at this tick; each has a tick of its own, or all have the first."""
+        """Return whether an agent decides at this tick;
+        each has a tick of its own, or all have the first.
+        """
         return offset_of(self.scenario, trajectory.world.seed, agent) == self._ticks[self._tick]
 
     @property
@@ -229,8 +266,12 @@ class LiveWorld(SceneWorld):
         self._going = [part for part in parts if not part.world.ended]
 
     def columns(self) -> dict[str, Any]:
-        """Return when each decision acts, whether it did, and conflicts, in the order of decisions."""
-        ttc_s, pet_s = (np.array([getattr(d, name) for d in self._decisions]) for name in ("ttc_s", "pet_s"))
+        """Return when each decision acts, whether it did, and conflicts,
+        in the order of decisions.
+        """
+        ttc_s, pet_s = (
+            np.array([getattr(d, name) for d in self._decisions]) for name in ("ttc_s", "pet_s")
+        )
         return {
             "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
             "acted": np.array([d.acted for d in self._decisions]),
@@ -248,12 +289,16 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
     """
     if agent_share(scenario):
         alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))
-        return [_swarm(t, course, alone_s[t.world.seed]) for t in trajectories for course in t.courses]
+        return [
+            _swarm(t, course, alone_s[t.world.seed]) for t in trajectories for course in t.courses
+        ]
     seeds = {t.number: t.world.seed for t in trajectories if t.world.outcome.success}
     worlds = [World.start(scenario, seeds[number]) for number in sorted(seeds)]
     outcomes = reference.finish(worlds, [PRIVILEGED] * len(worlds))
     references = dict(zip(sorted(seeds), outcomes, strict=True))
-    return [_episode(t, course, references.get(t.number)) for t in trajectories for course in t.courses]
+    return [
+        _episode(t, course, references.get(t.number)) for t in trajectories for course in t.courses
+    ]
 
 
 def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:
@@ -263,46 +308,72 @@ def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> S
 
 
 def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
-    """Return the decision point of each agent in its world, of an episode with this number, at this step."""
+    """Return the decision point of each agent in its world, of an episode with this number,
+    at this step.
+    """
     states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
     scenes = dict[int, Scene]()
     for scenario, places in places_by(world.seat(agent) for world, agent, _ in points).items():
         seen = [
-            (points[n][0], states[n], points[n][2],
-             [states[n].ego] if ego_alone else [states[n].ego, *states[n].helpers])
+            (
+                points[n][0],
+                states[n],
+                points[n][2],
+                [states[n].ego] if ego_alone else [states[n].ego, *states[n].helpers],
+            )
             for n in places
-        ]  # fmt: skip
+        ]
         for n, record in zip(places, records_of(scenario, seen), strict=True):
             world, agent, _ = points[n]
             place, seat = (world.answering.index(agent), scenario) if agent else (0, None)
-            scenes[n] = Scene(record, seat=seat, agent=place, several=agent_share(world.scenario) > 0)
+            scenes[n] = Scene(
+                record, seat=seat, agent=place, several=agent_share(world.scenario) > 0
+            )
     return [scenes[n] for n in range(len(points))]
 
 
 def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) -> Episode:
-    """Return how an episode ended; it is `late` if it cleared too long after the full-view driver."""
+    """Return how an episode ended; it is `late` if it cleared too long after the full-view
+    driver.
+    """
     world = trajectory.world
     ended = world.outcome
-    outcome = ended.judged(full_view, world.layout.danger, world.scenario.parameters) if full_view else ended
+    outcome = (
+        ended.judged(full_view, world.layout.danger, world.scenario.parameters)
+        if full_view
+        else ended
+    )
     failure = "" if outcome.success else outcome.result
     delay_s = None
     if full_view and full_view.time_s is not None and full_view.success and ended.success:
         delay_s = round((ended.time_s or 0.0) - full_view.time_s, 3)
     return Episode(
-        condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
-        danger=world.layout.danger or "none", success=outcome.success, failure=failure,
-        outcome=rating(failure, world.scenario.parameters), delay_s=delay_s, time_s=outcome.time_s,
-        partner=outcome.partner, striker=outcome.striker, fault=outcome.fault,
-        least_gap_m=round(outcome.least_gap_m, 3), hard_brakings=world.journey.hard_brakings,
-        other_crashes=outcome.other_crashes, skipped=course.skipped,
+        condition=course.point.name,
+        seed=course.seed,
+        episode=trajectory.number,
+        layout_seed=world.seed,
+        danger=world.layout.danger or "none",
+        success=outcome.success,
+        failure=failure,
+        outcome=rating(failure, world.scenario.parameters),
+        delay_s=delay_s,
+        time_s=outcome.time_s,
+        partner=outcome.partner,
+        striker=outcome.striker,
+        fault=outcome.fault,
+        least_gap_m=round(outcome.least_gap_m, 3),
+        hard_brakings=world.journey.hard_brakings,
+        other_crashes=outcome.other_crashes,
+        skipped=course.skipped,
         **radios(world.scenario, world.seed, world.layout.danger),
-    )  # fmt: skip
+    )
 
 
 def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float]) -> Episode:
     """Return how an episode of several agents ended: it succeeds if all of them reach their goals.
 
-    Its failure is the gravest of theirs, and of those the first; `alone_s` has when each would clear alone.
+    Its failure is the gravest of theirs, and of those the first;
+    `alone_s` has when each would clear alone.
     """
     world = trajectory.world
     journeys, its = world.journeys, ends(world, alone_s)
@@ -313,17 +384,27 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
     time_s = worst.time_s if worst else max(end.time_s or 0.0 for end in its)
     failure = worst.result if worst else ""
     return Episode(
-        condition=course.point.name, seed=course.seed, episode=trajectory.number, layout_seed=world.seed,
-        danger=world.layout.danger or "none", success=worst is None, failure=failure,
-        outcome=rating(failure, world.scenario.parameters), time_s=time_s,
-        partner=worst.partner if worst else None, striker=worst.striker if worst else None,
+        condition=course.point.name,
+        seed=course.seed,
+        episode=trajectory.number,
+        layout_seed=world.seed,
+        danger=world.layout.danger or "none",
+        success=worst is None,
+        failure=failure,
+        outcome=rating(failure, world.scenario.parameters),
+        time_s=time_s,
+        partner=worst.partner if worst else None,
+        striker=worst.striker if worst else None,
         fault=worst.fault if worst else None,
         least_gap_m=round(min(journey.outcome.least_gap_m for journey in journeys.values()), 3),
         hard_brakings=sum(journey.hard_brakings for journey in journeys.values()),
-        other_crashes=world.outcome.other_crashes, skipped=course.skipped,
-        agents=len(its), arrived=len(lost_s), met=sum(end.met for end in its),
+        other_crashes=world.outcome.other_crashes,
+        skipped=course.skipped,
+        agents=len(its),
+        arrived=len(lost_s),
+        met=sum(end.met for end in its),
         agents_lost_s=round(sum(lost_s.values()), 3) if lost_s else None,
         most_lost_s=None if most is None else lost_s[most],
         gave_way=most if most is not None and lost_s[most] > 0 else None,
         journeys=msgspec.json.encode(its).decode(),
-    )  # fmt: skip
+    )

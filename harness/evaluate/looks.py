@@ -21,9 +21,11 @@ MORE = 1.25  # times as many at each next one
 
 @dataclass(frozen=True)
 class Until:
-    """What is enough in every condition: a narrow interval of success, or a difference to another run.
+    """What is enough in every condition:
+    a narrow interval of success, or a difference to another run.
 
-    Layouts come in their order, which no answer changes, and intervals hold at every look (`core.sequences`).
+    Layouts come in their order, which no answer changes,
+    and intervals hold at every look (`core.sequences`).
     """
 
     width: float | None = None  # a share
@@ -34,25 +36,35 @@ class Until:
     def settings(self) -> dict[str, Any]:
         """Return this as the settings that ask for it."""
         width = None if self.width is None else round(100 * self.width, 9)
-        return {"until_width": width, "until_decided": None if self.folder is None else str(self.folder)}
+        return {
+            "until_width": width,
+            "until_decided": None if self.folder is None else str(self.folder),
+        }
 
     def record(self, layouts: int) -> Looks:
         """Return this as a run's record has it, of so many layouts at most."""
         run = self.against
         return self.looked or Looks(
-            layouts=layouts, width=self.width, against=run.manifest.name if run else None,
+            layouts=layouts,
+            width=self.width,
+            against=run.manifest.name if run else None,
             against_sha256=sha256_file(run.path / "episodes.csv") if run else None,
-        )  # fmt: skip
+        )
 
     def after(self, looks: Looks) -> "Until":
         """Return this of a run that has stopped."""
         return replace(self, looked=looks)
 
     def check(
-        self, world: FrozenScenes | ClosedLoop, numbers: Sequence[int], conditions: Sequence[str],
+        self,
+        world: FrozenScenes | ClosedLoop,
+        numbers: Sequence[int],
+        conditions: Sequence[str],
         seeds: Sequence[int],
-    ) -> None:  # fmt: skip
-        """Raise UserError unless another run has these scenes and seeds, and all layouts and conditions."""
+    ) -> None:
+        """Raise UserError unless another run has these scenes and seeds,
+        and all layouts and conditions.
+        """
         run = self.against
         if run is None:
             return
@@ -60,22 +72,30 @@ class Until:
         if type(run.manifest.world) is not type(world) or run.manifest.world.pinned != world.pinned:
             raise UserError(f"{where} is not of the same scenes; give a run on these")
         if sorted(run.manifest.seeds) != sorted(seeds):
-            raise UserError(f"{where} has the seeds {printable(list(run.manifest.seeds), 40)}; give the same")
+            raise UserError(
+                f"{where} has the seeds {printable(list(run.manifest.seeds), 40)}; give the same"
+            )
         if missing := [name for name in conditions if name not in run.conditions]:
             raise UserError(
-                f"{where} has no condition {printable(missing[0])}; give --condition with those that it has: "
+                f"{where} has no condition {printable(missing[0])}; give --condition with those "
+                "that it has: "
                 f"{printable(', '.join(run.conditions), 60)}"
             )
         if lacking := sum(number not in run.grid.episodes for number in numbers):
             raise UserError(
-                f"{where} lacks {lacking} of the {amount(len(numbers), 'layout')}; use fewer, or a longer run"
+                f"{where} lacks {lacking} of the {amount(len(numbers), 'layout')}; use fewer, or a "
+                "longer run"
             )
 
     def enough(self, grid: Grid, episodes: Sequence[Episode]) -> bool:
-        """Return whether the episodes so far, in the grid's order, are enough in every condition."""
+        """Return whether the episodes so far, in the grid's order,
+        are enough in every condition.
+        """
         success, values = by_condition(grid, episodes)
         if self.width is not None:
-            spans: list[Estimate] = [success.any_time(of_condition) for of_condition in values.values()]
+            spans: list[Estimate] = [
+                success.any_time(of_condition) for of_condition in values.values()
+            ]
             return all(span.high - span.low <= self.width for span in spans)
         assert self.against
         other = self.against
@@ -85,13 +105,16 @@ class Until:
         ]
         _, before = by_condition(other.grid, other.episodes)
         differences = [
-            success.any_time_difference(b, before[name][order[0]][:, order[1]]) for name, b in values.items()
+            success.any_time_difference(b, before[name][order[0]][:, order[1]])
+            for name, b in values.items()
         ]
         return all(e.low > 0 or e.high < 0 for e in differences)
 
 
 def looks(layouts: int) -> list[int]:
-    """Return after how many layouts a run of at most so many is looked at; the last is all of them."""
+    """Return after how many layouts a run of at most so many is looked at;
+    the last is all of them.
+    """
     at = [min(FIRST, layouts)]
     while at[-1] < layouts:
         at.append(min(math.ceil(at[-1] * MORE), layouts))
@@ -99,7 +122,9 @@ def looks(layouts: int) -> list[int]:
 
 
 def until(width: float | None, against: str | None) -> Until | None:
-    """Return what the settings ask for, or None. Raises UserError if both ask, or for what is no run."""
+    """Return what the settings ask for, or None.
+    Raises UserError if both ask, or for what is no run.
+    """
     if width is None and against is None:
         return None
     if width is not None and against is not None:

@@ -31,7 +31,8 @@ DRIVER = "driver"  # the engine of what has no model and no prompt
 
 
 def spec_of(run: Run, source: FrozenSource) -> Spec:
-    """Return the evaluation of a run's frozen scenes, with all that decides its answers; without conditions.
+    """Return the evaluation of a run's frozen scenes, with all that decides its answers;
+    without conditions.
 
     Raises UserError if a prompt of it is not here.
     """
@@ -43,7 +44,9 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
 
 
 def card_here(card: Card) -> Card:
-    """Return a card that a run states; of a driver the one that is here, which says what it may see."""
+    """Return a card that a run states;
+    of a driver the one that is here, which says what it may see.
+    """
     return cards.load(card.name) if card.engine == DRIVER else card
 
 
@@ -58,7 +61,10 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
         "channel profile": (manifest.channels, CHANNELS.unchanged),
         "network": (manifest.networks, lambda name, then: _same(asdict(network(name)), then)),
-        "schedule": (manifest.schedules, lambda name, then: _same(SCHEDULES.file_sha256(name), then)),
+        "schedule": (
+            manifest.schedules,
+            lambda name, then: _same(SCHEDULES.file_sha256(name), then),
+        ),
     }
     for folder, recorded_there in manifest.kept.items():
         is_kept = partial(_is_kept, kept.get(folder, {}))
@@ -67,7 +73,8 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
         for name, recorded in by_name.items():
             if not unchanged(name, recorded):
                 raise UserError(
-                    f"{printable(run.path)}: {what} {printable(name)} has changed since; restore it or run "
+                    f"{printable(run.path)}: {what} {printable(name)} has changed since; restore "
+                    "it or run "
                     "again"
                 )
     return points
@@ -96,12 +103,18 @@ def _agent(run: Run, stated: Mapping[str, Any]) -> Agent:
     card = convert(stated["model"], Card, f"{printable(run.path)}: its model")
     if (version := stated["prompt"]["version"]) not in versions.names():
         raise UserError(
-            f"{printable(run.path)}: prompt {printable(version)} is not here; {_restore(run, stated)}"
+            f"{printable(run.path)}: prompt {printable(version)} is not here; "
+            f"{_restore(run, stated)}"
         )
     return Agent(
-        card, versions.load(version), cast("AnswerMode", stated["answer"]), stated["thinking"],
-        cast("ImageMode", stated["image"]), cast("Letters", stated["letters"]), cast("Sums", stated["sums"]),
-    )  # fmt: skip
+        card,
+        versions.load(version),
+        cast("AnswerMode", stated["answer"]),
+        stated["thinking"],
+        cast("ImageMode", stated["image"]),
+        cast("Letters", stated["letters"]),
+        cast("Sums", stated["sums"]),
+    )
 
 
 def _restore(run: Run, stated: Mapping[str, Any]) -> str:

@@ -1,4 +1,6 @@
-"""Compute what an ego sees of the regions, and what it can infer about its helpers' views before it asks."""
+"""Compute what an ego sees of the regions,
+and what it can infer about its helpers' views before it asks.
+"""
 
 from collections.abc import Sequence
 
@@ -19,7 +21,9 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
-    """Return the outlook of each scene, (n, ...); a road with fewer sectors than others sees the rest."""
+    """Return the outlook of each scene, (n, ...);
+    a road with fewer sectors than others sees the rest.
+    """
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]
     most = max((len(road.sectors) for road, _ in roads), default=0)
@@ -39,20 +43,27 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
         graph, state = scene.graphs[scene.viewers[0]], scene.state
         helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]
         as_known = _as_known(state, graph.nodes, helpers)
-        # What the ego sees is decided by where occluders truly are, and not by where it measures them.
+        # What the ego sees is decided by where occluders truly are, and not by where it measures
+        # them.
         reported = {state.ego.id, *graph.seen}
         in_sight = replace(state, vehicles=tuple(v for v in state.vehicles if v.id in reported))
         unseen = _unseen(road, in_sight, state.ego)
         added = [_by_region(road, unseen & ~_unseen(road, as_known, helper)) for helper in helpers]
         distance_m, speed_mps = max(graph.ego.zone_m, 0.0), graph.ego.speed_mps
-        to_zone_s = distance_m / speed_mps if speed_mps > MOVING_MPS else np.inf if distance_m else 0.0
+        to_zone_s = (
+            distance_m / speed_mps if speed_mps > MOVING_MPS else np.inf if distance_m else 0.0
+        )
         regions = len(road.sectors)
-        kept = Outlook(_by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s))
+        kept = Outlook(
+            _by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s)
+        )
         scene.notes["outlook"] = kept
     return kept
 
 
-def _as_known(state: WorldState, nodes: Sequence[Node], helpers: Sequence[VehicleState]) -> WorldState:
+def _as_known(
+    state: WorldState, nodes: Sequence[Node], helpers: Sequence[VehicleState]
+) -> WorldState:
     """Return the state as the ego knows it: vehicles as its sensors and its radio report them."""
     ego, by_beacon = state.ego, {helper.id: helper for helper in helpers}
     cos, sin = np.cos(ego.heading_rad), np.sin(ego.heading_rad)
@@ -74,4 +85,6 @@ def _unseen(road: Road, state: WorldState, viewer: VehicleState) -> Bools:
 def _by_region(road: Road, points: Bools) -> Floats:
     """Return the share of each region's points, (R,)."""
     ends = np.cumsum([len(sector) for sector in road.sectors.values()])[:-1]
-    return np.array([part.mean() for part in np.split(points, ends)] if road.sectors else [], dtype=float)
+    return np.array(
+        [part.mean() for part in np.split(points, ends)] if road.sectors else [], dtype=float
+    )

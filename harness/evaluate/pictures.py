@@ -1,4 +1,6 @@
-"""Choose the picture of a prompt: what the viewer sees, or a control that tests whether a model looks."""
+"""Choose the picture of a prompt: what the viewer sees,
+or a control that tests whether a model looks.
+"""
 
 from functools import lru_cache
 
@@ -18,8 +20,8 @@ GREY = 127
 def picture(spec: Spec, index: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
     """Return the picture that a viewer's agent is shown; None if its prompts show none.
 
-    `index` says which agent answers. A `blind` viewer is shown nothing, and its picture is blank. Raises
-    UserError if there is no other scene to take a picture from.
+    `index` says which agent answers. A `blind` viewer is shown nothing, and its picture is blank.
+    Raises UserError if there is no other scene to take a picture from.
     """
     agent = spec.agents[index]
     vision = agent.card.vision
@@ -42,7 +44,9 @@ def blank(size_px: tuple[int, int]) -> Image:
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """Return a decision point of the same step in another episode, drawn with the scene's id as the key."""
+    """Return a decision point of the same step in another episode,
+    drawn with the scene's id as the key.
+    """
     assert isinstance(spec.source, FrozenSource), "Spec refuses another scene in the closed loop"
     dataset = spec.source.dataset
     forest = dataset.forest

@@ -33,10 +33,29 @@ from harness.runs.records import Episode, FrozenScenes, Latency
 
 AGAIN = 3  # episodes of a driven run that are driven again
 OF_ENDS = (  # what an episode's row says of how it ended
-    "layout_seed", "danger", "success", "failure", "outcome", "delay_s", "time_s", "partner", "striker",
-    "fault", "least_gap_m", "hard_brakings", "other_crashes", "witnesses", "danger_radio", "agents",
-    "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys",
-)  # fmt: skip
+    "layout_seed",
+    "danger",
+    "success",
+    "failure",
+    "outcome",
+    "delay_s",
+    "time_s",
+    "partner",
+    "striker",
+    "fault",
+    "least_gap_m",
+    "hard_brakings",
+    "other_crashes",
+    "witnesses",
+    "danger_radio",
+    "agents",
+    "arrived",
+    "met",
+    "agents_lost_s",
+    "most_lost_s",
+    "gave_way",
+    "journeys",
+)
 OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
 RULES = (DRIVER, "proxy")  # engines that are no models
 
@@ -59,8 +78,12 @@ class Held:
         return self._kept.latency()
 
 
-def computed(stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> tuple[Run, int]:
-    """Compute a run again, and count the answers that the rule here gives otherwise; 0 of other models."""
+def computed(
+    stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]
+) -> tuple[Run, int]:
+    """Compute a run again, and count the answers that the rule here gives otherwise;
+    0 of other models.
+    """
     kept, held = Kept(stated), list[Held]()
 
     def opens(card: Card, **options: Any) -> Backend:
@@ -91,11 +114,14 @@ def differences(
         out: the folder, which is written.
         progress: called with the number of answers that were read again.
 
-    Raises UserError if a prompt, a channel or the like is not here as it was, or an answer is missing.
+    Raises UserError if a prompt, a channel or the like is not here as it was,
+    or an answer is missing.
     """
     world = run.manifest.world
     assert isinstance(world, FrozenScenes)
-    selection = convert({"limit": world.limit, **world.selection}, Selection, f"{printable(run.path)}: world")
+    selection = convert(
+        {"limit": world.limit, **world.selection}, Selection, f"{printable(run.path)}: world"
+    )
     source = FrozenSource(selection.of(dataset), selection)
     if source.dataset.episodes != run.grid.episodes:
         return ["episodes.csv has other episodes than run.json says that were selected"], []
@@ -105,7 +131,9 @@ def differences(
     ego = replace(stated.ego, card=card_here(stated.ego.card))
     latency = latencies.as_declared(manifest.latency) if profile is None else None
     said = manifest.settings
-    settings = structs.replace(stated.settings, ask=said.ask, device_model=said.device_model, latency=latency)
+    settings = structs.replace(
+        stated.settings, ask=said.ask, device_model=said.device_model, latency=latency
+    )
     points = tuple(points_of(run).values())
     spec = replace(stated, ego=ego, points=points, device_profile=profile, settings=settings)
     ours, otherwise = computed(run, spec, out, progress)
@@ -119,21 +147,32 @@ def differences(
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
     if otherwise:
-        wrong.append(f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here")
+        wrong.append(
+            f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here"
+        )
     return wrong, list(_lacking(run, ours))
 
 
 def _lacking(stated: Run, ours: Run) -> Iterator[str]:
-    """Yield, in a sentence, the columns that are empty in a run by older rules, and are not here."""
+    """Yield, in a sentence, the columns that are empty in a run by older rules,
+    and are not here.
+    """
     if current(stated):
         return
     theirs, here = stated.decisions.table, ours.decisions.table
     names = [
-        *(name for name in Episode.__struct_fields__ if _empty(stated, name) and not _empty(ours, name)),
+        *(
+            name
+            for name in Episode.__struct_fields__
+            if _empty(stated, name) and not _empty(ours, name)
+        ),
         *(name for name in here.column_names if _null(theirs, name) and not _null(here, name)),
     ]
     if names := list(dict.fromkeys(names)):
-        yield f"Columns are empty that its answers fill: {', '.join(names)}. Older runs do not have them."
+        yield (
+            f"Columns are empty that its answers fill: {', '.join(names)}. Older runs do not have "
+            "them."
+        )
 
 
 def _empty(run: Run, name: str) -> bool:
@@ -145,7 +184,8 @@ def _null(table: Any, name: str) -> bool:
 
 
 def driven_otherwise(run: Run) -> Iterator[str]:
-    """Yield what episodes.csv says otherwise of a few episodes than the simulator, by the recorded actions.
+    """Yield what episodes.csv says otherwise of a few episodes than the simulator,
+    by the recorded actions.
 
     Raises UserError if the scenario is not here as it was.
     """
@@ -163,7 +203,9 @@ def driven_otherwise(run: Run) -> Iterator[str]:
 
 
 def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
-    """Yield what run.json, with this card, says otherwise of scenes, conditions, latency and model."""
+    """Yield what run.json, with this card, says otherwise of scenes, conditions,
+    latency and model.
+    """
     world, here = (to_builtins(run.manifest.world) for run in (stated, ours))
     for name in here.keys() - {"path", "looks"}:
         if world.get(name) != here[name]:
@@ -181,14 +223,17 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
 
 
 def of_card(run: Run) -> Iterator[str]:
-    """Yield a sentence where a run names its card as the source of a latency that the card here has not."""
+    """Yield a sentence where a run names its card as the source of a latency that the card here has
+    not.
+    """
     latency, name = run.manifest.latency, run.manifest.model["name"]
     if latency.source != "card" or name not in cards.names():
         return
     here_s = cards.load(name).latency.inference_s
     if here_s != latency.ego_s:
         yield (
-            f"Its latency of {latency.ego_s:g} s is that of a card in run.json; the card {printable(name)} "
+            f"Its latency of {latency.ego_s:g} s is that of a card in run.json; the card "
+            f"{printable(name)} "
             f"that is here states {'none' if here_s is None else f'{here_s:g} s'}."
         )
 
@@ -214,13 +259,22 @@ def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
 
 
 def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
-    """Yield what answers.jsonl says otherwise of its texts, from which the rates of parsing follow."""
+    """Yield what answers.jsonl says otherwise of its texts,
+    from which the rates of parsing follow.
+    """
     here = {(each.scene, each.viewer, each.heard, each.role): each for each in ours.answers}
-    asked = [(each, here.get((each.scene, each.viewer, each.heard, each.role))) for each in stated.answers]
+    asked = [
+        (each, here.get((each.scene, each.viewer, each.heard, each.role)))
+        for each in stated.answers
+    ]
     for name in OF_TEXTS:
-        wrong = sum(b is not None and not _close(getattr(a, name), getattr(b, name)) for a, b in asked)
+        wrong = sum(
+            b is not None and not _close(getattr(a, name), getattr(b, name)) for a, b in asked
+        )
         if wrong:
-            yield f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
+            yield (
+                f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
+            )
     if more := sum(b is None for _, b in asked):
         yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
 
@@ -245,4 +299,7 @@ def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
             continue
         pairs = zip(theirs[name].to_pylist(), here[name].to_pylist(), strict=True)
         if wrong := sum(not close(a, b) for a, b in pairs):
-            yield f"decisions.parquet has another {name} in {amount(wrong, 'row')} than its answers make"
+            yield (
+                f"decisions.parquet has another {name} in {amount(wrong, 'row')} than its answers "
+                "make"
+            )

@@ -1,4 +1,6 @@
-"""Replay a closed-loop episode from its record: equal actions in equal frames give an equal world."""
+"""Replay a closed-loop episode from its record:
+equal actions in equal frames give an equal world.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,7 +53,9 @@ def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode
     is_episode &= table.codes("condition", run.conditions) == run.conditions.index(condition)
     rows = table.take(np.flatnonzero(is_episode))
     decisions = sorted(rows.records(0, len(rows)), key=lambda d: (d.step, d.agent or ""))
-    return ReplayedEpisode(run.manifest, condition, seed, episode, world.first_seed + episode, decisions)
+    return ReplayedEpisode(
+        run.manifest, condition, seed, episode, world.first_seed + episode, decisions
+    )
 
 
 def scenes_of(run: Run, names: Sequence[str]) -> list[Scene]:
@@ -60,7 +64,9 @@ def scenes_of(run: Run, names: Sequence[str]) -> list[Scene]:
     A scene's id equals its decision point's only if this simulator behaves as the run's did.
     """
     return [
-        scene for at in range(0, len(names), AT_ONCE) for scene in _together(run, names[at : at + AT_ONCE])
+        scene
+        for at in range(0, len(names), AT_ONCE)
+        for scene in _together(run, names[at : at + AT_ONCE])
     ]
 
 
@@ -85,7 +91,9 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     scenes = dict[int, Scene]()
     for step in {decision.step for decision in decisions}:
         at = [n for n, decision in enumerate(decisions) if decision.step == step]
-        points = [(worlds[n], _place(worlds[n], decisions[n].agent), decisions[n].episode) for n in at]
+        points = [
+            (worlds[n], _place(worlds[n], decisions[n].agent), decisions[n].episode) for n in at
+        ]
         scenes |= zip(at, looks(points, step, alone), strict=True)
     return [scenes[n] for n in range(len(names))]
 
@@ -99,7 +107,9 @@ def due_frame(world: World, decision: Decision) -> int:
 def actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
     """Return the decisions that acted, by the frame in which they did, in the order of time."""
     p, acting = played.scenario.parameters, dict[int, list[Decision]]()
-    for decision in sorted((d for d in played.decisions if d.acted), key=lambda d: acting_frame(d, p)):
+    for decision in sorted(
+        (d for d in played.decisions if d.acted), key=lambda d: acting_frame(d, p)
+    ):
         acting.setdefault(acting_frame(decision, p), []).append(decision)
     return acting
 
@@ -121,7 +131,9 @@ def _place(world: World, agent: str | None) -> int:
 
 
 def driven_again(played: ReplayedEpisode) -> Episode:
-    """Drive an episode to its end with the recorded actions; return how it ended, without its decisions."""
+    """Drive an episode to its end with the recorded actions;
+    return how it ended, without its decisions.
+    """
     world = World.start(played.scenario, played.layout_seed)
     for frame, acting in actions_by_frame(played).items():
         world.advance(frame)

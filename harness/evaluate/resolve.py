@@ -1,4 +1,6 @@
-"""Make an evaluation of settings: cards, prompts, datasets, operating points and seeds in place of names."""
+"""Make an evaluation of settings: cards, prompts, datasets,
+operating points and seeds in place of names.
+"""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,11 +29,17 @@ from harness.world.scenarios import DEFAULT
 if TYPE_CHECKING:
     from harness.evaluate.live_world import LiveSource
 
-CONTROLS = {"shuffled-messages": "messages=shuffled", "no-messages": "loss=1", "blind": "messages=blind"}
+CONTROLS = {
+    "shuffled-messages": "messages=shuffled",
+    "no-messages": "loss=1",
+    "blind": "messages=blind",
+}
 
 
 def spec(settings: Settings, source: Source) -> Spec:
-    """Return the evaluation of a world under these settings. Raises UserError for what is not allowed."""
+    """Return the evaluation of a world under these settings.
+    Raises UserError for what is not allowed.
+    """
     ego, helpers = agents(settings, source.scenario)
     profile = settings.device_profile
     return Spec(
@@ -49,14 +57,17 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
     """Return the selected episodes of a dataset, by its name or folder."""
     selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
     whole = load.load(load.find(dataset), None if selection.given else world.limit)
-    return FrozenSource(selection.of(whole), selection, until(world.until_width, world.until_decided))
+    return FrozenSource(
+        selection.of(whole), selection, until(world.until_width, world.until_decided)
+    )
 
 
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
-    """Return the layouts that are driven; by default as many, and the same, as the shipped dataset has.
+    """Return the layouts that are driven;
+    by default as many, and the same, as the shipped dataset has.
 
-    Raises UserError if an episode or seed is out of range or mixed with those of another purpose, or if the
-    scenario is an environment that cannot be driven.
+    Raises UserError if an episode or seed is out of range or mixed with those of another purpose,
+    or if the scenario is an environment that cannot be driven.
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
@@ -81,11 +92,16 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
 
 
 def _shipped(scenario: str) -> dict[str, Any]:
-    """Return the manifest of the dataset that ships of a scenario; where none does, of the default one."""
+    """Return the manifest of the dataset that ships of a scenario;
+    where none does, of the default one.
+    """
     manifests = [
-        json.loads(text_of(file, "record")) for file in sorted(folder("datasets").glob("*/manifest.json"))
+        json.loads(text_of(file, "record"))
+        for file in sorted(folder("datasets").glob("*/manifest.json"))
     ]
-    by_scenario: dict[str, dict[str, Any]] = {manifest["scenario"]: manifest for manifest in manifests}
+    by_scenario: dict[str, dict[str, Any]] = {
+        manifest["scenario"]: manifest for manifest in manifests
+    }
     return by_scenario.get(scenario) or by_scenario[DEFAULT]
 
 
@@ -94,21 +110,35 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     own, version = settings.helpers, settings.prompt or scenario.prompt
     card = cards.resolve(settings.model, settings.engine)
     # Agent checks the modes.
-    how = (settings.answer, settings.thinking, settings.image, settings.letters, settings.sums, settings.flip)
+    how = (
+        settings.answer,
+        settings.thinking,
+        settings.image,
+        settings.letters,
+        settings.sums,
+        settings.flip,
+    )
     ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
     prompt, mode = versions.load(own.prompt or version), own.answer or settings.answer
     if settings.letters and not {settings.answer, mode} & {*BARE}:
         raise UserError(
-            f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; leave it "
+            f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; "
+            "leave it "
             "out, or give --answer readout"
         )
-    helper_cards = [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
+    helper_cards = (
+        [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
+    )
     with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
         theirs = (
-            prompt, mode, settings.thinking if own.thinking is None else own.thinking,
-            settings.image if prompt.image else "own", settings.letters if mode in BARE else None,
-            settings.sums if mode == "json" else "refuse", settings.flip and mode in BARE,
-        )  # fmt: skip
+            prompt,
+            mode,
+            settings.thinking if own.thinking is None else own.thinking,
+            settings.image if prompt.image else "own",
+            settings.letters if mode in BARE else None,
+            settings.sums if mode == "json" else "refuse",
+            settings.flip and mode in BARE,
+        )
         return ego, tuple(Agent(helper_card, *theirs) for helper_card in helper_cards)  # type: ignore[arg-type]
 
 
@@ -124,20 +154,27 @@ def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
         reason = str(error)
         if typed.get(reason.partition(" ")[0].rstrip(":")) is not None:
             reason = reason.replace("--", "--helper-", 1)
-        raise UserError(reason if reason.startswith("--helper-") else f"helpers: {reason}") from None
+        raise UserError(
+            reason if reason.startswith("--helper-") else f"helpers: {reason}"
+        ) from None
 
 
 def points(
     conditions: Sequence[str], controls: Sequence[str] = (), attacks: Sequence[str] = ()
 ) -> tuple[OperatingPoint, ...]:
-    """Return operating points by name, each once, and of those with a channel the controls and attacks."""
+    """Return operating points by name, each once,
+    and of those with a channel the controls and attacks.
+    """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     if wrong := [control for control in controls if control not in CONTROLS]:
         raise unknown("--control", wrong[0], CONTROLS)
-    beside = dict.fromkeys((*(CONTROLS[control] for control in controls), *(f"attack={a}" for a in attacks)))
+    beside = dict.fromkeys(
+        (*(CONTROLS[control] for control in controls), *(f"attack={a}" for a in attacks))
+    )
     derived = [
         named_point(point.name + ("," if ":" in point.name else ":") + setting)
-        for setting in beside for point in named
+        for setting in beside
+        for point in named
         if point.radio.profile and setting.partition("=")[0] not in point.name
-    ]  # fmt: skip
+    ]
     return tuple(dict.fromkeys((*named, *derived)))

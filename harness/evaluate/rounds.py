@@ -1,10 +1,11 @@
-"""Further rounds of a negotiation: agents send what they have decided, and decide again with what they hear.
+"""Further rounds of a negotiation: agents send what they have decided,
+and decide again with what they hear.
 
-In seconds from the start of the decision: an agent that has decided by the window asks the same others once
-more. Each replies once it has decided itself, with its policy after the round before. What arrives in the
-window takes the place of the plan of the round before; who is not heard again is taken at its last word. The
-agent decides again by its own intent and by what it now knows. A fusion call delays what follows it, and who
-has heard nothing new makes no further one.
+In seconds from the start of the decision: an agent that has decided by the window asks the same
+others once more. Each replies once it has decided itself, with its policy after the round before.
+What arrives in the window takes the place of the plan of the round before; who is not heard again
+is taken at its last word. The agent decides again by its own intent and by what it now knows. A
+fusion call delays what follows it, and who has heard nothing new makes no further one.
 """
 
 from collections.abc import Callable
@@ -43,7 +44,8 @@ def further_rounds(
         policy = decided.fused
         # An attacker repeats what it said.
         newer = np.where(said.attackers[..., None], intents.helpers, policy[senders])
-        call_s = np.nan_to_num(decided.fusion_s)  # unknown where the inference is, which counts as 0
+        # unknown where the inference is, which counts as 0
+        call_s = np.nan_to_num(decided.fusion_s)
         decided_s = heard.exchange_s + call_s
         helpers_s = np.where(there, decided_s[senders], np.nan)
         more = exchange(
@@ -53,7 +55,10 @@ def further_rounds(
             heard.asked & (decided_s < point.fusion.window_s)[:, None],
         )
         said = replace(
-            said, intents=replace(intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers))
+            said,
+            intents=replace(
+                intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers)
+            ),
         )
         # Who hears nothing new keeps the last decision, and its call counts once.
         repeated_s = np.where(any_of(more.on_time), 0.0, call_s)

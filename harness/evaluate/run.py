@@ -1,4 +1,6 @@
-"""Run an evaluation, for `harness eval` and `harness drive`: walk its chunks, score them, write the run."""
+"""Run an evaluation, for `harness eval` and `harness drive`:
+walk its chunks, score them, write the run.
+"""
 
 import math
 import os
@@ -67,7 +69,8 @@ Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
 EPISODES_AT_ONCE = 16  # fewest episodes of a closed-loop chunk
 TREES_AT_ONCE = 256  # decision trees of a chunk of frozen scenes
-WALKS_AT_ONCE = 1 << 14  # most walks, by layout, seed and condition, that frozen scenes hold in memory
+# most walks, by layout, seed and condition, that frozen scenes hold in memory
+WALKS_AT_ONCE = 1 << 14
 LEAST_VIEWERS = 4  # requests at once for each closed-loop episode: the ego and three helpers
 
 
@@ -81,27 +84,31 @@ def evaluate(
     opens: Opens | None = None,
     given: Mapping[str, Answer] = NOTHING,
 ) -> Evaluated:
-    """Evaluate a model with a prompt and write the run's folder, whose bytes do not depend on the workers.
+    """Evaluate a model with a prompt and write the run's folder,
+    whose bytes do not depend on the workers.
 
-    A stopped run in that folder resumes. The working folder stays until the caller calls `work.tidy`; until
-    then the caller may add files to the run.
+    A stopped run in that folder resumes. The working folder stays until the caller calls
+    `work.tidy`; until then the caller may add files to the run.
 
     Args:
         spec: what is evaluated.
         out: the run's folder.
-        progress: called with the number of new answers (frozen scenes) or of episodes just driven (closed
-            loop); what an earlier, stopped run kept is included.
+        progress: called with the number of new answers (frozen scenes) or of episodes just driven
+            (closed loop); what an earlier, stopped run kept is included.
         cache: completion cache for language models, a file; None for no cache.
         more: called with the number of answers that are due next; frozen scenes only.
-        workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules or served
-            models answer; each worker opens its own backend. Other models answer frozen scenes in this
-            process. The workers together have as many requests at once at a server as one would.
-        opens: replaces `open_backend` for frozen scenes; it may return a backend that is open already.
+        workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules
+            or served models answer; each worker opens its own backend. Other models answer frozen
+            scenes in this process. The workers together have as many requests at once at a server
+            as one would.
+        opens: replaces `open_backend` for frozen scenes;
+            it may return a backend that is open already.
         given: answers by request id that need not be asked for; frozen scenes only.
 
-    Raises UserError if the folder holds another run or something else, or the model is not available; nothing
-    is written then. Raises Unanswered if a question of the ego or a fusion call, or too many of the helpers',
-    got no answer; the folder keeps all answers, and the same call asks the others again.
+    Raises UserError if the folder holds another run or something else, or the model is not
+    available; nothing is written then. Raises Unanswered if a question of the ego or a fusion call,
+    or too many of the helpers', got no answer; the folder keeps all answers, and the same call asks
+    the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished(spec, out)
@@ -116,23 +123,31 @@ def evaluate(
     begun, chunks = _begin_driving(spec, out, begun, workers)
     with work.working(out, begun, "run.json") as place:
         seen, looked = _walked(
-            spec, chunks, place, lambda some: _drive(spec, begun, some, place, progress, cache, workers)
+            spec,
+            chunks,
+            place,
+            lambda some: _drive(spec, begun, some, place, progress, cache, workers),
         )
         return _gather(out, as_finished(spec, begun, looked), seen, place, made_of)
 
 
-def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, workers: Workers = 1) -> int:
-    """Drive one shard of a closed-loop run, which `harness run merge` combines; a stopped shard resumes.
+def evaluate_shard(
+    spec: Spec, out: Path, shard: Shard, progress: Progress, workers: Workers = 1
+) -> int:
+    """Drive one shard of a closed-loop run, which `harness run merge` combines;
+    a stopped shard resumes.
 
-    `progress` counts episodes, those that a stopped shard kept included. Returns how many the shard has.
-    Raises UserError as `evaluate`, or if the latency is to be measured.
+    `progress` counts episodes, those that a stopped shard kept included. Returns how many the shard
+    has. Raises UserError as `evaluate`, or if the latency is to be measured.
     """
     metrics_of(spec.source.kind)
     refuse_finished(out)
     if spec.source.until:
         raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")
     made_of = sources(spec)
-    begun, chunks = _begin_driving(spec, out, unfinished(spec, out, str(shard)), workers, str(shard))
+    begun, chunks = _begin_driving(
+        spec, out, unfinished(spec, out, str(shard)), workers, str(shard)
+    )
     own_chunks = shard.part(chunks)
     progress.more(sum(map(len, own_chunks)))
     with work.working(out, begun, "run.json") as place:
@@ -144,15 +159,18 @@ def evaluate_shard(spec: Spec, out: Path, shard: Shard, progress: Progress, work
 
 
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
-    """Combine the shards of a closed-loop run into the run that `evaluate` would have written, byte for byte.
+    """Combine the shards of a closed-loop run into the run that `evaluate` would have written,
+    byte for byte.
 
-    Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two hold
-    different bytes for the same part, or `out` holds something else.
+    Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two
+    hold different bytes for the same part, or `out` holds something else.
     """
     begun = shards.read(folders, RunStart)
     chunks = _chunks_of(begun[0].settings)
     chunk_by_folder = {_folder_name(chunk): chunk for chunk in chunks}
-    parts = shards.owners(folders, begun, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part]))
+    parts = shards.owners(
+        folders, begun, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part])
+    )
     if (out / "run.json").exists() and (out / WORK).is_dir():
         return finished_with(begun[0].settings, out)
     refuse_finished(out)
@@ -166,7 +184,9 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
         try:
             return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK), folders)
         except Unanswered as error:
-            raise UserError(f"{error}; type the commands of the shards again, and merge then") from None
+            raise UserError(
+                f"{error}; type the commands of the shards again, and merge then"
+            ) from None
 
 
 def _walk(
@@ -174,9 +194,10 @@ def _walk(
 ) -> dict[str, bytes]:
     """Walk a chunk's episodes to their ends and return the files of this part of the run, by name.
 
-    One of them says which servers gave answers that are not kept yet; it is no part of the run's tables.
-    Frozen scenes are walked for some seeds at a time: the decisions of all would not fit into memory.
-    `asker_of` returns the asker of the n-th of these walks, which is given the answers so far.
+    One of them says which servers gave answers that are not kept yet; it is no part of the run's
+    tables. Frozen scenes are walked for some seeds at a time: the decisions of all would not fit
+    into memory. `asker_of` returns the asker of the n-th of these walks, which is given the answers
+    so far.
     """
     at_once = len(spec.seeds)
     if isinstance(spec.source, FrozenSource):
@@ -194,19 +215,30 @@ def _walk(
             more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
         decisions = table(decided, more, spec.actions)
         if spec.device_profile:
-            joules = device.energy(spec.device_profile, asker.latency, spec.points, decisions, answers)
+            joules = device.energy(
+                spec.device_profile, asker.latency, spec.points, decisions, answers
+            )
             decisions = decisions.replace(**joules)
         tables.append(decisions.rounded())
         episodes += world.episodes()
-    files = run_parts.part_files(of_all_seeds(tables, spec.points), episodes, answers.values(), viewers)
+    files = run_parts.part_files(
+        of_all_seeds(tables, spec.points), episodes, answers.values(), viewers
+    )
     return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
 def _frozen(
-    spec: Spec, source: FrozenSource, out: Path, begun: RunStart | None, progress: Callable[[int], None],
-    cache: Path | None, more: Callable[[int], None], opens: Opens | None, given: Mapping[str, Answer],
+    spec: Spec,
+    source: FrozenSource,
+    out: Path,
+    begun: RunStart | None,
+    progress: Callable[[int], None],
+    cache: Path | None,
+    more: Callable[[int], None],
+    opens: Opens | None,
+    given: Mapping[str, Answer],
     workers: Workers,
-) -> Evaluated:  # fmt: skip
+) -> Evaluated:
     made_of, chunks = sources(spec), _split(source.dataset.episodes, TREES_AT_ONCE)
     here = opens or given or source.until or len(chunks) == 1
     spread_over = 1 if here else spreadable(spec, workers)
@@ -228,7 +260,8 @@ def _frozen(
                 there = {**given, **before, **so_far}
                 return Asker(spec, lambda: backend, latency, kept, there, progress, more)
 
-            # A chunk fits into memory; what a language model's engine leaves behind in cycles might not.
+            # A chunk fits into memory; what a language model's engine leaves behind in cycles might
+            # not.
             with uncollected() if _reproducible(spec) else nullcontext():
                 return _walk(spec, chunk, asker_of)
 
@@ -240,27 +273,34 @@ def _frozen(
         def walk_all(some: Sequence[Sequence[int]]) -> None:
             if in_workers:
                 _hand_over(place, some)
-                walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, spread_over))
+                walk_chunk = partial(
+                    _walk_chunk, spec, begun, *_files(spec, cache, place, spread_over)
+                )
                 _walk_missing(some, place, walk_chunk, report_kept, report_kept, spread_over)
             else:
                 _walk_missing(some, place, walk_here, report_kept, lambda chunk: None)
 
         if not in_workers:
-            backend = together(spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache)
+            backend = together(
+                spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache
+            )
         seen, looked = _walked(spec, chunks, place, walk_all)
         layouts = source.layouts(sum(map(len, seen)))
         return _gather(out, as_finished(spec, begun, looked), seen, place, made_of, layouts=layouts)
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
-    """Return the workers that walk frozen scenes: 1 unless rules answer, or servers are asked by processes.
+    """Return the workers that walk frozen scenes:
+    1 unless rules answer, or servers are asked by processes.
 
     Of these there are no more than a server may have requests at once.
     """
     if _reproducible(spec):
         return workers
     asks_servers = all(agent.card.server or not agent.can.language_model for agent in spec.agents)
-    return min(workers, spec.settings.batch_size) if asks_servers and isinstance(workers, int) else 1
+    return (
+        min(workers, spec.settings.batch_size) if asks_servers and isinstance(workers, int) else 1
+    )
 
 
 def _hand_over(place: Path, chunks: Sequence[Sequence[int]]) -> None:
@@ -277,7 +317,8 @@ def _begin_driving(
     """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
     if spec.settings.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
-            f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; measure on "
+            f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; "
+            "measure on "
             "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
     identity, latency = _stated_in_worker(spec, begun, workers)
@@ -323,13 +364,17 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
 
 def _label(chunk: Sequence[int]) -> str:
     whole = chunk == range(chunk[0], chunk[-1] + 1)
-    return f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
+    return (
+        f"episodes {chunk[0]} to {chunk[-1]}" if whole else f"episodes {', '.join(map(str, chunk))}"
+    )
 
 
 def _walked(
-    spec: Spec, chunks: Sequence[Sequence[int]], place: Path,
+    spec: Spec,
+    chunks: Sequence[Sequence[int]],
+    place: Path,
     walk_all: Callable[[Sequence[Sequence[int]]], None],
-) -> tuple[Sequence[Sequence[int]], Looks | None]:  # fmt: skip
+) -> tuple[Sequence[Sequence[int]], Looks | None]:
     """Walk the chunks, or as many layouts as are enough; return the chunks of these, and the looks.
 
     A resumed run looks at the same layouts again, and so stops where it would have.
@@ -339,7 +384,11 @@ def _walked(
         walk_all(chunks)
         return chunks, None
     numbers, most = spec.source.numbers, max(map(len, chunks))
-    names, done, ended = tuple(point.name for point in spec.points), list[Sequence[int]](), list[Episode]()
+    names, done, ended = (
+        tuple(point.name for point in spec.points),
+        list[Sequence[int]](),
+        list[Episode](),
+    )
     enough, at = False, list[int]()
     for layouts in looks(len(numbers)):
         new = _split(numbers[at[-1] if at else 0 : layouts], most)
@@ -355,9 +404,14 @@ def _walked(
 
 
 def _drive(
-    spec: Spec, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path,
-    progress: Callable[[int], None], cache: Path | None, workers: Workers,
-) -> None:  # fmt: skip
+    spec: Spec,
+    begun: RunStart,
+    chunks: Sequence[Sequence[int]],
+    place: Path,
+    progress: Callable[[int], None],
+    cache: Path | None,
+    workers: Workers,
+) -> None:
 
     def report(chunk: Sequence[int]) -> None:
         progress(len(chunk))
@@ -366,8 +420,11 @@ def _drive(
     _walk_missing(chunks, place, walk_chunk, report, report, workers, _reproducible(spec))
 
 
-def _files(spec: Spec, cache: Path | None, place: Path, workers: Workers) -> tuple[Path | None, Path | None]:
-    """Return the completion cache of workers, and the folder where they keep answers; None if they have none.
+def _files(
+    spec: Spec, cache: Path | None, place: Path, workers: Workers
+) -> tuple[Path | None, Path | None]:
+    """Return the completion cache of workers, and the folder where they keep answers;
+    None if they have none.
 
     These are files of this machine, which the nodes of a cluster cannot share.
     """
@@ -377,10 +434,14 @@ def _files(spec: Spec, cache: Path | None, place: Path, workers: Workers) -> tup
 
 
 def _walk_missing(
-    chunks: Sequence[Sequence[int]], place: Path, walk_chunk: Callable[[Sequence[int]], dict[str, bytes]],
-    report_kept: Callable[[Sequence[int]], None], report_new: Callable[[Sequence[int]], None],
-    workers: Workers = 1, exact: bool = True,
-) -> None:  # fmt: skip
+    chunks: Sequence[Sequence[int]],
+    place: Path,
+    walk_chunk: Callable[[Sequence[int]], dict[str, bytes]],
+    report_kept: Callable[[Sequence[int]], None],
+    report_new: Callable[[Sequence[int]], None],
+    workers: Workers = 1,
+    exact: bool = True,
+) -> None:
     """Walk the chunks that are not kept yet, and keep each as soon as it is done."""
     todo = [chunk for chunk in chunks if not (place / _folder_name(chunk)).is_dir()]
     for chunk in chunks:
@@ -399,14 +460,18 @@ def _walk_missing(
 
 
 def _reproducible(spec: Spec) -> bool:
-    """Return whether all machines give a question the same answer; those of a language model may differ."""
+    """Return whether all machines give a question the same answer;
+    those of a language model may differ.
+    """
     return not any(agent.can.language_model for agent in spec.agents)
 
 
 def _walk_chunk(
     spec: Spec, begun: RunStart, cache: Path | None, place: Path | None, chunk: Sequence[int]
 ) -> dict[str, bytes]:
-    """Walk a chunk in a worker process and return its files by name; `place` keeps its answers until then."""
+    """Walk a chunk in a worker process and return its files by name;
+    `place` keeps its answers until then.
+    """
     kept = place and _answered_file(place, chunk)
 
     def backend() -> Backend:
@@ -432,13 +497,19 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 
 def _gather(
-    out: Path, begun: RunStart, chunks: Sequence[Sequence[int]], place: Path, made_of: Mapping[str, bytes],
-    folders: Sequence[Path] = (), layouts: Sequence[Layout] = (),
-) -> Evaluated:  # fmt: skip
-    """Score the chunks in a working folder and write the files of the finished run, with its sources.
+    out: Path,
+    begun: RunStart,
+    chunks: Sequence[Sequence[int]],
+    place: Path,
+    made_of: Mapping[str, bytes],
+    folders: Sequence[Path] = (),
+    layouts: Sequence[Layout] = (),
+) -> Evaluated:
+    """Score the chunks in a working folder and write the files of the finished run,
+    with its sources.
 
-    `place` is the working folder, `made_of` has the sources by name, `folders` are folders that the run is
-    merged from, and `layouts` those that its own are a part of.
+    `place` is the working folder, `made_of` has the sources by name, `folders` are folders that the
+    run is merged from, and `layouts` those that its own are a part of.
     """
     settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
     typed = {**settings["settings"], "tag": begun.tags}
@@ -460,39 +531,64 @@ def _gather(
         summary = whole.scores()
         cells = len(names) * len(settings["seeds"])
         episodes = [
-            episode for cell in range(cells) for chunk, of_part in zip(chunks, by_part, strict=True)
+            episode
+            for cell in range(cells)
+            for chunk, of_part in zip(chunks, by_part, strict=True)
             for episode in of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
-        ]  # fmt: skip
+        ]
         if settings["world"].get("looks"):
             summary = [*summary, *any_time_scores(whole.grid, episodes)]
         if layouts:
             summary = [*summary, *adjusted_scores(whole.grid, episodes, layouts)]
-        manifest = msgspec.convert({
-            "format": FORMAT, "name": out.name, "created": begun.created,
-            "command": shlex.join([*begun.command, "--out", str(out)]), "tags": begun.tags, **settings,
-            "settings": typed,
-            "latency": msgspec.to_builtins(begun.latency),
-            "answer_times": msgspec.to_builtins(latencies.times(answers)), "identity": begun.identity,
-            "cached_answers": sum(answer.cached for answer in answers),
-            "engine_errors": sum(answer.error is not None for answer in answers),
-            "retries": sum(answer.retries for answer in answers),
-            "versions": begun.versions,
-            **({"cost": msgspec.to_builtins(cost)} if (cost := costs.total(settings, works)) else {}),
-        }, Manifest)  # fmt: skip
+        manifest = msgspec.convert(
+            {
+                "format": FORMAT,
+                "name": out.name,
+                "created": begun.created,
+                "command": shlex.join([*begun.command, "--out", str(out)]),
+                "tags": begun.tags,
+                **settings,
+                "settings": typed,
+                "latency": msgspec.to_builtins(begun.latency),
+                "answer_times": msgspec.to_builtins(latencies.times(answers)),
+                "identity": begun.identity,
+                "cached_answers": sum(answer.cached for answer in answers),
+                "engine_errors": sum(answer.error is not None for answer in answers),
+                "retries": sum(answer.retries for answer in answers),
+                "versions": begun.versions,
+                **(
+                    {"cost": msgspec.to_builtins(cost)}
+                    if (cost := costs.total(settings, works))
+                    else {}
+                ),
+            },
+            Manifest,
+        )
         kept_sources.write(out, made_of, place)
         with suppress(UserError):  # a stranger's shard may state any command
             write_whole(out / FILE, text_of(of_words(begun.command)))
         servers.write(out, works)
         decisions_of_all = run_parts.decisions_of(parts, settings["actions"])
-        writer.write(out, manifest, decisions_of_all, episodes, run_parts.lines_of(parts), summary, layouts)
+        writer.write(
+            out, manifest, decisions_of_all, episodes, run_parts.lines_of(parts), summary, layouts
+        )
     return Evaluated(out, manifest, summary)
 
 
-def _stated_in_worker(spec: Spec, begun: RunStart | None, workers: Workers) -> tuple[dict[str, Any], Latency]:
-    """Return what `_identity_and_latency` does, in a worker: a forked one inherits no engine's threads."""
+def _stated_in_worker(
+    spec: Spec, begun: RunStart | None, workers: Workers
+) -> tuple[dict[str, Any], Latency]:
+    """Return what `_identity_and_latency` does, in a worker:
+    a forked one inherits no engine's threads.
+    """
     state, exact = partial(_identity_and_latency, begun=begun), _reproducible(spec)
     [stated] = spread(
-        state, [spec], workers, lambda done: None, lambda each: f"the model {each.ego.card.name}", exact
+        state,
+        [spec],
+        workers,
+        lambda done: None,
+        lambda each: f"the model {each.ego.card.name}",
+        exact,
     )
     return stated
 
@@ -526,10 +622,16 @@ def _open_all(spec: Spec) -> list[Backend]:
 
 
 def read_or_evaluate(
-    spec: Spec, out: Path, progress: Progress, cache: Path | None, opens: Opens,
+    spec: Spec,
+    out: Path,
+    progress: Progress,
+    cache: Path | None,
+    opens: Opens,
     given: Mapping[str, Answer] = NOTHING,
-) -> folder.Run:  # fmt: skip
-    """Read the finished run in a folder, or run it with `evaluate` first; for studies of several runs."""
+) -> folder.Run:
+    """Read the finished run in a folder, or run it with `evaluate` first;
+    for studies of several runs.
+    """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)
     else:

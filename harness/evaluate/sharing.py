@@ -22,14 +22,17 @@ from harness.world.scene_graph import SceneGraph
 def shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
-    """Return the ego's graph for each scene and the keys of those who were heard in it (`fusion.key_of`).
+    """Return the ego's graph for each scene and the keys of those who were heard in it
+    (`fusion.key_of`).
 
-    None where their messages hold no objects. All sets have messages of one content; `scenes` has the scenes
-    that these come from, by id.
+    None where their messages hold no objects. All sets have messages of one content;
+    `scenes` has the scenes that these come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
     for seat, places in by_seat([scene for scene, _ in sets], scenario).items():
-        for n, graph in zip(places, _shared_graphs(seat, [sets[n] for n in places], scenes), strict=True):
+        for n, graph in zip(
+            places, _shared_graphs(seat, [sets[n] for n in places], scenes), strict=True
+        ):
             graphs[n] = graph
     return graphs
 
@@ -41,7 +44,9 @@ def _shared_graphs(
     if TRUTH in changes:
         truths = truth_graphs(scenario, [scene.state for scene, _ in sets])
         own = [scene.graphs[scene.viewers[0]] for scene, _ in sets]
-        return [structs.replace(t, sectors=o.all_in_sight) for t, o in zip(truths, own, strict=True)]
+        return [
+            structs.replace(t, sectors=o.all_in_sight) for t, o in zip(truths, own, strict=True)
+        ]
     if OBJECTS not in changes:
         return [None] * len(sets)
     cases = []
@@ -56,7 +61,9 @@ def _shared_graphs(
 
 def _without_ego(graph: SceneGraph) -> SceneGraph:
     """Return a graph without the ego, which the ego that hears it would take for somebody else."""
-    return structs.replace(graph, nodes=tuple(node for node in graph.nodes if node.id != graph.ego.id))
+    return structs.replace(
+        graph, nodes=tuple(node for node in graph.nodes if node.id != graph.ego.id)
+    )
 
 
 def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
@@ -70,24 +77,30 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     return graph
 
 
-def as_asked(scenario: Scenario, scene: Scene, answer: Answer, source: Scene | None = None) -> Scene:
+def as_asked(
+    scenario: Scenario, scene: Scene, answer: Answer, source: Scene | None = None
+) -> Scene:
     """Return a decision point as it was shown to who gave an answer.
 
-    A blind helper saw nothing; an ego that was asked again may have had the objects of others, of the scene
-    `source` (`fusion.source_of`) if their messages were shuffled.
+    A blind helper saw nothing; an ego that was asked again may have had the objects of others, of
+    the scene `source` (`fusion.source_of`) if their messages were shuffled.
 
     Raises:
-        UserError: the answer names a sender or an attack that there is not, as only a stranger's can.
+        UserError: the answer names a sender or an attack that there is not,
+            as only a stranger's can.
     """
     if answer.role == "blind":
-        return scene.changed(graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()})
+        return scene.changed(
+            graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()}
+        )
     try:
         [graph] = shared_graphs(
             scenario, [(scene, answer.heard)], {each.id: each for each in (source, scene) if each}
         )
     except KeyError as error:
         raise UserError(
-            f"answers.jsonl has an answer in scene {printable(scene.id)} that heard {printable(error)}, "
+            f"answers.jsonl has an answer in scene {printable(scene.id)} that heard "
+            f"{printable(error)}, "
             "who is not there; make the run again"
         ) from None
     return scene if graph is None else scene.changed(graphs={**scene.graphs, answer.viewer: graph})
@@ -96,8 +109,8 @@ def as_asked(scenario: Scenario, scene: Scene, answer: Answer, source: Scene | N
 def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
     """Return how many objects each helper lists, and in how many bits as compact JSON, both (n, H).
 
-    Each object has its id, class, place in metres to one decimal, heading in degrees, speed and indicator;
-    each region the share that is in sight. Both are 0 where there is no helper.
+    Each object has its id, class, place in metres to one decimal, heading in degrees, speed and
+    indicator; each region the share that is in sight. Both are 0 where there is no helper.
     """
     counts, bits = np.zeros((2, len(scenes), max(len(scene.viewers) for scene in scenes) - 1))
     for n, scene in enumerate(scenes):
@@ -113,7 +126,13 @@ def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
 
 def _message(graph: SceneGraph) -> dict[str, object]:
     objects = [
-        [n.id, n.type, n.forward_m, n.left_m, n.heading_deg, n.speed_mps, n.indicator] for n in graph.sensed
+        [n.id, n.type, n.forward_m, n.left_m, n.heading_deg, n.speed_mps, n.indicator]
+        for n in graph.sensed
     ]
     seen = [[sector.sector, sector.seen_share] for sector in graph.sectors]
-    return {"from": graph.viewer, "objects": objects, "seen": seen, "speed_mps": graph.itself.speed_mps}
+    return {
+        "from": graph.viewer,
+        "objects": objects,
+        "seen": seen,
+        "speed_mps": graph.itself.speed_mps,
+    }

@@ -16,7 +16,8 @@ from harness.runs import devices
 
 
 def sources(spec: Spec) -> dict[str, bytes]:
-    """Return the files behind an evaluation by their path in a project, each once, and its answers' schemas.
+    """Return the files behind an evaluation by their path in a project, each once,
+    and its answers' schemas.
 
     What is in no file, such as the card of a hub id or a package's channel, `run.json` has alone.
     """
@@ -27,14 +28,21 @@ def sources(spec: Spec) -> dict[str, bytes]:
         for name, text in prompt.files.items():
             texts[f"prompts/{prompt.version}/{name}"] = text.encode()
         for role in ROLES:
-            schema = msgspec.json.encode(answer_schema(**prompt.shape(role, spec.actions)._asdict()))
-            texts[f"schemas/{prompt.version}/{role}.json"] = msgspec.json.format(schema, indent=1) + b"\n"
+            schema = msgspec.json.encode(
+                answer_schema(**prompt.shape(role, spec.actions)._asdict())
+            )
+            texts[f"schemas/{prompt.version}/{role}.json"] = (
+                msgspec.json.format(schema, indent=1) + b"\n"
+            )
         card = agent.card.name.partition(":")[0]
         if card in cards.names() and cards.load(agent.card.name) == agent.card:
             paths[f"models/{card}.toml"] = resources.find("models", f"{card}.toml")
     for point in spec.points:
         if point.radio.profile:
-            paths |= {f"channels/{name}": path for name, path in CHANNELS.files(point.radio.profile).items()}
+            paths |= {
+                f"channels/{name}": path
+                for name, path in CHANNELS.files(point.radio.profile).items()
+            }
         if point.network:
             file = f"{point.cloud.round_trip}.toml"
             paths[f"networks/{file}"] = resources.find("networks", file)

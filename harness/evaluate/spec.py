@@ -31,7 +31,13 @@ from harness.runs.devices import Device
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
-from harness.runs.settings import DriveSettings, FrozenSettings, HelperSettings, Settings, of_extensions
+from harness.runs.settings import (
+    DriveSettings,
+    FrozenSettings,
+    HelperSettings,
+    Settings,
+    of_extensions,
+)
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
@@ -90,7 +96,9 @@ class Source(Protocol):
         ...
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield a decision point of each of up to `most` episodes; with `ego_alone`, no graph of a helper."""
+        """Yield a decision point of each of up to `most` episodes;
+        with `ego_alone`, no graph of a helper.
+        """
         ...
 
 
@@ -102,13 +110,14 @@ class Spec:
     source: Source  # the world that is walked
     points: tuple[OperatingPoint, ...]  # the conditions, each an operating point
     seeds: tuple[int, ...]  # seeds of the channel's draws
-    # the agents that answer for the helpers. Helpers take them in turn, in the order in which they were
-    # spawned. Empty if the ego's agent answers for the helpers, too
+    # the agents that answer for the helpers. Helpers take them in turn, in the order in which they
+    # were spawned. Empty if the ego's agent answers for the helpers, too
     helpers: tuple[Agent, ...] = ()
-    # the computer that every vehicle has; it replaces `--latency`: the time of an answer follows from its own
-    # tokens. None for no profile
+    # the computer that every vehicle has; it replaces `--latency`: the time of an answer follows
+    # from its own tokens. None for no profile
     device_profile: Device | None = None
-    # all settings, from which `resolve.spec` makes this evaluation: those of what stands above are made of it
+    # all settings, from which `resolve.spec` makes this evaluation: those of what stands above are
+    # made of it
     settings: Settings = USUAL
     budget: Budget | None = None  # what may be spent on answers; it changes nothing in the run
 
@@ -126,7 +135,10 @@ class Spec:
                     f"--tag {printable(tag)!r}: give 1 to {TAG_CHARACTERS} printable characters, "
                     "with no space at either end"
                 )
-        for flag, choice, choices in (("--ask", self.settings.ask, ASKS), ("--ties", self.ties, TIES)):
+        for flag, choice, choices in (
+            ("--ask", self.settings.ask, ASKS),
+            ("--ties", self.ties, TIES),
+        ):
             if choice not in choices:
                 raise UserError(f"{flag} {printable(choice)}: give {' or '.join(choices)}")
         if self.settings.batch_size < 1:
@@ -139,11 +151,13 @@ class Spec:
         if self.helpers and drivers and (self.ego in drivers or not self.several_decide):
             if self.ego in drivers:
                 raise UserError(
-                    f"--model {printable(self.ego.card.name)}: it is a driver, which asks no helpers; give "
+                    f"--model {printable(self.ego.card.name)}: it is a driver, which asks no "
+                    "helpers; give "
                     "another model, or leave the helpers' options out"
                 )
             raise UserError(
-                f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for an ego "
+                f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for "
+                "an ego "
                 "only; give other models"
             )
         if (latency := self.settings.latency) not in (None, *NAMES):
@@ -159,13 +173,19 @@ class Spec:
         if until := self.source.until:
             names = [point.name for point in self.points]
             until.check(self.source.record(), self.source.numbers, names, self.seeds)
-        for flag, value in {"--device": self.settings.device, "--dtype": self.settings.dtype}.items():
+        for flag, value in {
+            "--device": self.settings.device,
+            "--dtype": self.settings.dtype,
+        }.items():
             if value is not None and not any(agent.can.has_weights for agent in self.agents):
                 engines = [
-                    name for name, engine in ENGINES.usable().items() if engine.capabilities.has_weights
+                    name
+                    for name, engine in ENGINES.usable().items()
+                    if engine.capabilities.has_weights
                 ]
                 raise UserError(
-                    f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights here "
+                    f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights "
+                    "here "
                     f"(engines {' and '.join(engines)} have); leave it out"
                 )
 
@@ -173,11 +193,14 @@ class Spec:
         if self.device_profile is None:
             if self.settings.device_model is not None:
                 shown = printable(self.settings.device_model)
-                raise UserError(f"--device-model {shown} is a device's row; give --device-profile as well")
+                raise UserError(
+                    f"--device-model {shown} is a device's row; give --device-profile as well"
+                )
             return
         if self.settings.latency is not None:
             raise UserError(
-                f"--device-profile {printable(self.device_profile.name)} says how long answers take, as "
+                f"--device-profile {printable(self.device_profile.name)} says how long answers "
+                "take, as "
                 f"--latency {printable(self.settings.latency)} does; give one of the two"
             )
         rows_of(self.device_profile, self.settings.device_model, self.agents)
@@ -185,9 +208,13 @@ class Spec:
     def _check_servers(self) -> None:
         served = {agent.card for agent in self.agents if agent.card.server}
         if self.settings.server and len(served) != 1:
-            models = " and ".join(sorted(printable(card.name) for card in served or {self.ego.card}))
+            models = " and ".join(
+                sorted(printable(card.name) for card in served or {self.ego.card})
+            )
             reason = "are asked at servers of their own" if served else "is asked at none"
-            raise UserError(f"--server: {models} {reason}; leave it out, and give base_url in a card")
+            raise UserError(
+                f"--server: {models} {reason}; leave it out, and give base_url in a card"
+            )
         try:
             for card in served:
                 card.at(self.settings.server)
@@ -198,7 +225,9 @@ class Spec:
         temperature, seed = self.settings.temperature, self.settings.sampling_seed
         shown = f"--temperature {temperature:g}"
         if not 0 <= temperature <= HOTTEST:
-            raise UserError(f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}")
+            raise UserError(
+                f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}"
+            )
         if seed < 0 or (seed and not temperature):
             raise UserError(
                 f"--sampling-seed {seed}: give 0 or more, with a --temperature above 0: "
@@ -206,28 +235,41 @@ class Spec:
             )
         if temperature and not any(agent.samples for agent in self.agents):
             name = printable(self.ego.card.name)
-            reason = f"{name} has nothing to sample; leave it out, or give a model that writes its answers"
+            reason = (
+                f"{name} has nothing to sample; leave it out, or give a model that writes its "
+                "answers"
+            )
             if self.ego.answer in BARE:
-                reason = f"a {self.ego.answer} is a distribution already; use --answer json or constrained"
+                reason = (
+                    f"a {self.ego.answer} is a distribution already; use --answer json or "
+                    "constrained"
+                )
             raise UserError(f"{shown}: {reason}")
 
     def _check(self, agent: Agent) -> None:
         name, version = printable(agent.card.name), agent.prompt.version
         if reason := unfit(agent.prompt, self.scenario):
-            raise UserError(f"--prompt {version} {reason}; give {self.scenario.prompt}, or one of your own")
+            raise UserError(
+                f"--prompt {version} {reason}; give {self.scenario.prompt}, or one of your own"
+            )
         self._check_examples(agent.prompt)
         if self.source.kind == "closed-loop" and agent.image == "another":
-            raise UserError("--image another: pictures of other scenes are a dataset's; give blank or none")
+            raise UserError(
+                "--image another: pictures of other scenes are a dataset's; give blank or none"
+            )
         if self.source.kind == "closed-loop" and not agent.can.closed_loop:
             raise UserError(
-                f"--model {name}: a replay has answers to frozen scenes alone; give the model that it replays"
+                f"--model {name}: a replay has answers to frozen scenes alone; give the model that "
+                "it replays"
             )
         latency = self.settings.latency
         shown = f"--latency {printable(latency)}"
         if latency not in NAMES:
             return
         if agent.can.own_latency and latency != "paper":
-            raise UserError(f"{shown}: a replay has the times of its run; use paper, or leave it out")
+            raise UserError(
+                f"{shown}: a replay has the times of its run; use paper, or leave it out"
+            )
         elif latency == MEASURED and not agent.can.language_model:
             raise UserError(f"{shown}: {name} is no language model; use card or paper")
         elif latency == "card" and agent.card.latency.inference_s is None:
@@ -237,13 +279,17 @@ class Spec:
             )
 
     def _check_examples(self, prompt: Prompt) -> None:
-        """Raise UserError if an example's layout is evaluated, or if the parser would not take its answer."""
+        """Raise UserError if an example's layout is evaluated,
+        or if the parser would not take its answer.
+        """
         if prompt.examples is None:
             return
         if shown := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
             raise UserError(
-                f"--prompt {prompt.version} has an example of layout seed {shown[0]}, which is evaluated; "
-                "leave that episode out, or draw the examples anew: `harness prompt examples --first-seed`"
+                f"--prompt {prompt.version} has an example of layout seed {shown[0]}, which is "
+                "evaluated; "
+                "leave that episode out, or draw the examples anew: `harness prompt examples "
+                "--first-seed`"
             )
         for role in ROLES:
             example_actions(prompt, role, self.actions)
@@ -251,7 +297,9 @@ class Spec:
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego
         if point.ask.messages == "shuffled" and self.source.kind != "frozen":
-            raise UserError(f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval")
+            raise UserError(
+                f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval"
+            )
         if point.content.plan and not self.several_decide:
             raise UserError(NO_PLANS.format(printable(point.name)))
         for part in point.more:
@@ -269,14 +317,18 @@ class Spec:
         reason = self._plan_obstacle if point.content.plan else self.fusion_obstacle
         if point.content.words and not ego.prompt.shows_words:
             version = ego.prompt.version
-            reason = f"prompt {version} cannot show words without an intent; use --prompt v11 or v12"
+            reason = (
+                f"prompt {version} cannot show words without an intent; use --prompt v11 or v12"
+            )
         if not ego.can.language_model:
             reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
         if reason:
             raise UserError(f"{shown}: {reason}")
 
     def _check_shows_objects(self, shown: str) -> None:
-        """Raise UserError if the ego's prompt is the same whatever is around; it is tried on some scenes."""
+        """Raise UserError if the ego's prompt is the same whatever is around;
+        it is tried on some scenes.
+        """
         for scene in self.source.trial(TRIED, ego_alone=True):
             graph = truth_graph(self.scenario, scene.state)
             full, empty = (
@@ -286,7 +338,8 @@ class Spec:
             if full != empty:
                 return
         raise UserError(
-            f"{shown}: prompt {self.ego.prompt.version} shows no objects in its text, so the ego would be "
+            f"{shown}: prompt {self.ego.prompt.version} shows no objects in its text, so the ego "
+            "would be "
             "asked the same question again; give another --prompt"
         )
 
@@ -299,7 +352,8 @@ class Spec:
         for prompt in (helper.prompt for helper in self.helpers):
             if prompt.helper_answer != form:
                 return (
-                    f"prompt {version} fuses messages with a {form}, those of {prompt.version} have a "
+                    f"prompt {version} fuses messages with a {form}, those of {prompt.version} "
+                    "have a "
                     f"{prompt.helper_answer}; use another --helper-prompt"
                 )
         return None
@@ -310,7 +364,10 @@ class Spec:
         for agent in self.agents:
             if not agent.can.language_model:
                 name = printable(agent.card.name)
-                return f"{name} is no language model and cannot read plans; use consensus=yield-by-time"
+                return (
+                    f"{name} is no language model and cannot read plans; use "
+                    "consensus=yield-by-time"
+                )
             if not agent.prompt.shows_plans:
                 return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
         if self.device_profile:
@@ -331,7 +388,9 @@ class Spec:
         return scene.seat or self.scenario
 
     def agent(self, place: int) -> int:
-        """Return the index of the agent of the vehicle at this place (`Scene.place`); the ego is at 0."""
+        """Return the index of the agent of the vehicle at this place (`Scene.place`);
+        the ego is at 0.
+        """
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
     @property
@@ -349,7 +408,9 @@ class Spec:
 
     @property
     def asks_all(self) -> bool:
-        """Whether the answers of all are asked at once; with a device profile the joules of all count."""
+        """Whether the answers of all are asked at once;
+        with a device profile the joules of all count.
+        """
         return self.settings.ask == "all" or self.ego_alone or self.device_profile is not None
 
     @property
@@ -362,14 +423,20 @@ class Spec:
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def changed(self, **settings: Any) -> "Spec":
-        """Return this evaluation with other settings, such as `temperature=0.5`, that open nothing."""
+        """Return this evaluation with other settings, such as `temperature=0.5`,
+        that open nothing.
+        """
         spec = replace(self, settings=structs.replace(self.settings, **settings))
-        if lost := [name for name, value in settings.items() if getattr(spec.settings, name) != value]:
+        if lost := [
+            name for name, value in settings.items() if getattr(spec.settings, name) != value
+        ]:
             raise ValueError(f"{lost[0]} is what is opened here: replace that")
         return spec
 
     def record(self) -> dict[str, Any]:
-        """Return the settings, and what they opened, as plain values: a part of a run's `run.json`."""
+        """Return the settings, and what they opened, as plain values:
+        a part of a run's `run.json`.
+        """
         settings = msgspec.to_builtins(self.settings)
         return {
             **self.ego.settings(),
@@ -378,10 +445,14 @@ class Spec:
             "actions": list(self.actions),
             "conditions": [point.record() for point in self.points],
             "channels": {
-                name: CHANNELS.record(name) for point in self.points if (name := point.radio.profile)
+                name: CHANNELS.record(name)
+                for point in self.points
+                if (name := point.radio.profile)
             },
             "networks": {
-                point.cloud.round_trip: asdict(point.network) for point in self.points if point.network
+                point.cloud.round_trip: asdict(point.network)
+                for point in self.points
+                if point.network
             },
             "schedules": {
                 name: sha256
@@ -399,18 +470,23 @@ class Spec:
         }
 
     def _opened(self) -> dict[str, Any]:
-        """Return the settings that open what is opened here; and those that depend on it if nothing is typed.
+        """Return the settings that open what is opened here;
+        and those that depend on it if nothing is typed.
 
-        A condition with a control or an attack has a name of its own, and so has a model on another engine.
+        A condition with a control or an attack has a name of its own,
+        and so has a model on another engine.
         """
         helpers = HelperSettings()
         if self.helpers:
-            thinking = any(agent.thinking and agent.card.thinking != "always" for agent in self.helpers)
+            thinking = any(
+                agent.thinking and agent.card.thinking != "always" for agent in self.helpers
+            )
             helpers = HelperSettings(
                 model=",".join(argument(agent.card) for agent in self.helpers),
-                prompt=self.helpers[0].prompt.version, answer=self.helpers[0].answer,
+                prompt=self.helpers[0].prompt.version,
+                answer=self.helpers[0].answer,
                 thinking=None if thinking == self.ego.thinking else thinking,
-            )  # fmt: skip
+            )
         first = self.seeds[0]
         return {
             "model": argument(self.ego.card),
@@ -421,8 +497,13 @@ class Spec:
             "condition": tuple(point.name for point in self.points),
             "control": (),
             "attack": (),
-            "seeds": ",".join(map(str, self.seeds)) if len(self.seeds) > 1 else f"{first}:{first + 1}",
-            **{name: getattr(self.ego, name) for name in ("answer", "thinking", "image", "flip", "sums")},
+            "seeds": ",".join(map(str, self.seeds))
+            if len(self.seeds) > 1
+            else f"{first}:{first + 1}",
+            **{
+                name: getattr(self.ego, name)
+                for name in ("answer", "thinking", "image", "flip", "sums")
+            },
             "letters": self._letters,
             "device_profile": self.device_profile.name if self.device_profile else None,
             "ties": self.ties,

@@ -16,7 +16,9 @@ from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 @lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
-    """Return the channel busy ratio under the background load; NaN if the channel has no such figure."""
+    """Return the channel busy ratio under the background load;
+    NaN if the channel has no such figure.
+    """
     return point.physical.busy_ratio() if point.physical else float("nan")
 
 
@@ -25,20 +27,29 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
     c, point = decided.result, decided.point
     anybody = any_of(c.on_time)
     return {
-        "messages": c.messages, "requests": c.requests, "request_bits": c.request_bits,
-        "reply_bits": c.reply_bits, "airtime_ms": c.airtime_s * 1000, "triggered": c.triggered,
+        "messages": c.messages,
+        "requests": c.requests,
+        "request_bits": c.request_bits,
+        "reply_bits": c.reply_bits,
+        "airtime_ms": c.airtime_s * 1000,
+        "triggered": c.triggered,
         "busy_ratio": np.full(c.messages.shape, busy_ratio(point)),
         "own_failed": c.own_failed,
-        "entropy_nats": c.entropy_nats, "normalised_entropy": c.normalised_entropy,
-        "own_weight": c.weights[..., 0], "latency_ms": c.latency_s * 1000,
+        "entropy_nats": c.entropy_nats,
+        "normalised_entropy": c.normalised_entropy,
+        "own_weight": c.weights[..., 0],
+        "latency_ms": c.latency_s * 1000,
         "deadline_missed": np.where(np.isnan(c.latency_s), np.nan, c.deadline_missed),
         "fusion_ms": c.fusion_s * 1000,
         "fusion_failed": np.where(anybody & point.has_fusion_call, c.fusion_failed, np.nan),
-        "effective_loss": np.where(c.triggered, c.loss, np.nan), "observed_loss": c.observed_loss,
-    }  # fmt: skip
+        "effective_loss": np.where(c.triggered, c.loss, np.nan),
+        "observed_loss": c.observed_loss,
+    }
 
 
-def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]) -> Decisions:
+def table(
+    decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]
+) -> Decisions:
     """Return the table of decisions, sorted by episode, step, decision point, condition and seed.
 
     The decisions may be in any order; further columns (n,), `more`, are in that order.
@@ -58,7 +69,9 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
         return np.array(list(values))[at]
 
     def widened(arrays: Iterable[Any]) -> Any:
-        return np.concatenate([np.pad(array, ((0, 0), (0, helpers - array.shape[1]))) for array in arrays])
+        return np.concatenate(
+            [np.pad(array, ((0, 0), (0, helpers - array.shape[1]))) for array in arrays]
+        )
 
     def of_messages(name: str) -> Any:
         return widened(getattr(part.result, name) for part in decided)
@@ -66,16 +79,22 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
     numbers = [columns(part) for part in decided]
     asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
     sent = {
-        "delivered": of_messages("delivered"), "on_time": of_messages("on_time"),
+        "delivered": of_messages("delivered"),
+        "on_time": of_messages("on_time"),
         "arrival_ms": np.where(np.isfinite(arrival_s), arrival_s * 1000, np.nan),
         "weight": widened([part.result.weights[:, 1:] for part in decided]),
-        "trust": of_messages("trust"), "attacker": widened([part.said.attackers for part in decided]),
-    }  # fmt: skip
-    voices = [f"voice-{n + 1}" for n in range(helpers - vehicles)]  # an attacker may have several voices
+        "trust": of_messages("trust"),
+        "attacker": widened([part.said.attackers for part in decided]),
+    }
+    # an attacker may have several voices
+    voices = [f"voice-{n + 1}" for n in range(helpers - vehicles)]
     senders = [
-        [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices] for scene in scenes
+        [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices]
+        for scene in scenes
     ]
-    episode, step = (of_scenes(getattr(s.record, name) for s in scenes) for name in ("episode", "step"))
+    episode, step = (
+        of_scenes(getattr(s.record, name) for s in scenes) for name in ("episode", "step")
+    )
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]
     order = np.lexsort((point, rank[at], step, episode))
@@ -89,27 +108,36 @@ def table(decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: S
             for name, messages in sent.items()
             for column, array in by_message(name, np.where(asked, messages, np.nan)).items()
         },
-        "seed": np.concatenate([part.due.seed for part in decided]), "episode": episode, "step": step,
-    }  # fmt: skip
+        "seed": np.concatenate([part.due.seed for part in decided]),
+        "episode": episode,
+        "step": step,
+    }
     labels = {
         "scene": _labels(ids, at),
         "danger": _labels([s.record.danger.sector for s in scenes], at),
         "condition": Labels(point, points),
         "agent": _labels([s.viewers[0] if s.several else None for s in scenes], at),
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
-        **{f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h]) for h in range(helpers)},
+        **{
+            f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h])
+            for h in range(helpers)
+        },
     }
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 
 def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
-    """Return tables of the same episodes and of different seeds, in their order, as `table` makes one."""
+    """Return tables of the same episodes and of different seeds, in their order,
+    as `table` makes one.
+    """
     if len(tables) == 1:
         return tables[0]
     whole = Decisions.concat(tables)
     ids = sorted(set().union(*(part.scenes for part in tables)))
     condition = whole.codes("condition", [point.name for point in points])
-    order = np.lexsort((condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode")))
+    order = np.lexsort(
+        (condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode"))
+    )
     return whole.take(order)
 
 

@@ -1,4 +1,6 @@
-"""Measure inference times before a run; only if the user asks for it, and only on an idle machine."""
+"""Measure inference times before a run;
+only if the user asks for it, and only on an idle machine.
+"""
 
 import os
 from collections.abc import Sequence
@@ -22,9 +24,11 @@ def refuse_busy() -> None:
     load = load_a_core()
     if load is None or load > IDLE:
         reason = (
-            "this system does not say how busy it is" if load is None else
-            f"the machine is busy ({load:.2f} processes a core in the last minute; at most {IDLE:g})"
-        )  # fmt: skip
+            "this system does not say how busy it is"
+            if load is None
+            else f"the machine is busy ({load:.2f} processes a core in the last minute; at most "
+            f"{IDLE:g})"
+        )
         wait = "" if load is None else "wait until it is idle, or "
         raise UserError(
             f"--latency {MEASURED}: {reason}; {wait}declare times with --latency paper or {EXAMPLE}"
@@ -45,10 +49,12 @@ def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
 
 
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
-    """Return the median time of the answers in each role, over these scenes; each request is sent alone.
+    """Return the median time of the answers in each role, over these scenes;
+    each request is sent alone.
 
-    A role in which no answer can be timed gets the ego's time. The backend is the model itself; a cache
-    would answer in no time. Raises UserError if no answer of the ego can be timed, and Unanswered.
+    A role in which no answer can be timed gets the ego's time. The backend is the model itself; a
+    cache would answer in no time. Raises UserError if no answer of the ego can be timed, and
+    Unanswered.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first request of a process includes the warm-up
@@ -64,7 +70,8 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
             raise Unanswered(str(tally))
         name = printable(spec.ego.card.name)
         raise UserError(
-            f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; see what "
+            f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; "
+            "see what "
             f"`harness model check` says, or declare times such as {EXAMPLE}"
         )
     ego_s, helper_s, fusion_s = (
@@ -72,9 +79,12 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     )
     several_helpers = len(spec.helpers) > 1
     helper_times = tuple(
-        times(answers[r.id] for r in first if r.agent == agent).get("helper", sample["ego"]).median_s
-        for agent in range(1, len(spec.agents)) if several_helpers
-    )  # fmt: skip
+        times(answers[r.id] for r in first if r.agent == agent)
+        .get("helper", sample["ego"])
+        .median_s
+        for agent in range(1, len(spec.agents))
+        if several_helpers
+    )
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
     helper_s = helper_times[0] if helper_times else helper_s
     return Latency("measured", basis, ego_s, helper_s, fusion_s, sample, helper_times)

@@ -1,4 +1,5 @@
-"""The one loop over decision points: observe the world, get intents, coordinate under every condition, act.
+"""The one loop over decision points:
+observe the world, get intents, coordinate under every condition, act.
 
 The kinds of world are frozen scenes, the closed loop, and those whose decision points are drawn.
 They differ only in where their decision points come from and where an action leads.
@@ -46,8 +47,8 @@ class Due:
     episode: Ints  # the episode's number of each, (n,)
     seed: Ints  # the seed of the channel's draws for each, (n,)
     draws: Draws  # those draws, (n, ...)
-    # the decision that each helper makes itself now, in the same world, (n, H): its place among these; -1
-    # where it makes none. None where messages hold no plans
+    # the decision that each helper makes itself now, in the same world, (n, H): its place among
+    # these; -1 where it makes none. None where messages hold no plans
     senders: Ints | None = None
 
     @property
@@ -79,27 +80,39 @@ class World(Protocol[DecisionPoint]):
         ...
 
     def site(self, units: Collection[Unit]) -> Site | None:
-        """Return where vehicles and units are in the points just shown, (n, ...); None without places."""
+        """Return where vehicles and units are in the points just shown, (n, ...);
+        None without places.
+        """
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return what egos see in the points just shown, (n, ...); None in a world without places."""
+        """Return what egos see in the points just shown, (n, ...);
+        None in a world without places.
+        """
         ...
 
     def claims(self) -> Claims | None:
-        """Return what helpers claim in the points just shown, (n, ...); None in a world without places."""
+        """Return what helpers claim in the points just shown, (n, ...);
+        None in a world without places.
+        """
         ...
 
     def plans(self) -> Plans | None:
-        """Return what each agent says of itself in the points just shown, (n, 1); None for one ego."""
+        """Return what each agent says of itself in the points just shown, (n, 1);
+        None for one ego.
+        """
         ...
 
     def listed(self) -> tuple[Floats, Floats] | None:
-        """Return how many objects helpers list, and in how many bits, (n, H); None without places."""
+        """Return how many objects helpers list, and in how many bits, (n, H);
+        None without places.
+        """
         ...
 
     def step(self, decided: Sequence[Decided[DecisionPoint]]) -> None:
-        """Act on the decisions, one `Decided` a condition, and advance to the next decision points."""
+        """Act on the decisions, one `Decided` a condition,
+        and advance to the next decision points.
+        """
         ...
 
 
@@ -131,7 +144,9 @@ class Fuses(Protocol):
     """The answered fusion calls of some decision points."""
 
     def __call__(self, decision_points: Ints, attackers: Bools | None = None, /) -> FusionCall:
-        """Return the call for decisions at points (n,), with the attackers (n, H) if messages show them."""
+        """Return the call for decisions at points (n,),
+        with the attackers (n, H) if messages show them.
+        """
         ...
 
 
@@ -139,32 +154,48 @@ class Ask(Protocol[AskedPoint]):
     """The source of intents: it asks the agents."""
 
     def __call__(self, points: Sequence[AskedPoint], /) -> Intents:
-        """Return what every vehicle intends in these decision points, (n, ...); helpers may be `unasked`."""
+        """Return what every vehicle intends in these decision points, (n, ...);
+        helpers may be `unasked`.
+        """
         ...
 
     def blind(self, points: Sequence[AskedPoint], /, at: Ints) -> Intents:
-        """Return the same where helpers are shown nothing, (n, ...); only the points `at` need values."""
+        """Return the same where helpers are shown nothing, (n, ...);
+        only the points `at` need values.
+        """
         ...
 
-    def helpers(self, points: Sequence[AskedPoint], /, wanted: Bools, blind: bool = False) -> Intents:
-        """Ask the helpers wanted, (n, H), and return the intents of the points where any is wanted."""
+    def helpers(
+        self, points: Sequence[AskedPoint], /, wanted: Bools, blind: bool = False
+    ) -> Intents:
+        """Ask the helpers wanted, (n, H),
+        and return the intents of the points where any is wanted.
+        """
         ...
 
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers to these sets of messages (`codes_of`), rewritten as `rewrites` says."""
+        """Return the ego's answers to these sets of messages (`codes_of`),
+        rewritten as `rewrites` says.
+        """
         ...
 
     def plan_call(self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents) -> FusionCall:
-        """Return the call of agents, in the points `at` (n,), that hear the plans in `intents`, (n, ...)."""
+        """Return the call of agents, in the points `at` (n,),
+        that hear the plans in `intents`, (n, ...).
+        """
         ...
 
 
 def walk(
-    world: World[DecisionPoint], points: Sequence[OperatingPoint], ask: Ask[DecisionPoint], ties: str
+    world: World[DecisionPoint],
+    points: Sequence[OperatingPoint],
+    ask: Ask[DecisionPoint],
+    ties: str,
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
-    """Walk a world under some conditions until every episode is decided; yield the decisions of each step.
+    """Walk a world under some conditions until every episode is decided;
+    yield the decisions of each step.
 
     Of actions that are equally likely, `ties` takes the `first`, or one that is `drawn`.
     """
@@ -178,7 +209,10 @@ def walk(
 
 
 def _steps(
-    world: World[DecisionPoint], points: Sequence[OperatingPoint], ask: Ask[DecisionPoint], ties: str
+    world: World[DecisionPoint],
+    points: Sequence[OperatingPoint],
+    ask: Ask[DecisionPoint],
+    ties: str,
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
     memories = {point: Memory() for point in points}
     attackers = {point: Attackers(point) for point in points}
@@ -198,7 +232,11 @@ def _steps(
             counts, bits = world.listed() or (None, None)
             intents = replace(intents, objects=counts, object_bits=bits)
         asked_blind = [each.at for point, each in due.items() if point.blind_helpers]
-        blind = ask.blind(decision_points, np.unique(np.concatenate(asked_blind))) if asked_blind else None
+        blind = (
+            ask.blind(decision_points, np.unique(np.concatenate(asked_blind)))
+            if asked_blind
+            else None
+        )
         intents, blind = _asked(ask, decision_points, due, intents, blind)
         broadcasts = {
             point: attackers[point].said(
@@ -208,9 +246,13 @@ def _steps(
             )
             for point, each in due.items()
         }
-        sent = {point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()}
+        sent = {
+            point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()
+        }
         for point in (point for point in due if point.fusion.rounds > 1):
-            fusion = FusionInputs(None, memories[point].recall(due[point]), tie_draws(due[point].draws, ties))
+            fusion = FusionInputs(
+                None, memories[point].recall(due[point]), tie_draws(due[point].draws, ties)
+            )
             plan_call = partial(ask.plan_call, decision_points, due[point].at)
             broadcasts[point], sent[point] = further_rounds(
                 point, broadcasts[point], sent[point], partial(_decided, point, fusion, plan_call)
@@ -225,7 +267,9 @@ def _steps(
                 call = calls[point.rewrites](
                     places_of(point, due_here, len(decision_points)), shown(point, broadcast)
                 )
-            fusion = FusionInputs(call, memories[point].recall(due_here), tie_draws(due_here.draws, ties))
+            fusion = FusionInputs(
+                call, memories[point].recall(due_here), tie_draws(due_here.draws, ties)
+            )
             result = fuse(point, sent[point], broadcast.intents, fusion)
             decided.append(Decided(point, decision_points, due_here, result, broadcast))
         for part in decided:
@@ -235,17 +279,23 @@ def _steps(
 
 
 def _decided(
-    point: OperatingPoint, fusion: FusionInputs, plan_call: Callable[[Intents], FusionCall],
-    heard: Exchange, intents: Intents,
-) -> Coordination:  # fmt: skip
+    point: OperatingPoint,
+    fusion: FusionInputs,
+    plan_call: Callable[[Intents], FusionCall],
+    heard: Exchange,
+    intents: Intents,
+) -> Coordination:
     call = plan_call(intents) if point.has_fusion_call else None
     return fuse(point, heard, intents, replace(fusion, call=call))
 
 
 def _asked(
-    ask: Ask[DecisionPoint], decision_points: Sequence[DecisionPoint],
-    due: Mapping[OperatingPoint, Due], intents: Intents, blind: Intents | None,
-) -> tuple[Intents, Intents | None]:  # fmt: skip
+    ask: Ask[DecisionPoint],
+    decision_points: Sequence[DecisionPoint],
+    due: Mapping[OperatingPoint, Due],
+    intents: Intents,
+    blind: Intents | None,
+) -> tuple[Intents, Intents | None]:
     """Ask the helpers whose answers some condition uses, and return the intents, sighted and blind.
 
     An answer may fail, and another helper is asked in its place; so this may take several turns.
@@ -272,9 +322,10 @@ def _asked(
 def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
     """Return the intents that each decision works with; a control replaces those of the helpers.
 
-    With `messages=blind` they are the intents of helpers that are shown nothing. With `messages=shuffled`
-    they come from another layout: the next one in which the same seed has a decision at this step. If there
-    is none, the ego hears nobody. Who is asked, the distances and the times stay the same.
+    With `messages=blind` they are the intents of helpers that are shown nothing. With
+    `messages=shuffled` they come from another layout: the next one in which the same seed has a
+    decision at this step. If there is none, the ego hears nobody. Who is asked, the distances and
+    the times stay the same.
     """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = _able(point, intents if every else intents.take(due.at))
@@ -301,7 +352,9 @@ def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
 
 
 def _able(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return the intents where only those helpers count as valid that have what the content wants."""
+    """Return the intents where only those helpers count as valid that have what the content
+    wants.
+    """
     if point.content.words:
         return intents.with_words()
     by_model = point.content.intent or point.content.plan or not point.asks
@@ -313,11 +366,15 @@ def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
     content, encoding = point.content, point.radio.encoding
     if encoding == JSON and not content.asks_again:
         return intents
-    return replace(intents, payload_bits=reply_bits(encoding, content, intents, point.physical is not None))
+    return replace(
+        intents, payload_bits=reply_bits(encoding, content, intents, point.physical is not None)
+    )
 
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:
-    """Return the decision whose helpers each decision hears, (n,): its own, but where they are shuffled."""
+    """Return the decision whose helpers each decision hears, (n,):
+    its own, but where they are shuffled.
+    """
     if point.ask.messages != "shuffled":
         return np.arange(len(due.at))
     order = np.lexsort((due.episode, due.seed))
@@ -346,14 +403,17 @@ class Memory:
 
 
 def _fusion_calls(
-    due: Mapping[OperatingPoint, Due], broadcasts: Mapping[OperatingPoint, SentIntents],
-    sent: Mapping[OperatingPoint, Exchange], decision_points: Sequence[DecisionPoint],
+    due: Mapping[OperatingPoint, Due],
+    broadcasts: Mapping[OperatingPoint, SentIntents],
+    sent: Mapping[OperatingPoint, Exchange],
+    decision_points: Sequence[DecisionPoint],
     ask: Ask[DecisionPoint],
-) -> dict[Rewrites, Fuses]:  # fmt: skip
-    """Make one fusion call for each set of messages that any condition hears, and return them by rewrites.
+) -> dict[Rewrites, Fuses]:
+    """Make one fusion call for each set of messages that any condition hears,
+    and return them by rewrites.
 
-    This can happen before any decision, since who is heard does not depend on the fusion. Plans are left out:
-    they may be of a later round.
+    This can happen before any decision, since who is heard does not depend on the fusion.
+    Plans are left out: they may be of a later round.
     """
     calls = {}
     due = {point: due_here for point, due_here in due.items() if not point.content.plan}
@@ -365,10 +425,13 @@ def _fusion_calls(
 
 
 def heard_codes(
-    due: Mapping[OperatingPoint, Due], broadcasts: Mapping[OperatingPoint, SentIntents],
-    sent: Mapping[OperatingPoint, Exchange], n: int,
-) -> Ints:  # fmt: skip
-    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`), ascending.
+    due: Mapping[OperatingPoint, Due],
+    broadcasts: Mapping[OperatingPoint, SentIntents],
+    sent: Mapping[OperatingPoint, Exchange],
+    n: int,
+) -> Ints:
+    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`),
+    ascending.
 
     There are `n` decision points.
     """
@@ -376,13 +439,16 @@ def heard_codes(
     for point, due_here in due.items():
         if point.has_fusion_call:
             on_time = sent[point].on_time
-            codes_here = codes_of(on_time, places_of(point, due_here, n), shown(point, broadcasts[point]))
+            codes_here = codes_of(
+                on_time, places_of(point, due_here, n), shown(point, broadcasts[point])
+            )
             codes.append(codes_here[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
 
 
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
-    """Return a number for each decision, (n,): of its point, and of that of its helpers if shuffled.
+    """Return a number for each decision, (n,):
+    of its point, and of that of its helpers if shuffled.
 
     With `n` decision points, the number of a shuffled one is n times the first and the second.
     """

@@ -1,1 +1,3 @@
-"""Hold what goes beyond the paper's method: each folder is one extension, and nothing else imports it."""
+"""Hold what goes beyond the paper's method:
+each folder is one extension, and nothing else imports it.
+"""

@@ -20,7 +20,9 @@ MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
-    """An intent, its sum as stated, a helper's message, the repairs, and what else was asked for."""
+    """An intent, its sum as stated, a helper's message, the repairs,
+    and what else was asked for.
+    """
 
     intent: values.Intent
     mass: float | None
@@ -35,7 +37,9 @@ class Answer(Struct, frozen=True):
         return replace(self, repairs=self.repairs - repairs)
 
 
-def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False) -> Answer:
+def read(
+    members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False
+) -> Answer:
     """Read an answer-shaped object; with `divides`, any sum above 0 is divided out.
 
     Raises Failure with all statuses for values that are true of it.
@@ -54,8 +58,14 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
         if extension is None:
             repairs.add(Repair.UNFIT_EXTENSION)
     has_loose_actions = any(values.match(key, actions) for key in rest)
-    if has_loose_actions and fields.keys() & {"action_distribution", "recommended_maneuver", "maneuver"}:
-        raise Failure(Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields")
+    if has_loose_actions and fields.keys() & {
+        "action_distribution",
+        "recommended_maneuver",
+        "maneuver",
+    }:
+        raise Failure(
+            Status.CONFLICTING_ANSWERS, "actions stand both inside and outside the answer's fields"
+        )
     if has_loose_actions:
         repairs.add(Repair.UNWRAPPED)
         fields["action_distribution"] = rest
@@ -64,7 +74,9 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
     if "confidence" in fields:  # which has no sum to tell percent by
         fields["confidence"] = values.in_percent(fields["confidence"], list(rest.values()))
     if "action_distribution" in fields:
-        fields["action_distribution"], found = pieces.distribution_in(fields["action_distribution"], actions)
+        fields["action_distribution"], found = pieces.distribution_in(
+            fields["action_distribution"], actions
+        )
         repairs |= found
 
     if _is_other_form(fields, shape):
@@ -79,7 +91,9 @@ def read(members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divid
     else:
         if "confidence" in fields:
             repairs.add(Repair.EXTRA_FIELD)
-        intent, mass = values.distribution(fields.get("action_distribution"), actions, repairs, divides)
+        intent, mass = values.distribution(
+            fields.get("action_distribution"), actions, repairs, divides
+        )
     return Answer(intent, mass, None, frozenset(repairs), extension)
 
 
@@ -97,19 +111,26 @@ def _helper(fields: dict[str, Any], shape: Shape, repairs: set[Repair], divides:
         risk = _risk(fields.get("risk"), repairs)
     evidence = _evidence(fields.get("evidence"), shape, repairs)
     if failures and Repair.EVIDENCE_ECHO in repairs:
-        failures.append(Failure(Status.SCHEMA_ECHO, "the evidence is the prompt's placeholder for it"))
+        failures.append(
+            Failure(Status.SCHEMA_ECHO, "the evidence is the prompt's placeholder for it")
+        )
     if failures:
         raise joined(failures)
     message = {
-        "evidence": evidence, "risk": risk, "recommended_maneuver": maneuver, "confidence": confidence,
-    }  # fmt: skip
+        "evidence": evidence,
+        "risk": risk,
+        "recommended_maneuver": maneuver,
+        "confidence": confidence,
+    }
     return Answer(intent, mass, message, frozenset(repairs))
 
 
 def _judgement(
     fields: dict[str, Any], key: str, actions: Sequence[str], repairs: set[Repair], divides: bool
 ) -> tuple[values.Intent, float | None, str, float]:
-    """Return the intent, its sum as stated, the maneuver and its confidence, in whichever form they stand."""
+    """Return the intent, its sum as stated, the maneuver and its confidence,
+    in whichever form they stand.
+    """
     if "action_distribution" in fields:
         intent, mass = values.distribution(fields["action_distribution"], actions, repairs, divides)
         confidence = max(intent)
@@ -118,7 +139,9 @@ def _judgement(
             repairs.add(Repair.BOTH_FORMS)
             maneuver = _maneuver(fields.get(key, maneuver), actions, repairs)
             if intent[actions.index(maneuver)] < confidence:
-                detail = f"the {key.replace('_', ' ')} is not the distribution's most probable action"
+                detail = (
+                    f"the {key.replace('_', ' ')} is not the distribution's most probable action"
+                )
                 raise Failure(Status.CONFLICTING_ANSWERS, detail)
         return intent, mass, maneuver, confidence
     failures: list[Failure] = []
@@ -133,14 +156,18 @@ def _judgement(
     elif failures:
         failures.append(Failure(Status.MISSING_ACTION, "no confidence and no distribution"))
     else:
-        failures.append(Failure(Status.LABEL_ONLY, f"only {maneuver} is named, without a confidence"))
+        failures.append(
+            Failure(Status.LABEL_ONLY, f"only {maneuver} is named, without a confidence")
+        )
     if failures:
         raise joined(failures)
     return recommended(maneuver, confidence, actions), None, maneuver, confidence
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
-    """Return the intent with `confidence` on the maneuver and the rest spread evenly over the others."""
+    """Return the intent with `confidence` on the maneuver and the rest spread evenly over the
+    others.
+    """
     if len(actions) == 1:
         return (1.0,)
     share = (1 - confidence) / (len(actions) - 1)
@@ -151,17 +178,23 @@ def _maneuver(value: object, actions: Sequence[str], repairs: set[Repair]) -> st
     if not isinstance(value, str):
         raise Failure(Status.UNKNOWN_ACTION, "the recommended maneuver is no action's name")
     if _lists(value, actions) or values.is_placeholder(value):
-        raise Failure(Status.SCHEMA_ECHO, "the schema's choice of actions came back instead of one action")
+        raise Failure(
+            Status.SCHEMA_ECHO, "the schema's choice of actions came back instead of one action"
+        )
     name = values.match(value, actions)
     if name is None:
-        raise Failure(Status.UNKNOWN_ACTION, f"{printable(value, 40)!r} is no action of the scenario")
+        raise Failure(
+            Status.UNKNOWN_ACTION, f"{printable(value, 40)!r} is no action of the scenario"
+        )
     if name != value:
         repairs.add(Repair.KEY_CASE)
     return name
 
 
 def _lists(value: str, options: Sequence[str]) -> bool:
-    """Return whether a text lists all options and chooses none: low|medium|high, low or medium or high."""
+    """Return whether a text lists all options and chooses none:
+    low|medium|high, low or medium or high.
+    """
     listed = all(re.search(rf"\b{re.escape(option)}\b", value) for option in options)
     return "|" in value or (listed and len(options) > 1)
 
@@ -190,7 +223,9 @@ def _evidence(value: object, shape: Shape, repairs: set[Repair]) -> str | None:
 
 def _risk(value: object, repairs: set[Repair]) -> str | None:
     if isinstance(value, str) and (_lists(value, RISKS) or values.is_placeholder(value)):
-        raise Failure(Status.SCHEMA_ECHO, "the schema's choice of risks came back instead of one risk")
+        raise Failure(
+            Status.SCHEMA_ECHO, "the schema's choice of risks came back instead of one risk"
+        )
     level = values.match(value, RISKS) if isinstance(value, str) else None
     if level is None:
         repairs.add(Repair.MISSING_RISK)

@@ -17,7 +17,8 @@ from harness.parsing.status import Failure, Repair, Status
 from harness.parsing.values import is_schema, match
 
 _MAX_BROKEN = 200  # most braces that open nothing; a text with more is noise, and each costs a try
-_MAX_TRIED = 4_000_000  # most characters that these tries read in total; without it, a megabyte takes minutes
+# most characters that these tries read in total; without it, a megabyte takes minutes
+_MAX_TRIED = 4_000_000
 _MAX_OBJECTS = 5_000  # no answer has so many
 _MISSING = {"evidence": Repair.MISSING_EVIDENCE, "risk": Repair.MISSING_RISK}
 _OPENING = re.compile(r"[{｛]")
@@ -49,9 +50,9 @@ def candidates(
 ) -> list[Candidate]:
     """Return all candidates, in the order of the text, which has no thought and no special tokens.
 
-    If the token limit `cut` the text, an open bracket is never closed. With `reasons_first` the prompt asked
-    for reasons before the answer, and prose there is no repair. Raises Failure (no_json, label_only,
-    truncated_json, syntax or missing_action) if there is no candidate.
+    If the token limit `cut` the text, an open bracket is never closed. With `reasons_first` the
+    prompt asked for reasons before the answer, and prose there is no repair. Raises Failure
+    (no_json, label_only, truncated_json, syntax or missing_action) if there is no candidate.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)
@@ -67,7 +68,9 @@ def candidates(
     other_text, at = [], 0
     for start, reading in objects.readings:
         answers = list(_answers(reading.value, role, actions))
-        shaped += [Candidate(members, extra | reading.repairs | escapes) for members, extra in answers]
+        shaped += [
+            Candidate(members, extra | reading.repairs | escapes) for members, extra in answers
+        ]
         if answers:
             other_text.append(text[at:start])
             at = reading.end
@@ -85,7 +88,11 @@ def candidates(
         return shaped
     if objects.broken is not None:
         mended, rest = mend.mended(text[objects.broken :], FIELDS[role] + actions, cut)
-        extra = escapes | _repairs_around(text[: objects.broken], rest, reasons_first) | {Repair.JSON_REPAIR}
+        extra = (
+            escapes
+            | _repairs_around(text[: objects.broken], rest, reasons_first)
+            | {Repair.JSON_REPAIR}
+        )
         answers = list(_answers(mended, role, actions))
         if not answers:
             raise mend.unreadable()
@@ -94,7 +101,9 @@ def candidates(
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return the spans of a text's candidates; empty if `candidates` must change the text to find any."""
+    """Return the spans of a text's candidates;
+    empty if `candidates` must change the text to find any.
+    """
     try:
         objects = _objects(text, cut=False)
     except Failure:
@@ -107,19 +116,31 @@ def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int
 
 
 def _around(
-    text: str, objects: _Objects, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool
+    text: str,
+    objects: _Objects,
+    role: str,
+    actions: tuple[str, ...],
+    cut: bool,
+    reasons_first: bool,
 ) -> Candidate | None:
-    """Return a helper's message whose distribution alone can be read, with the fields around it mended.
+    """Return a helper's message whose distribution alone can be read,
+    with the fields around it mended.
 
     A quote in its evidence breaks the object, and nothing else. None if there is no such object.
     """
     start = objects.broken or 0
-    inner = [(at, each) for at, each in objects.readings if at > start and _shaped(each.value, role, actions)]
+    inner = [
+        (at, each)
+        for at, each in objects.readings
+        if at > start and _shaped(each.value, role, actions)
+    ]
     if len(inner) != 1 or len(objects.readings) != 1:
         return None
     [(at, reading)] = inner
     try:
-        members, name, rest = mend.around(text[start:], at - start, reading.end - start, FIELDS[role], cut)
+        members, name, rest = mend.around(
+            text[start:], at - start, reading.end - start, FIELDS[role], cut
+        )
     except Failure:
         return None
     around = _repairs_around(text[:start], rest, reasons_first)
@@ -184,7 +205,9 @@ def _shaped(value: object, role: str, actions: tuple[str, ...]) -> bool:
 def _answers(
     value: Any, role: str, actions: tuple[str, ...]
 ) -> Iterator[tuple[dict[str, Any], frozenset[Repair]]]:
-    """Yield answer-shaped objects in a JSON value: the value, or what a wrapper such as a tool call holds."""
+    """Yield answer-shaped objects in a JSON value:
+    the value, or what a wrapper such as a tool call holds.
+    """
     stack = [(value, frozenset[Repair]())]
     while stack:
         node, repairs = stack.pop()
@@ -192,7 +215,9 @@ def _answers(
         repairs |= opened
         if is_schema(node) and not isinstance(node, relaxed.Repeated):
             in_schema = pieces.in_schema(node, role, actions)
-            yield from [(members, repairs | extra) for members, extra in in_schema] or [(node, repairs)]
+            yield from [(members, repairs | extra) for members, extra in in_schema] or [
+                (node, repairs)
+            ]
         elif isinstance(node, relaxed.Repeated) or _shaped(node, role, actions):
             yield node, repairs
         elif isinstance(node, dict | list):
@@ -212,7 +237,9 @@ def _repairs_for(text: str) -> frozenset[Repair]:
     repairs = {Repair.CODE_FENCE} if fences else set()
     characters = "".join(unfenced.split())
     if characters:
-        repairs.add(Repair.STRAY_PUNCTUATION if _STRAY.issuperset(characters) else Repair.PROSE_AROUND)
+        repairs.add(
+            Repair.STRAY_PUNCTUATION if _STRAY.issuperset(characters) else Repair.PROSE_AROUND
+        )
     return frozenset(repairs)
 
 
@@ -225,11 +252,12 @@ def _no_candidate(text: str, has_object: bool, actions: tuple[str, ...]) -> Fail
     lone = text.strip("".join(_STRAY) + "!?# \t\r\n").casefold()
     # A name that is not in the text at all needs no look at what surrounds it.
     named = [
-        a for a in actions
+        a
+        for a in actions
         if (a in text and re.search(_whole_word(a), text))
         or lone == a.casefold()
         or (has_object and f'"{a.casefold()}"' in text.casefold())
-    ]  # fmt: skip
+    ]
     if len(named) == 1:
         return Failure(Status.LABEL_ONLY, f"only {named[0]} is named, without probabilities")
     if has_object:

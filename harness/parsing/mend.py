@@ -1,4 +1,6 @@
-"""Repair broken JSON with json_repair, the last resort; the result counts only if the text confirms it."""
+"""Repair broken JSON with json_repair, the last resort;
+the result counts only if the text confirms it.
+"""
 
 import json
 import re
@@ -9,8 +11,8 @@ from harness.parsing.relaxed import DECODER
 from harness.parsing.status import Failure, Status
 
 _MAX_CHARS = 4000  # json_repair's time grows faster than its input
-# What a repair could mistake for a number or drop unseen: operators, comparisons, denials, currencies,
-# literals, half a number.
+# What a repair could mistake for a number or drop unseen: operators, comparisons, denials,
+# currencies, literals, half a number.
 _AMBIGUOUS = re.compile(
     r"[~≈<>()+*/^=%|$€£]|[!¬]\w"
     r"|(?<![\w.])-?(?:true|false|null|none|nan|inf(?:inity)?)\b|\d\s*-|\d\.(?!\d)",
@@ -28,9 +30,9 @@ def unreadable() -> Failure:
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """Return the broken object at the start of `text`, repaired, and the text after it.
 
-    The object counts only if it holds nothing ambiguous, each of `names` is a key at most once, and the
-    numbers read are the numbers written, in the same order. Nothing is repaired of a text that the token
-    limit `cut`. Raises Failure for syntax.
+    The object counts only if it holds nothing ambiguous, each of `names` is a key at most once, and
+    the numbers read are the numbers written, in the same order. Nothing is repaired of a text that
+    the token limit `cut`. Raises Failure for syntax.
     """
     import json_repair
 
@@ -50,13 +52,17 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     return value, text[len(source) :]
 
 
-def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tuple[dict[str, Any], str, str]:
-    """Return the members of the broken object at the start of `text`, around a value that can be read.
+def around(
+    text: str, at: int, end: int, fields: Sequence[str], cut: bool
+) -> tuple[dict[str, Any], str, str]:
+    """Return the members of the broken object at the start of `text`,
+    around a value that can be read.
 
-    The value stands from `at` to `end`, with its numbers as they are written, so the text of other members
-    may hold anything. The object counts only if it has no other members than `fields`, and each text in it
-    stands in `text`. Returned are the other members, the name of the value, and the text after the object.
-    Nothing is repaired of a text that the token limit `cut`. Raises Failure for syntax.
+    The value stands from `at` to `end`, with its numbers as they are written, so the text of other
+    members may hold anything. The object counts only if it has no other members than `fields`, and
+    each text in it stands in `text`. Returned are the other members, the name of the value, and the
+    text after the object. Nothing is repaired of a text that the token limit `cut`. Raises Failure
+    for syntax.
     """
     import json_repair
 
@@ -82,7 +88,9 @@ def around(text: str, at: int, end: int, fields: Sequence[str], cut: bool) -> tu
 
 
 def _numbers(value: object) -> list[float]:
-    """Return the numbers in a JSON value in order; also those in keys and texts, so that none is lost."""
+    """Return the numbers in a JSON value in order;
+    also those in keys and texts, so that none is lost.
+    """
     if isinstance(value, dict):
         parts = [part for pair in value.items() for part in pair]
         return [number for part in parts for number in _numbers(part)]

@@ -1,7 +1,8 @@
-"""Parse a completion into an intent: any text gets exactly one status, and every repair is recorded.
+"""Parse a completion into an intent:
+any text gets exactly one status, and every repair is recorded.
 
-The order of the steps is the rule: the thought is cut off before the search for an answer, valid JSON goes
-before repaired JSON, and two answers that differ are no answer.
+The order of the steps is the rule: the thought is cut off before the search for an answer, valid
+JSON goes before repaired JSON, and two answers that differ are no answer.
 """
 
 import re
@@ -30,28 +31,33 @@ _SPECIAL = re.compile(
 )
 # Listed, not worked out from \s, so that a search passes over all else at once.
 _NO_WIDTH = r"\u200b-\u200f\u2060-\u2064\u202a-\u202e\ufeff\u00ad"
-_SPACES = r"\x0b\x0c\x1c-\x1f\x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"  # not JSON's
+# not JSON's
+_SPACES = r"\x0b\x0c\x1c-\x1f\x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"
 _INVISIBLE = re.compile(rf"[{_NO_WIDTH}{_SPACES}]")
 _NO_WIDTHS, _SPACE = re.compile(rf"[{_NO_WIDTH}]+"), re.compile(rf"[{_SPACES}]")
 
 # Where no value could be read, the words still show what was copied.
 _UNREAD = (Status.NO_JSON, Status.SYNTAX, Status.TRUNCATED_JSON)
-_ECHO = re.compile(r"\blow ?\| ?medium\b|[\"']\s*:\s*[\"']?p\d?[\"']?\s*[,}]|[\"']max 12 words[\"']")
+_ECHO = re.compile(
+    r"\blow ?\| ?medium\b|[\"']\s*:\s*[\"']?p\d?[\"']?\s*[,}]|[\"']max 12 words[\"']"
+)
 
 
 class Parsed(Struct, frozen=True):
     """The result of parsing one completion."""
 
     status: Status  # the outcome
-    repairs: tuple[Repair, ...] = ()  # the repairs, in the order of `Repair`; empty unless recovered
+    # the repairs, in the order of `Repair`; empty unless recovered
+    repairs: tuple[Repair, ...] = ()
     # probabilities in the order of the actions, summing to 1; None if failed
     intent: tuple[float, ...] | None = None
     # the sum as the model wrote it; None if it wrote none (a recommendation, most failures)
     mass: float | None = None
-    # a helper's evidence, risk, recommended_maneuver and confidence. For a distribution, the maneuver is the
-    # most probable action (the first of equals) and the confidence its probability
+    # a helper's evidence, risk, recommended_maneuver and confidence. For a distribution, the
+    # maneuver is the most probable action (the first of equals) and the confidence its probability
     message: dict[str, Any] | None = None
-    reasoning: str | None = None  # the thought, or None; the whole text if the thought was never closed
+    # the thought, or None; the whole text if the thought was never closed
+    reasoning: str | None = None
     detail: str = ""  # one sentence for people, safe to print
     faults: tuple[Status, ...] = ()  # if failed, all that is wrong with it, the status first
     # the further members that were asked for; None without any, or if they do not fit
@@ -80,8 +86,9 @@ def parse(
 ) -> Parsed:
     """Parse one completion. Any text gives a `Parsed`; no text makes this raise.
 
-    A closed thought is what a thinking model should write, and an empty one is what a template adds, so
-    neither is a repair. A closed thought with content is one if the model was not asked to think.
+    A closed thought is what a thinking model should write, and an empty one is what a template
+    adds, so neither is a repair. A closed thought with content is one if the model was not asked to
+    think.
 
     Args:
         text: the completion as it came; of a refusal, the words of the model or none.
@@ -90,12 +97,13 @@ def parse(
         form: one of the role's `FORMS`; None if any of them will do.
         extension: schemas of further members; empty for none.
         placeholders: what the prompt shows in place of values, which is no evidence.
-        thinking: whether the text must hold a closed thought: the model was asked to think, and the engine
-            did not take the thought out of the text.
-        reasons_first: whether the prompt asked for reasons before the answer; then prose there is no repair.
+        thinking: whether the text must hold a closed thought: the model was asked to think, and the
+            engine did not take the thought out of the text.
+        reasons_first: whether the prompt asked for reasons before the answer;
+            then prose there is no repair.
         divides: whether a sum that is off 1 by more than rounding is divided out, unless it is 0.
-        finish_reason: the engine's finish reason; `length` means that the token limit cut the text off,
-            `refusal` that the model refused the question.
+        finish_reason: the engine's finish reason; `length` means that the token limit cut the text
+            off, `refusal` that the model refused the question.
         error: the engine's message if it failed.
 
     Raises UserError for an unknown role.
@@ -126,7 +134,9 @@ def parse(
         if failure.status is Status.TRUNCATED_REASONING:
             thought = text.strip()
         return _failed(failure, thought or None)
-    repairs = tuple(repair for repair in Repair if repair in answer.repairs) if answer.repairs else ()
+    repairs = (
+        tuple(repair for repair in Repair if repair in answer.repairs) if answer.repairs else ()
+    )
     return Parsed(
         Status.RECOVERED if repairs else Status.STRICT,
         repairs,
@@ -135,18 +145,27 @@ def parse(
         answer.message,
         thought or None,
         extension=answer.extension,
-        detail=f"read after {len(repairs)} repair(s): {', '.join(repairs)}" if repairs else "fits the schema",
+        detail=f"read after {len(repairs)} repair(s): {', '.join(repairs)}"
+        if repairs
+        else "fits the schema",
     )
 
 
 def _failed(failure: Failure, thought: str | None) -> Parsed:
     return Parsed(
-        failure.status, mass=failure.mass, reasoning=thought, detail=failure.detail, faults=failure.faults
+        failure.status,
+        mass=failure.mass,
+        reasoning=thought,
+        detail=failure.detail,
+        faults=failure.faults,
     )
 
 
-def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) -> list[tuple[int, int]]:
-    """Return the start and end of each answer that `parse` finds in a completion, to show them to people.
+def spans(
+    text: str, role: str, actions: Sequence[str], thinking: bool = False
+) -> list[tuple[int, int]]:
+    """Return the start and end of each answer that `parse` finds in a completion,
+    to show them to people.
 
     Empty if there is no answer, or if the text had to be rewritten before one was found.
     """
@@ -162,7 +181,8 @@ def spans(text: str, role: str, actions: Sequence[str], thinking: bool = False) 
 
 def _recovered(text: str, shape: Shape, cut: bool, reasons_first: bool, divides: bool) -> Answer:
     text, special = _SPECIAL.subn(" ", text)
-    # A narrow space between a number and its unit is good typography in prose, so reasons may have one.
+    # A narrow space between a number and its unit is good typography in prose, so reasons may have
+    # one.
     zero_width = _INVISIBLE.search(text, text.find("{") if reasons_first else 0)
     if zero_width or (reasons_first and _INVISIBLE.search(text)):
         text = _SPACE.sub(" ", _NO_WIDTHS.sub("", text))
@@ -176,7 +196,9 @@ def _recovered(text: str, shape: Shape, cut: bool, reasons_first: bool, divides:
 
 
 def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
-    """Return the one answer among the candidates; an echo of the template is not a second answer."""
+    """Return the one answer among the candidates;
+    an echo of the template is not a second answer.
+    """
     answers: list[Answer] = []
     failures: list[Failure] = []
     partial = True  # whether no candidate that failed names an action
@@ -192,10 +214,14 @@ def _choose(objects: list[Candidate], shape: Shape, divides: bool) -> Answer:
     if not answers:
         raise _none_read(objects, failures, serious)
     last = answers[-1]
-    agree = all(abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True))
+    agree = all(
+        abs(p - q) <= _SAME for a in answers for p, q in zip(a.intent, last.intent, strict=True)
+    )
     if serious or not agree:
         count = len(answers) + len(serious)
-        faults = _distinct([Status.CONFLICTING_ANSWERS, *(f for each in serious for f in each.faults)])
+        faults = _distinct(
+            [Status.CONFLICTING_ANSWERS, *(f for each in serious for f in each.faults)]
+        )
         detail = f"{count} answers stand in the text and they differ"
         if agree and partial:
             detail = "beside the answer stands a part of another one, which names no action"
@@ -209,7 +235,8 @@ def _none_read(
     """Return the failure of candidates of which none is an answer."""
     last, faults = (serious or failures)[-1], [fault for each in failures for fault in each.faults]
     if any(Repair.JSON_REPAIR in candidate.repairs for candidate in objects):
-        # An error in a guessed object need not be one of the text; that it was copied shows in its words.
+        # An error in a guessed object need not be one of the text; that it was copied shows in its
+        # words.
         last, faults = unreadable(), [fault for fault in faults if fault is Status.SCHEMA_ECHO]
     return Failure(last.status, last.detail, last.mass, _distinct([last.status, *faults]))
 

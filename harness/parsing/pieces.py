@@ -1,4 +1,6 @@
-"""Put an answer together that stands in pieces, in a text, or where the types of its schema would."""
+"""Put an answer together that stands in pieces, in a text,
+or where the types of its schema would.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -53,7 +55,9 @@ def decides(fields: set[str], role: str) -> bool:
 
 
 def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
-    """Return the answers in a JSON Schema: beside its keywords, and under `properties` in place of types."""
+    """Return the answers in a JSON Schema:
+    beside its keywords, and under `properties` in place of types.
+    """
     found: list[Found] = []
     own = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
     if _states(own, role, actions):
@@ -66,7 +70,9 @@ def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list
 
 
 def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
-    """Return the distribution that stands in a text or under a schema's `properties`, with the repairs."""
+    """Return the distribution that stands in a text or under a schema's `properties`,
+    with the repairs.
+    """
     value, repairs = decoded(value)
     inner = _properties(value)
     if inner is value or not _states({_DISTRIBUTION: inner}, "ego", actions):
@@ -80,7 +86,9 @@ def _properties(value: Any) -> Any:
 
 
 def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
-    """Return whether members name an action, or give a number or a text for one, and not its type."""
+    """Return whether members name an action, or give a number or a text for one,
+    and not its type.
+    """
     shares = [value for key, value in members.items() if match(key, (_DISTRIBUTION,))]
     for each in (members, *(share for share in shares if isinstance(share, dict))):
         stated = [value for key, value in each.items() if match(key, (NAMED[role], *actions))]
@@ -89,8 +97,11 @@ def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
     return False
 
 
-def gathered(members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]) -> Found:
-    """Return an answer with the fields that it has one level deeper, but for those in members `apart`.
+def gathered(
+    members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]
+) -> Found:
+    """Return an answer with the fields that it has one level deeper,
+    but for those in members `apart`.
 
     Raises Failure conflicting_answers if two members have the same field.
     """
@@ -121,10 +132,16 @@ def _two_forms(fields: set[str], role: str) -> bool:
 
 
 def are_one(pieces: Sequence[dict[str, Any]], role: str, actions: Sequence[str]) -> bool:
-    """Return whether several objects are pieces of one answer: one decides, and none repeats another."""
+    """Return whether several objects are pieces of one answer:
+    one decides, and none repeats another.
+    """
     if len(pieces) < 2 or any(isinstance(piece, relaxed.Repeated) for piece in pieces):
         return False
     fields = [fields_of(piece, role, actions) for piece in pieces]
     together = set().union(*fields)
     alone = sum(map(len, fields)) == len(together) and all(fields)
-    return alone and sum(decides(each, role) for each in fields) == 1 and not _two_forms(together, role)
+    return (
+        alone
+        and sum(decides(each, role) for each in fields) == 1
+        and not _two_forms(together, role)
+    )

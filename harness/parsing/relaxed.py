@@ -1,8 +1,9 @@
 """Read almost-JSON; every deviation from JSON is recorded as a repair, and no value is guessed.
 
-It reads what small models often write: Python dicts, typographic quotes, bare keys, comments, trailing
-commas, percent signs, missing closing brackets. An expression (`1/3`) is kept as text, so that no later rule
-takes it for a number. Numbers and words that touch the end of the text count as cut off.
+It reads what small models often write: Python dicts, typographic quotes, bare keys, comments,
+trailing commas, percent signs, missing closing brackets. An expression (`1/3`) is kept as text, so
+that no later rule takes it for a number. Numbers and words that touch the end of the text count as
+cut off.
 """
 
 import json
@@ -64,7 +65,9 @@ class Unfinished(Exception):
 
 @dataclass
 class Reading:
-    """A value, where it ends in the text, the repairs, and whether the end of the text closed it."""
+    """A value, where it ends in the text, the repairs,
+    and whether the end of the text closed it.
+    """
 
     value: Any = None
     end: int = 0
@@ -78,7 +81,8 @@ def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members if len(members) == len(pairs) else Repeated(members)
 
 
-# As a float, an integer may have any number of digits; one too large becomes infinite instead of an error.
+# As a float, an integer may have any number of digits; one too large becomes infinite instead of an
+# error.
 DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 
 
@@ -86,7 +90,8 @@ DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 class Token:
     """A token of the text."""
 
-    kind: str  # a group of the pattern; `other` for a character that begins no token, `end` at the text's end
+    # a group of the pattern; `other` for a character that begins no token, `end` at the text's end
+    kind: str
     text: str  # the text as written, with full-width numbers and marks as ASCII
     end: int  # where the next token may begin
     repairs: frozenset[Repair] = frozenset()  # repairs for the token and the comments before it
@@ -201,7 +206,9 @@ class _Reader:
         return True
 
     def _ends_after_value(self, closer: str) -> bool:
-        """Read the comma or the closing bracket after a value; return whether the container ends there."""
+        """Read the comma or the closing bracket after a value;
+        return whether the container ends there.
+        """
         token = self.token
         if token.kind == "mark" and token.text in (",", closer):
             return self._take().text == closer
@@ -209,7 +216,8 @@ class _Reader:
             self.out.repairs.add(Repair.MISSING_COMMA)
             return False
         last = self.last.kind
-        if token.kind == "end" and last in ("string", "mark"):  # a closed string or bracket is complete
+        # a closed string or bracket is complete
+        if token.kind == "end" and last in ("string", "mark"):
             self.out.closed_by_end = True
         elif token.kind != "fence" and not (last == "mark" and token.kind in ("word", "other")):
             self._fail(token)

@@ -1,4 +1,6 @@
-"""Judge the further members of an answer, which a prompt's `answer.json` asks for, with `jsonschema`."""
+"""Judge the further members of an answer, which a prompt's `answer.json` asks for,
+with `jsonschema`.
+"""
 
 import json
 import math
@@ -18,7 +20,9 @@ def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
 
 
 def is_json(value: object) -> bool:
-    """Return whether a value that was read from JSON has no repeated key and no NaN, which are no JSON."""
+    """Return whether a value that was read from JSON has no repeated key and no NaN,
+    which are no JSON.
+    """
     if isinstance(value, dict):
         return not isinstance(value, Repeated) and all(map(is_json, value.values()))
     if isinstance(value, list):
@@ -28,6 +32,7 @@ def is_json(value: object) -> bool:
 
 @lru_cache(maxsize=16)
 def _validator(shape: Shape) -> Any:
-    from jsonschema import Draft202012Validator  # plain answers never need it, and it takes time to load
+    # plain answers never need it, and it takes time to load
+    from jsonschema import Draft202012Validator
 
     return Draft202012Validator(closed(shape.further))

@@ -1,4 +1,6 @@
-"""Read an answer that is exactly what was asked for, in one typed reading; anything else takes repairs."""
+"""Read an answer that is exactly what was asked for, in one typed reading;
+anything else takes repairs.
+"""
 
 import math
 from functools import lru_cache
@@ -31,7 +33,8 @@ def fitting(text: str, shape: Shape) -> Answer | None:
     for form in _forms(shape):
         try:
             return _answer(msgspec.convert(value, form), shape, extension)
-        except ValueError:  # a form that it is not, or a key with a lone surrogate, which is legal JSON
+        # a form that it is not, or a key with a lone surrogate, which is legal JSON
+        except ValueError:
             continue
     return None
 
@@ -57,7 +60,8 @@ def _answer(answer: Any, shape: Shape, extension: dict[str, Any] | None) -> Answ
     if is_placeholder_text(answer.evidence, shape):
         return None
     message = {
-        "evidence": answer.evidence.encode("utf-8", "replace").decode(),  # a lone surrogate is legal JSON
+        # a lone surrogate is legal JSON
+        "evidence": answer.evidence.encode("utf-8", "replace").decode(),
         "risk": answer.risk,
         "recommended_maneuver": maneuver,
         "confidence": confidence,

@@ -1,7 +1,8 @@
 """Read the members of an answer: names, numbers and sums.
 
-The sum is the checksum of a distribution, so it decides. Within 0.001 of 1 it is exact. Within 0.025 (five
-actions rounded by half a hundredth, and back) it is rounding. Beyond, it is unknown which number is wrong.
+The sum is the checksum of a distribution, so it decides. Within 0.001 of 1 it is exact. Within
+0.025 (five actions rounded by half a hundredth, and back) it is rounding. Beyond, it is unknown
+which number is wrong.
 """
 
 import math
@@ -30,8 +31,8 @@ _PLACEHOLDER = re.compile(
 _NOT = ("!", "¬", "~", "-", "−")
 _PERCENT_WORDS = ("%", "percent", "per cent")
 _BETWEEN_CHOICES = re.compile(r"[|/,]|\bor\b")
-# What any prompt may write in the place of words: how many, or what kind of text. What the one that asked
-# writes is known from its template.
+# What any prompt may write in the place of words: how many, or what kind of text. What the one that
+# asked writes is known from its template.
 _WORDS = re.compile(
     r"(?:at most|max(?:imum)?(?: of)?|up to|under|in)\.? \d+ (?:words?|characters?)"
     rf"|(?:one|a) short sentence|text|string|<.*>|\.{{2,}}|…|{_RANGE}",
@@ -42,7 +43,8 @@ Intent = tuple[float, ...]
 
 
 def match(name: str, known: Sequence[str]) -> str | None:
-    """Return the known name that is meant: the same, or the only one with other case and separators.
+    """Return the known name that is meant:
+    the same, or the only one with other case and separators.
 
     A name behind a sign that denies it, such as !SLOWER, is not meant.
     """
@@ -61,7 +63,9 @@ def _plain(name: str) -> str:
 def sort_fields(
     members: dict[str, Any], known: Sequence[str], repairs: set[Repair]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return members by their known names, and the rest. Raises duplicate_key, even for two spellings."""
+    """Return members by their known names, and the rest.
+    Raises duplicate_key, even for two spellings.
+    """
     if isinstance(members, Repeated):
         raise Failure(Status.DUPLICATE_KEY, "an object has the same key twice")
     fields: dict[str, Any] = {}
@@ -84,8 +88,8 @@ def distribution(
 ) -> tuple[Intent, float]:
     """Return the intent in the order of `actions`, summing to 1, and the sum as stated.
 
-    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure with all
-    statuses for values that are true of it.
+    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure
+    with all statuses for values that are true of it.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -139,12 +143,16 @@ def _check_sum(mass: float, repairs: set[Repair], divides: bool) -> None:
 
 
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
-    """Return a finite number, and whether a percent sign followed it. Raises `Failure` for others."""
+    """Return a finite number, and whether a percent sign followed it.
+    Raises `Failure` for others.
+    """
     percent = False
     if isinstance(value, str):
         text = unicodedata.normalize("NFKC", value).strip()
         if _PLACEHOLDER.fullmatch(text):
-            raise Failure(Status.SCHEMA_ECHO, f"{printable(name, 40)} is a placeholder, not a number")
+            raise Failure(
+                Status.SCHEMA_ECHO, f"{printable(name, 40)} is a placeholder, not a number"
+            )
         percent = text.endswith("%")
         text = text.removesuffix("%").strip()
         if _NUMBER.fullmatch(text):
@@ -165,7 +173,9 @@ def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[fl
     """Return numbers as fractions; they are percent only if all say so or if they sum to 100."""
     values = [value for value, _ in numbers]
     nonzero_percents = [percent for value, percent in numbers if value]
-    if (any(nonzero_percents) and all(nonzero_percents)) or (abs(sum(values) - 100) <= 1 and max(values) > 1):
+    if (any(nonzero_percents) and all(nonzero_percents)) or (
+        abs(sum(values) - 100) <= 1 and max(values) > 1
+    ):
         repairs.add(Repair.PERCENT)
         return [value / 100 for value in values]
     if any(percent for _, percent in numbers):
@@ -180,8 +190,12 @@ def check_range(name: str, value: float) -> None:
 
 
 def in_percent(value: object, rest: Sequence[object]) -> object:
-    """Return a number as a text with a percent sign if a member beside it, in `rest`, states that unit."""
-    stated = any(isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest)
+    """Return a number as a text with a percent sign if a member beside it, in `rest`,
+    states that unit.
+    """
+    stated = any(
+        isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest
+    )
     return f"{value}%" if stated and type(value) is float else value
 
 
@@ -191,7 +205,8 @@ def is_placeholder(value: object) -> bool:
 
 
 def is_placeholder_text(text: str, shape: Shape) -> bool:
-    """Return whether a text stands in a prompt in place of a value: max 12 words, <text>, low|medium.
+    """Return whether a text stands in a prompt in place of a value:
+    max 12 words, <text>, low|medium.
 
     It is one of the prompt that asked, of any prompt, or several of the choices of one of these.
     """
@@ -227,9 +242,15 @@ def is_schema(value: object) -> bool:
 
 def _no_distribution(value: object, actions: Sequence[str]) -> Failure:
     if isinstance(value, str) and match(value, actions):
-        return Failure(Status.LABEL_ONLY, "the distribution is one action's name, without probabilities")
+        return Failure(
+            Status.LABEL_ONLY, "the distribution is one action's name, without probabilities"
+        )
     if is_placeholder(value):
-        return Failure(Status.SCHEMA_ECHO, "the template's placeholder stands where the distribution belongs")
+        return Failure(
+            Status.SCHEMA_ECHO, "the template's placeholder stands where the distribution belongs"
+        )
     if isinstance(value, str):
-        return Failure(Status.MISSING_ACTION, "what stands for the distribution is a text, and none of JSON")
+        return Failure(
+            Status.MISSING_ACTION, "what stands for the distribution is a text, and none of JSON"
+        )
     return Failure(Status.MISSING_ACTION, "what stands for the distribution names no actions")

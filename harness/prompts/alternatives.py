@@ -1,9 +1,9 @@
 """Alternatives that a template's author marks, one of which a search of wordings chooses.
 
-A mark is part of a template's text and has a name. `{% either greeting %}A{% or %}B{% endeither %}` is A or
-B; `{% order parts %}A{% or %}B{% endorder %}` is AB or BA. A mark of one name in both templates is one
-choice. As long as nothing is chosen, a mark is its first alternative, so that the version is an ordinary
-prompt.
+A mark is part of a template's text and has a name. `{% either greeting %}A{% or %}B{% endeither %}`
+is A or B; `{% order parts %}A{% or %}B{% endorder %}` is AB or BA. A mark of one name in both
+templates is one choice. As long as nothing is chosen, a mark is its first alternative, so that the
+version is an ordinary prompt.
 """
 
 import re
@@ -62,7 +62,9 @@ def _marks(text: str) -> Iterator[Mark]:
 
 
 def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
-    """Return a template's text with each mark replaced by the alternative of this number, from 0."""
+    """Return a template's text with each mark replaced by the alternative of this number,
+    from 0.
+    """
     pieces, place = [], 0
     for mark in _marks(text):
         pieces += [text[place : mark.start], mark.alternative(choice.get(mark.name, 0))]
@@ -80,7 +82,9 @@ def counts(texts: Iterable[str]) -> dict[str, int]:
         for mark in _marks(text):
             name, n = mark.name, mark.choices
             if name == EXAMPLES:
-                raise ValueError(f"a mark is named {EXAMPLES}, which example_sets are; give another name")
+                raise ValueError(
+                    f"a mark is named {EXAMPLES}, which example_sets are; give another name"
+                )
             if n < 2:
                 raise ValueError(f"mark {name} has one alternative; divide them by {{% or %}}")
             if sizes.setdefault(name, n) != n:

@@ -1,4 +1,5 @@
-"""Build the JSON Schema of an answer: what a prompt asks for, servers are sent, and an answer is judged by.
+"""Build the JSON Schema of an answer: what a prompt asks for, servers are sent,
+and an answer is judged by.
 
 JSON Schema cannot express that probabilities sum to one; `harness.parsing.parse` checks that.
 """
@@ -13,8 +14,10 @@ from harness.core import errors
 
 FORMS = {"ego": ("distribution", "maneuver"), "helper": ("distribution", "recommendation")}
 ROLES = tuple(FORMS)
-NAMED = {"ego": "maneuver", "helper": "recommended_maneuver"}  # the key of an action that is named alone
-FIELDS = ("evidence", "risk", "action_distribution", "confidence", *NAMED.values())  # of any role's answer
+# the key of an action that is named alone
+NAMED = {"ego": "maneuver", "helper": "recommended_maneuver"}
+# of any role's answer
+FIELDS = ("evidence", "risk", "action_distribution", "confidence", *NAMED.values())
 RISKS = ("low", "medium", "high")
 EVIDENCE_CHARS = 200
 
@@ -25,10 +28,11 @@ class Shape(NamedTuple):
     role: str  # `ego` or `helper`
     actions: tuple[str, ...]  # meta-action names, in the environment's order
     form: str | None = None  # one of the role's `FORMS`; None for any of them
-    # JSON text of the schemas of further members by name (`harness.prompts.extension`), which come first;
-    # empty for none
+    # JSON text of the schemas of further members by name (`harness.prompts.extension`), which come
+    # first; empty for none
     extension: str = ""
-    placeholders: tuple[str, ...] = ()  # what the prompt shows in place of values, which is no evidence
+    # what the prompt shows in place of values, which is no evidence
+    placeholders: tuple[str, ...] = ()
 
     @property
     def forms(self) -> tuple[str, ...]:
@@ -54,8 +58,8 @@ def answer_schema(
 ) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
 
-    An answer has one of two forms: a distribution, or one action with a confidence. `scenario` stands in the
-    title only, and `placeholders` nowhere. Raises UserError for an unknown role.
+    An answer has one of two forms: a distribution, or one action with a confidence. `scenario`
+    stands in the title only, and `placeholders` nowhere. Raises UserError for an unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)
@@ -63,10 +67,16 @@ def answer_schema(
     shape = Shape(role, tuple(actions), form, extension)
     report = shape.further
     if role == "helper":
-        report |= {"evidence": {"type": "string", "maxLength": EVIDENCE_CHARS}, "risk": _choice(RISKS)}
+        report |= {
+            "evidence": {"type": "string", "maxLength": EVIDENCE_CHARS},
+            "risk": _choice(RISKS),
+        }
     distribution = {"action_distribution": closed(dict.fromkeys(actions, probability))}
     single = {NAMED[role]: _choice(actions), "confidence": probability}
-    forms = [closed(report | (distribution if each == "distribution" else single)) for each in shape.forms]
+    forms = [
+        closed(report | (distribution if each == "distribution" else single))
+        for each in shape.forms
+    ]
     title = f"{role} answer" + (f", {scenario}" if scenario else "")
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title}
     return head | (forms[0] if len(forms) == 1 else {"oneOf": forms})
@@ -89,16 +99,22 @@ def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 @lru_cache
 def constrained_schema(shape: Shape) -> Mapping[str, Any]:
-    """Return the schema that constrains an answer of a stated form: a helper's evidence is an empty text."""
+    """Return the schema that constrains an answer of a stated form:
+    a helper's evidence is an empty text.
+    """
     schema = answer_schema(shape.role, shape.actions, form=shape.form, extension=shape.extension)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
     if shape.role == "helper":
-        schema["properties"] = {**schema["properties"], "evidence": {"type": "string", "enum": [""]}}
+        schema["properties"] = {
+            **schema["properties"],
+            "evidence": {"type": "string", "enum": [""]},
+        }
     return schema
 
 
 def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the texts of a number that a constrained answer chooses from, 100 to 1000 steps for a `number`.
+    """Return the texts of a number that a constrained answer chooses from,
+    100 to 1000 steps for a `number`.
 
     The step is a power of ten: hundredths between 0 and 1, tenths between -10 and 10.
     """
@@ -121,7 +137,9 @@ def longest(schema: Mapping[str, Any]) -> int:
         case "array":
             return 1 + int(schema["maxItems"]) * (1 + longest(schema["items"]))
         case "object":
-            return 1 + sum(len(name) + 4 + longest(each) for name, each in schema["properties"].items())
+            return 1 + sum(
+                len(name) + 4 + longest(each) for name, each in schema["properties"].items()
+            )
     return max(map(len, number_texts(schema)))
 
 

@@ -26,18 +26,24 @@ class Outside(NamedTuple):
 class Sizes:
     """Token counts of all prompts."""
 
-    tokens: dict[str, list[int]] = field(default_factory=dict)  # by call: a role, `FUSION` or `REPAIR`
+    # by call: a role, `FUSION` or `REPAIR`
+    tokens: dict[str, list[int]] = field(default_factory=dict)
     outside: list[Outside] = field(default_factory=list)
 
 
 def measure(
-    prompt: Prompt, data: Dataset, scenes: Sequence[Scene], count: Callable[[Sequence[Any]], int] | None,
-    picture: int, progress: Callable[[int], None],
-) -> Sizes:  # fmt: skip
-    """Render the prompt of every viewer, and of the ego with the longest messages of one helper, of two, ...
+    prompt: Prompt,
+    data: Dataset,
+    scenes: Sequence[Scene],
+    count: Callable[[Sequence[Any]], int] | None,
+    picture: int,
+    progress: Callable[[int], None],
+) -> Sizes:
+    """Render the prompt of every viewer,
+    and of the ego with the longest messages of one helper, of two, ...
 
-    `count` returns the tokens of a chat's turns, None renders and counts nothing; a picture beside a text has
-    `picture` tokens. `progress` is called with 1 after each scene.
+    `count` returns the tokens of a chat's turns, None renders and counts nothing; a picture beside
+    a text has `picture` tokens. `progress` is called with 1 after each scene.
     """
     words, (least, most) = data.scenario.prompt_words, prompt.token_budget
     turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}

@@ -1,7 +1,7 @@
 """The decision answer mode: a typed question about a state, with what each option means.
 
-A decision model reads a state and a question, and gives each option a probability without writing text. Any
-chat model answers the same question by a read-out of letters (`harness.prompts.readout`).
+A decision model reads a state and a question, and gives each option a probability without writing
+text. Any chat model answers the same question by a read-out of letters (`harness.prompts.readout`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,8 +13,8 @@ from harness.prompts import readout
 if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
 
-# `choice` between options; `score`, of levels named by their place from 0, the lowest first; `noul`, how
-# probable `true` is and how probable `false`.
+# `choice` between options; `score`, of levels named by their place from 0, the lowest first;
+# `noul`, how probable `true` is and how probable `false`.
 Kind = Literal["choice", "score", "noul"]
 
 # What actions mean; the words of a scenario go before it, under the action's name.
@@ -46,7 +46,10 @@ class Question:
         """Return the question with all its texts changed."""
         meanings = {action: text and change(text) for action, text in self.meanings.items()}
         return replace(
-            self, state=change(self.state), instructions=change(self.instructions), meanings=meanings
+            self,
+            state=change(self.state),
+            instructions=change(self.instructions),
+            meanings=meanings,
         )
 
 
@@ -56,7 +59,8 @@ def question(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> Question:
-    """Return what a scene graph's viewer is asked; the state is the last message of a prompt's chat about it.
+    """Return what a scene graph's viewer is asked;
+    the state is the last message of a prompt's chat about it.
 
     `words` are the scenario's (`Scenario.prompt_words`).
     """
@@ -64,7 +68,10 @@ def question(
     care = CARE[graph.role]
     if graph.role == "ego":
         hidden = f" Other cars may be hidden by {hiding}." if hiding else ""
-        asked = f"You drive car {ego}. Your task: {task}.{hidden} {care} What do you do in the next second?"
+        asked = (
+            f"You drive car {ego}. Your task: {task}.{hidden} {care} What do you do in the next "
+            "second?"
+        )
     else:
         asked = (
             f"You help car {ego}, which does not see all that you see. Its task: {task}. {care} "
@@ -86,6 +93,8 @@ def asked(
     The state comes first, since all orders share it. A picture stays with the last of the messages.
     """
     meant = (question.meanings[action] for action in order)
-    options = [f"{action}: {text}" if text else action for action, text in zip(order, meant, strict=True)]
+    options = [
+        f"{action}: {text}" if text else action for action, text in zip(order, meant, strict=True)
+    ]
     user = {**messages[-1], "content": "\n".join([question.state, *options])}
     return readout.asked(({"role": "system", "content": question.instructions}, user), order)

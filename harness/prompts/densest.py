@@ -10,7 +10,9 @@ ERROR_CHARS = 120  # most characters of the parser's message
 
 
 def dense(characters: int) -> str:
-    """Return digits and spaces in turn: one token a character for Qwen's tokenizers, the most for ASCII."""
+    """Return digits and spaces in turn:
+    one token a character for Qwen's tokenizers, the most for ASCII.
+    """
     return ("1 2 3 4 5 6 7 8 9 " * characters)[:characters]
 
 
@@ -18,15 +20,21 @@ EVIDENCE = dense(EVIDENCE_CHARS)
 
 
 def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a message of each sender for `Prompt.render`, with evidence as long and dense as allowed."""
+    """Return a message of each sender for `Prompt.render`,
+    with evidence as long and dense as allowed.
+    """
     share = round(1 / len(actions), 2)
     return [
         {
-            "sender": sender, "evidence": EVIDENCE, "risk": "medium", "intent": (share,) * len(actions),
-            "recommended_maneuver": max(actions, key=len), "confidence": share,
+            "sender": sender,
+            "evidence": EVIDENCE,
+            "risk": "medium",
+            "intent": (share,) * len(actions),
+            "recommended_maneuver": max(actions, key=len),
+            "confidence": share,
         }
         for sender in senders
-    ]  # fmt: skip
+    ]
 
 
 def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
@@ -47,7 +55,9 @@ def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mappin
 def densest_repair(
     prompt: Prompt, role: str, actions: tuple[str, ...], words: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return what a repair turn adds to a chat at most: the longest answer, and the request to repair it."""
+    """Return what a repair turn adds to a chat at most:
+    the longest answer, and the request to repair it.
+    """
     request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
     answer = dense(prompt.most_answer_tokens(role))
     return {"role": "assistant", "content": answer}, {"role": "user", "content": request}

@@ -15,13 +15,27 @@ from harness.world.scenario import Scenario
 
 Kind = Literal["same", "removed", "added"]
 
-WORD = re.compile(r"\n|[^\S\n]*\S+|[^\S\n]+")  # a word with the space before it; a line break is a word too
+# a word with the space before it; a line break is a word too
+WORD = re.compile(r"\n|[^\S\n]*\S+|[^\S\n]+")
 CONTEXT = 8  # words shown before and after a change
-MARKS: Mapping[Kind, tuple[str, str]] = {"same": ("", ""), "removed": ("[-", "-]"), "added": ("{+", "+}")}
+MARKS: Mapping[Kind, tuple[str, str]] = {
+    "same": ("", ""),
+    "removed": ("[-", "-]"),
+    "added": ("{+", "+}"),
+}
 SETTINGS = (
-    "ego_answer", "helper_answer", "reasons_first", "max_answer_tokens", "max_objects", "max_conflicts",
-    "token_budget", "examples", "example_sets", "extension", "repair_turn",
-)  # fmt: skip
+    "ego_answer",
+    "helper_answer",
+    "reasons_first",
+    "max_answer_tokens",
+    "max_objects",
+    "max_conflicts",
+    "token_budget",
+    "examples",
+    "example_sets",
+    "extension",
+    "repair_turn",
+)
 
 
 @dataclass(frozen=True)
@@ -86,8 +100,12 @@ def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
         texts={**ego.texts, "helper": helper.texts["helper"]},
         max_answer_tokens={**ego.max_answer_tokens, "helper": helper.max_answer_tokens["helper"]},
         helper_answer=helper.helper_answer,
-        extension={r: p.extension[r] for r, p in (("ego", ego), ("helper", helper)) if r in p.extension},
-        reasons_first=tuple(r for r, p in (("ego", ego), ("helper", helper)) if r in p.reasons_first),
+        extension={
+            r: p.extension[r] for r, p in (("ego", ego), ("helper", helper)) if r in p.extension
+        },
+        reasons_first=tuple(
+            r for r, p in (("ego", ego), ("helper", helper)) if r in p.reasons_first
+        ),
     )
 
 
@@ -103,13 +121,17 @@ def _settings(prompt: Prompt) -> Iterator[tuple[str, Any]]:
 
 
 def sent(
-    a: Prompt, b: Prompt, scene: Scene, scenario: Scenario,
+    a: Prompt,
+    b: Prompt,
+    scene: Scene,
+    scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
-) -> list[Sent]:  # fmt: skip
-    """Render what is sent to the ego, to its first helper, and to the ego with a message of every helper.
+) -> list[Sent]:
+    """Render what is sent to the ego, to its first helper,
+    and to the ego with a message of every helper.
 
-    `scenario` gives the actions and words of the prompts. `count` counts the tokens of chat messages; None
-    leaves them uncounted.
+    `scenario` gives the actions and words of the prompts.
+    `count` counts the tokens of chat messages; None leaves them uncounted.
     """
     ego, *helpers = scene.viewers
     questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
@@ -121,15 +143,20 @@ def sent(
         received = [
             {
                 **message,
-                "evidence": f"what {message['sender']} sees from where it stands, in twelve words or less",
+                "evidence": f"what {message['sender']} sees from where "
+                "it stands, in twelve words or less",
             }
             for message in densest_messages(senders, scenario.actions)
         ]
-        old, new = (p.render(graph, scenario.actions, received, scenario.prompt_words) for p in (a, b))
+        old, new = (
+            p.render(graph, scenario.actions, received, scenario.prompt_words) for p in (a, b)
+        )
         pairs = zip(_parts(old).items(), _parts(new).values(), strict=True)
         parts = {part: words(before, after) for (part, before), after in pairs if before or after}
         lengths = _size(old), _size(new)
-        result.append(Sent(viewer, role, lengths, (count(old), count(new)) if count else None, parts))
+        result.append(
+            Sent(viewer, role, lengths, (count(old), count(new)) if count else None, parts)
+        )
     return result
 
 
@@ -166,7 +193,9 @@ def _count(tokens: Iterable[str]) -> int:
 
 
 def marked(hunk: Hunk) -> list[tuple[Kind, str]]:
-    """Mark a hunk's pieces, safe to print: `[-removed-]`, `{+added+}`, and ↵ for a changed line break."""
+    """Mark a hunk's pieces, safe to print:
+    `[-removed-]`, `{+added+}`, and ↵ for a changed line break.
+    """
     pieces: list[tuple[Kind, str]] = []
     for kind, text in hunk.pieces:
         first = "" if text.isspace() else text[: len(text) - len(text.lstrip(" "))]

@@ -1,7 +1,7 @@
 """Few-shot examples of a prompt version: earlier turns of the chat with the right answers.
 
-They are in the version's `examples.json`. Their layouts have train seeds, so that no result is reported on a
-layout that a model was shown.
+They are in the version's `examples.json`. Their layouts have train seeds,
+so that no result is reported on a layout that a model was shown.
 """
 
 from collections.abc import Sequence
@@ -30,11 +30,13 @@ class Example(Struct, frozen=True):
 class Examples(Struct, frozen=True):
     """The examples of a version by role, in the order in which they are shown."""
 
-    # the scenario that they come from, and the only one in which they may be shown, unless `everywhere`
+    # the scenario that they come from, and the only one in which they may be shown, unless
+    # `everywhere`
     scenario: str
     ego: tuple[Example, ...] = ()  # examples with a question to the ego
     helper: tuple[Example, ...] = ()  # examples with a question to a helper
-    # whether they may be shown in every scenario, since neither their text nor their answers depend on it
+    # whether they may be shown in every scenario, since neither their text nor their answers depend
+    # on it
     everywhere: bool = False
 
     def of(self, role: str) -> tuple[Example, ...]:
@@ -57,14 +59,16 @@ class Examples(Struct, frozen=True):
         where = self.scenario + (", for every scenario" if self.everywhere else "")
         pinned = sha256_bytes(text_of(self).encode())[:8]
         return (
-            f"{len(self.ego)} ego, {len(self.helper)} helper, {where}, layout seeds {listed}, sha256 {pinned}"
+            f"{len(self.ego)} ego, {len(self.helper)} helper, {where}, layout seeds {listed}, "
+            f"sha256 {pinned}"
         )
 
 
 def read(text: str, where: str) -> Examples:
     """Read examples from a file's text in JSON; `where` names the file in messages.
 
-    Raises UserError if it is no JSON or lacks something, or an example is of another role or no train seed.
+    Raises UserError if it is no JSON or lacks something,
+    or an example is of another role or no train seed.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict):
@@ -80,7 +84,8 @@ def _check(example: Example, role: str, what: str) -> None:
     seed = example.layout_seed
     if not FIRST["train"] <= seed < FIRST["report"]:
         raise UserError(
-            f"{what} is of layout seed {seed}; examples come from train seeds alone, {FIRST['train']} to "
+            f"{what} is of layout seed {seed}; examples come from train seeds alone, "
+            f"{FIRST['train']} to "
             f"{FIRST['report'] - 1}: `harness prompt examples` draws such"
         )
     if example.graph.role != role:

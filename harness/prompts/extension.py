@@ -1,8 +1,9 @@
-"""Read a version's `answer.json`: what its answers hold beside the decision, such as a reason or some gaps.
+"""Read a version's `answer.json`: what its answers hold beside the decision,
+such as a reason or some gaps.
 
-The file has, for each role that is asked for more, JSON Schemas of further members by name. They come before
-the members that decide, and all are required. Only what constrained decoding can fill in is allowed: bounded
-texts, choices, numbers, lists and objects.
+The file has, for each role that is asked for more, JSON Schemas of further members by name. They
+come before the members that decide, and all are required. Only what constrained decoding can fill
+in is allowed: bounded texts, choices, numbers, lists and objects.
 """
 
 import json
@@ -33,7 +34,8 @@ _CHOICE = re.compile(r'[^"\\]{1,80}')
 
 
 def read(text: str, where: str) -> dict[str, str]:
-    """Return the JSON text of the members' schemas by role, as `Shape` takes it; `where` names the file.
+    """Return the JSON text of the members' schemas by role, as `Shape` takes it;
+    `where` names the file.
 
     Raises UserError if the text is no JSON, or has something that cannot be constrained.
     """
@@ -47,7 +49,9 @@ def read(text: str, where: str) -> dict[str, str]:
         checked = _members(members, f"{where}: {role}", 1)
         for name in checked:
             if name.casefold() in FIELDS:
-                raise UserError(f"{where}: {role}.{name} is a field of every answer; give another name")
+                raise UserError(
+                    f"{where}: {role}.{name} is a field of every answer; give another name"
+                )
         if (characters := longest(closed(checked))) > MOST_CHARACTERS:
             raise UserError(
                 f"{where}: {role} may take {characters} characters; give bounds that leave at most "
@@ -60,18 +64,23 @@ def read(text: str, where: str) -> dict[str, str]:
 def _members(members: object, what: str, depth: int) -> dict[str, Any]:
     if not isinstance(members, dict) or not 0 < len(members) <= MOST_MEMBERS:
         raise UserError(
-            f"{what} has no members or too many; give an object with 1 to {MOST_MEMBERS} schemas by name"
+            f"{what} has no members or too many; give an object with 1 to {MOST_MEMBERS} schemas "
+            "by name"
         )
     for name in members:
         if not _NAME.fullmatch(name):
-            raise UserError(f"{what}: {printable(name, 40)!r} is no name; give up to 40 of A-Z a-z 0-9 _")
+            raise UserError(
+                f"{what}: {printable(name, 40)!r} is no name; give up to 40 of A-Z a-z 0-9 _"
+            )
     return {name: _schema(schema, f"{what}.{name}", depth) for name, schema in members.items()}
 
 
 def _schema(schema: object, what: str, depth: int) -> dict[str, Any]:
     """Return a schema as servers and the library take it."""
     if not isinstance(schema, dict):
-        raise UserError(f'{what} is no schema; give one such as {{"type": "string", "maxLength": 120}}')
+        raise UserError(
+            f'{what} is no schema; give one such as {{"type": "string", "maxLength": 120}}'
+        )
     if depth > MOST_DEPTH:
         raise UserError(f"{what} is nested {depth} deep; give at most {MOST_DEPTH}")
     kind = schema.get("type")
@@ -81,7 +90,9 @@ def _schema(schema: object, what: str, depth: int) -> dict[str, Any]:
         if word != "type" and word not in (every if known is None else known):
             of = "a schema" if known is None else f"type {kind}"
             allowed = ", ".join(("type", *(sorted(every) if known is None else known)))
-            raise UserError(f"{what}: {of} may not have {printable(word, 40)!r}; allowed: {allowed}")
+            raise UserError(
+                f"{what}: {of} may not have {printable(word, 40)!r}; allowed: {allowed}"
+            )
     if known is None:
         raise UserError(f"{what}: type {printable(kind, 40)!r}; give one of {', '.join(KEYWORDS)}")
     if kind == "string":
@@ -102,11 +113,16 @@ def _text(schema: Mapping[str, Any], what: str) -> dict[str, Any]:
     if "enum" not in schema:
         return {"maxLength": _count(schema, "maxLength", 1, MOST_TEXT, what)}
     choices = schema["enum"]
-    good = isinstance(choices, list) and 0 < len(choices) <= MOST_CHOICES and "maxLength" not in schema
-    good = good and all(isinstance(c, str) and c.isprintable() and _CHOICE.fullmatch(c) for c in choices)
+    good = (
+        isinstance(choices, list) and 0 < len(choices) <= MOST_CHOICES and "maxLength" not in schema
+    )
+    good = good and all(
+        isinstance(c, str) and c.isprintable() and _CHOICE.fullmatch(c) for c in choices
+    )
     if not good or len(set(choices)) < len(choices):
         raise UserError(
-            f"{what}.enum: give 1 to {MOST_CHOICES} different texts of up to 80 printable characters without "
+            f"{what}.enum: give 1 to {MOST_CHOICES} different texts of up to 80 printable "
+            "characters without "
             "quotes and backslashes, and no maxLength"
         )
     return {"enum": choices}
@@ -118,12 +134,16 @@ def _bounds(schema: Mapping[str, Any], what: str) -> dict[str, Any]:
     for bound in (least, most):
         if type(bound) not in kinds or not abs(bound) <= LARGEST:
             raise UserError(
-                f"{what}: {printable(bound, 40)} is no bound; give minimum and maximum, {schema['type']}s "
+                f"{what}: {printable(bound, 40)} is no bound; give minimum and maximum, "
+                f"{schema['type']}s "
                 f"from {-LARGEST:.0f} to {LARGEST:.0f}"
             )
-    if not most - least >= LEAST_RANGE or (schema["type"] == "integer" and most - least > MOST_WHOLE):
+    if not most - least >= LEAST_RANGE or (
+        schema["type"] == "integer" and most - least > MOST_WHOLE
+    ):
         raise UserError(
-            f"{what}: from {least} to {most}; give a minimum below the maximum, of an integer by at most "
+            f"{what}: from {least} to {most}; give a minimum below the maximum, of an integer by "
+            "at most "
             f"{MOST_WHOLE}"
         )
     return {"minimum": least, "maximum": most}

@@ -1,4 +1,6 @@
-"""Find what a prompt's template writes in place of an answer's values: `max 12 words`, `low|medium|high`."""
+"""Find what a prompt's template writes in place of an answer's values:
+`max 12 words`, `low|medium|high`.
+"""
 
 import re
 
@@ -11,5 +13,7 @@ _MEMBER = re.compile(r'"[^"\n]*"\s*:\s*("[^"\n]*"(?=\s*[,}\n])|[^,{}\n]+)')
 def placeholders(template: str) -> tuple[str, ...]:
     """Return the values of the JSON that a template shows, each once, up to what Jinja fills in."""
     shown = _JINJA.sub(_FILLED, template)
-    values = [value.partition(_FILLED)[0].strip().strip('"').strip() for value in _MEMBER.findall(shown)]
+    values = [
+        value.partition(_FILLED)[0].strip().strip('"').strip() for value in _MEMBER.findall(shown)
+    ]
     return tuple(dict.fromkeys(value for value in values if value))

@@ -1,4 +1,6 @@
-"""The environment in which prompt templates are compiled: Jinja's sandbox, narrower, with shorter code."""
+"""The environment in which prompt templates are compiled:
+Jinja's sandbox, narrower, with shorter code.
+"""
 
 import re
 from typing import Any
@@ -10,25 +12,51 @@ from jinja2.runtime import Context, LoopContext
 
 from harness.core import templates
 
-WIDE = re.compile(r"\d{3}|\*")  # in a format: a width of 100 characters or more, or one given as an argument
-PADDING = frozenset({"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"})
-# What binds a name to something that a template works out, or works out more than a loop over given things.
+# in a format: a width of 100 characters or more, or one given as an argument
+WIDE = re.compile(r"\d{3}|\*")
+PADDING = frozenset(
+    {"center", "ljust", "rjust", "zfill", "expandtabs", "format", "format_map", "translate"}
+)
+# What binds a name to something that a template works out, or works out more than a loop over given
+# things.
 BINDING = (
-    nodes.Assign, nodes.AssignBlock, nodes.Call, nodes.CallBlock, nodes.Concat, nodes.FilterBlock,
-    nodes.Macro, nodes.With,
-)  # fmt: skip
+    nodes.Assign,
+    nodes.AssignBlock,
+    nodes.Call,
+    nodes.CallBlock,
+    nodes.Concat,
+    nodes.FilterBlock,
+    nodes.Macro,
+    nodes.With,
+)
 # Filters whose result is no larger than their value, whatever small constants they are given.
-SHORTENING = frozenset({
-    "abs", "capitalize", "d", "default", "first", "float", "int", "last", "length", "lower", "round", "title",
-    "trim", "truncate", "upper",
-})  # fmt: skip
+SHORTENING = frozenset(
+    {
+        "abs",
+        "capitalize",
+        "d",
+        "default",
+        "first",
+        "float",
+        "int",
+        "last",
+        "length",
+        "lower",
+        "round",
+        "title",
+        "trim",
+        "truncate",
+        "upper",
+    }
+)
 NUMBERS = frozenset({"float", "int", "length"})  # filters that return one
 OF_A_LOOP = frozenset({"first", "index", "index0", "last"})  # what a loop says of its place
 LONGEST_CHAIN = 3  # filters one after another that need not pay
 
 
 class Code(templates.Code):
-    """Jinja's compiler with shorter code for what prompts do most; every template renders the same text.
+    """Jinja's compiler with shorter code for what prompts do most;
+    every template renders the same text.
 
     `_at` is a variable of the code, which no template can name.
     """
@@ -38,12 +66,16 @@ class Code(templates.Code):
         # The first case of `Sandbox.getattr`, without the call.
         self.write(f"(_at[{node.attr!r}] if type(_at := ")
         self.visit(node.node, frame)
-        self.write(f") is dict and {node.attr!r} in _at else environment.getattr(_at, {node.attr!r}))")
+        self.write(
+            f") is dict and {node.attr!r} in _at else environment.getattr(_at, {node.attr!r}))"
+        )
 
     @optimizeconst
     def visit_Filter(self, node: nodes.Filter, frame: Frame) -> None:
         rounded = node.node
-        if not (_bare(node, "int") and isinstance(rounded, nodes.Filter) and _bare(rounded, "round")):
+        if not (
+            _bare(node, "int") and isinstance(rounded, nodes.Filter) and _bare(rounded, "round")
+        ):
             super().visit_Filter(node, frame)
             return
         assert rounded.node is not None
@@ -56,7 +88,8 @@ class Code(templates.Code):
         if frame.buffer is not None or frame.require_output_check or escapes:
             super().visit_Output(node, frame)
             return
-        # One text in place of one for each part. Python compiles a `%` of a constant as it does an f-string.
+        # One text in place of one for each part. Python compiles a `%` of a constant as it does an
+        # f-string.
         data = [part.data if isinstance(part, nodes.TemplateData) else None for part in node.nodes]
         text = "".join("%s" if part is None else part.replace("%", "%%") for part in data)
         self.writeline(f"yield {text!r} % (", node)
@@ -81,9 +114,16 @@ def _is_path(node: nodes.Node) -> bool:
 
 
 def _is_given(node: nodes.Node, chain: int = LONGEST_CHAIN) -> bool:
-    """Whether a value is about as small as those that a template is given, in one that binds no name."""
+    """Whether a value is about as small as those that a template is given,
+    in one that binds no name.
+    """
     if isinstance(node, nodes.Filter):
-        return node.node is not None and chain > 0 and _keeps_small(node) and _is_given(node.node, chain - 1)
+        return (
+            node.node is not None
+            and chain > 0
+            and _keeps_small(node)
+            and _is_given(node.node, chain - 1)
+        )
     if isinstance(node, nodes.Or | nodes.And):
         return _is_given(node.left, chain) and _is_given(node.right, chain)
     if isinstance(node, nodes.CondExpr):
@@ -97,9 +137,14 @@ def _keeps_small(node: nodes.Filter) -> bool:
         return False
     if name == "format":
         form = node.node
-        narrow = isinstance(form, nodes.Const) and isinstance(form.value, str) and not WIDE.search(form.value)
+        narrow = (
+            isinstance(form, nodes.Const)
+            and isinstance(form.value, str)
+            and not WIDE.search(form.value)
+        )
         return narrow and all(_is_path(value) for value in node.args)
-    constants = node.args[1:] if name == "truncate" else node.args  # whatever its length, it adds no more
+    # whatever its length, it adds no more
+    constants = node.args[1:] if name == "truncate" else node.args
     if not all(isinstance(value, nodes.Const) for value in constants):
         return False
     given = [value.as_const() for value in constants]
@@ -115,7 +160,9 @@ def _keeps_small(node: nodes.Filter) -> bool:
 
 
 def _bare(node: nodes.Filter, name: str) -> bool:
-    """Return whether a filter is the one of this name, without arguments, and applied to an expression."""
+    """Return whether a filter is the one of this name, without arguments,
+    and applied to an expression.
+    """
     given = node.args or node.kwargs or node.dyn_args or node.dyn_kwargs
     return node.name.removeprefix(templates.FREE) == name and not given and node.node is not None
 
@@ -135,7 +182,8 @@ class Sandbox(templates.Sandbox):
             del self.filters[name]
 
     def _put_steps_into(self, source: nodes.Template) -> None:
-        # A template that binds no name can keep nothing, so its texts are as small as what it is given.
+        # A template that binds no name can keep nothing, so its texts are as small as what it is
+        # given.
         self._binds_nothing = not any(source.find_all(BINDING)) and all(
             _is_path(loop.iter) and not loop.recursive for loop in source.find_all(nodes.For)
         )
@@ -146,7 +194,9 @@ class Sandbox(templates.Sandbox):
 
     def is_small(self, node: nodes.Node) -> bool:
         """Return whether it is known of an expression that its value costs nothing to read."""
-        number = isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
+        number = (
+            isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
+        )
         return number or super().is_small(node) or (self._binds_nothing and _is_given(node))
 
     def whole(self, value: Any) -> Any:
@@ -155,7 +205,8 @@ class Sandbox(templates.Sandbox):
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
         """Allow products, powers and remainders of numbers only, and only small powers."""
         if type(left) is float and operator in ("+", "-", "*") and type(right) in (float, int):
-            return self.binop_table[operator](left, right)  # costs nothing; the rest takes a microsecond
+            # costs nothing; the rest takes a microsecond
+            return self.binop_table[operator](left, right)
         if operator in ("*", "**", "%"):
             numbers = all(isinstance(side, int | float) for side in (left, right))
             if not numbers or (operator == "**" and not (abs(left) < 1e6 and abs(right) < 64)):
@@ -163,7 +214,9 @@ class Sandbox(templates.Sandbox):
         return super().call_binop(context, operator, left, right)
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(obj, attr, value)
+        return not (isinstance(obj, str) and attr in PADDING) and super().is_safe_attribute(
+            obj, attr, value
+        )
 
     def getattr(self, obj: Any, attribute: str) -> Any:
         # Nearly all that a template reads is plain data, which needs no check of the sandbox.

@@ -35,7 +35,8 @@ class Template:
     def render(self, variables: Mapping[str, Any], blocks: Sequence[str]) -> list[str]:
         """Render some blocks. May raise any exception, since a template is a program."""
         templates.begin()
-        context = object.__new__(Context)  # `Template.new_context` takes a quarter of a prompt's time
+        # `Template.new_context` takes a quarter of a prompt's time
+        context = object.__new__(Context)
         vars(context).update(
             vars(self._empty),
             vars={},
@@ -44,7 +45,9 @@ class Template:
         )
         texts = ["".join(self._blocks[block](context)) for block in blocks]
         if not all(map(_is_written, texts)):
-            raise ValueError("it writes half of a surrogate pair, which no file and no server can hold")
+            raise ValueError(
+                "it writes half of a surrogate pair, which no file and no server can hold"
+            )
         return texts
 
 

@@ -1,9 +1,10 @@
 """Prompt versions: templates that turn a scene graph into chat messages.
 
-A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system` and
-`user`; `question` for what ends every question unless a letter is asked for, and `repair` for a repair turn)
-and `prompt.toml`; it may have examples, `examples.json`, and further members of its answers, `answer.json`.
-Released versions are pinned by digest in `prompts/released.toml`: a changed text is a new version.
+A version is a folder `prompts/<version>/` with `ego.j2`, `helper.j2` (each with the blocks `system`
+and `user`; `question` for what ends every question unless a letter is asked for, and `repair` for a
+repair turn) and `prompt.toml`; it may have examples, `examples.json`, and further members of its
+answers, `answer.json`. Released versions are pinned by digest in `prompts/released.toml`: a changed
+text is a new version.
 """
 
 import math
@@ -41,7 +42,8 @@ FILES = ("ego.j2", "helper.j2", "prompt.toml")
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
-OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})  # shipped versions that only describe crossings
+# shipped versions that only describe crossings
+OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,8 @@ class Prompt:
     description: str  # one line for people
     # what a helper is asked for: `distribution`, or `recommendation` with a confidence
     helper_answer: Literal["distribution", "recommendation"]
-    # most objects that are listed, one fewer if there are messages; those in conflict come first, then the
-    # nearest
+    # most objects that are listed, one fewer if there are messages; those in conflict come first,
+    # then the nearest
     max_objects: Count
     token_budget: tuple[Count, Count]  # least and most tokens a rendered prompt may have
     max_answer_tokens: Mapping[str, Count]  # most tokens an answer may have, by role
@@ -68,14 +70,18 @@ class Prompt:
     ego_answer: Literal["distribution", "maneuver"] = "distribution"
     # most conflicts in the variable `conflicts`, the soonest first; None for all
     max_conflicts: Count | None = None
-    examples: Examples | None = None  # earlier turns of the chat, from one scenario; None without any
-    # sets of examples that may be chosen, by their numbers from 1; the first is shown. Empty for all of them
+    # earlier turns of the chat, from one scenario; None without any
+    examples: Examples | None = None
+    # sets of examples that may be chosen, by their numbers from 1; the first is shown. Empty for
+    # all of them
     example_sets: tuple[tuple[Count, ...], ...] = ()
     # further members of a role's answer, as `Shape` takes them; roles without any are not there
     extension: Mapping[str, str] = field(default_factory=dict)
-    # whether the ego's template can show a message that holds words alone, a `sender` and `evidence`
+    # whether the ego's template can show a message that holds words alone, a `sender` and
+    # `evidence`
     shows_words: bool = False
-    # whether the ego's template can show an agent's plan: `sender`, `number`, `intent`, `reaches_s`, `lost_s`
+    # whether the ego's template can show an agent's plan: `sender`, `number`, `intent`,
+    # `reaches_s`, `lost_s`
     shows_plans: bool = False
     # picture before the user's text: what the viewer's `camera` sees; None if there is none
     image: Literal["camera"] | None = None
@@ -89,7 +95,9 @@ class Prompt:
         if self.max_answer_tokens.keys() != set(ROLES):
             raise ValueError("max_answer_tokens wants exactly ego and helper")
         if self.image and self.examples:
-            raise ValueError("image and examples.json exclude each other: an example shows no picture")
+            raise ValueError(
+                "image and examples.json exclude each other: an example shows no picture"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields only, for pickling: compiled templates cannot go to another process."""
@@ -112,7 +120,9 @@ class Prompt:
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
-        """Roles whose template has a block `repair`: an unreadable answer is asked for once more."""
+        """Roles whose template has a block `repair`:
+        an unreadable answer is asked for once more.
+        """
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def form(self, role: str) -> str:
@@ -129,11 +139,15 @@ class Prompt:
         return {role: placeholders(resolved(text)) for role, text in texts.items()}
 
     def most_answer_tokens(self, role: str) -> int:
-        """Return the most tokens of an answer: `max_answer_tokens`, and one a character of what is added."""
+        """Return the most tokens of an answer:
+        `max_answer_tokens`, and one a character of what is added.
+        """
         further = self.shape(role, ()).further
         return self.max_answer_tokens[role] + (longest(closed(further)) if further else 0)
 
-    def repair(self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]) -> str:
+    def repair(
+        self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]
+    ) -> str:
         """Render the message to a viewer whose answer could not be read, for the reason `error`."""
         variables = {"error": error, "actions": actions, "words": words}
         [text] = self._rendered(
@@ -151,12 +165,13 @@ class Prompt:
     ) -> tuple[dict[str, str], ...]:
         """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
 
-        The graph's `role` chooses the template. Examples follow the system message as earlier turns. A
-        message with the key `image` has a picture before its text. `messages` are those of helpers to the
-        ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and `confidence`, or with
-        `sender` and `evidence` alone if the version `shows_words`, or of agents, if it `shows_plans`: those
-        of `fusion.messages_of`. `words` are texts by which the scenario describes itself. A `letter` is asked
-        for in place of the block `question` (`readout.asked`).
+        The graph's `role` chooses the template. Examples follow the system message as earlier
+        turns. A message with the key `image` has a picture before its text. `messages` are those of
+        helpers to the ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and
+        `confidence`, or with `sender` and `evidence` alone if the version `shows_words`, or of
+        agents, if it `shows_plans`: those of `fusion.messages_of`. `words` are texts by which the
+        scenario describes itself. A `letter` is asked for in place of the block `question`
+        (`readout.asked`).
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)
@@ -175,7 +190,10 @@ class Prompt:
                 {"role": part, "content": text}
                 for example in self.examples.of(role)
                 for part, text in (
-                    ("user", *self._render_graph(example.graph, actions, (), words, letter, "user")),
+                    (
+                        "user",
+                        *self._render_graph(example.graph, actions, (), words, letter, "user"),
+                    ),
                     ("assistant", example.answer),
                 )
             )
@@ -186,10 +204,17 @@ class Prompt:
         return {}
 
     def _render_graph(
-        self, graph: "SceneGraph", actions: tuple[str, ...], messages: Sequence[Mapping[str, Any]],
-        words: Mapping[str, str], letter: bool, *blocks: str,
-    ) -> list[str]:  # fmt: skip
-        """Render some blocks of a template for a scene graph, the last of which ends with the question."""
+        self,
+        graph: "SceneGraph",
+        actions: tuple[str, ...],
+        messages: Sequence[Mapping[str, Any]],
+        words: Mapping[str, str],
+        letter: bool,
+        *blocks: str,
+    ) -> list[str]:
+        """Render some blocks of a template for a scene graph,
+        the last of which ends with the question.
+        """
         template, plain = self._templates[graph.role], graph.plain()
         objects = [plain["nodes"][n] for n in listed(graph, self.max_objects - bool(messages))]
         variables = {
@@ -205,7 +230,8 @@ class Prompt:
                 plain["conflicts"][n] for n in soonest(graph.conflicts)[: self.max_conflicts]
             ]
         needs = (
-            "it needs the blocks system and user, and may use graph, actions, objects, more, conflicts, "
+            "it needs the blocks system and user, and may use graph, actions, objects, more, "
+            "conflicts, "
             "messages, words"
         )
         if letter or "question" not in template.blocks:
@@ -231,16 +257,21 @@ class Prompt:
 
 
 def listed(graph: "SceneGraph", most: int) -> list[int]:
-    """Return the indices of the nodes that a prompt lists: those in conflict first, then the nearest."""
+    """Return the indices of the nodes that a prompt lists:
+    those in conflict first, then the nearest.
+    """
     meets = {conflict.vehicle for conflict in graph.conflicts}
     order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
     return sorted(range(len(order)), key=order.__getitem__)[:most]
 
 
 def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
-    """Return the indices of conflicts, the soonest first; those that the ego never reaches are last."""
+    """Return the indices of conflicts, the soonest first;
+    those that the ego never reaches are last.
+    """
     order = [
-        (math.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m) for c in conflicts
+        (math.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m)
+        for c in conflicts
     ]
     return sorted(range(len(order)), key=order.__getitem__)
 
@@ -255,11 +286,19 @@ def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
     """Return why a version may not be used in a scenario; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
-    if prompt.examples and not prompt.examples.everywhere and prompt.examples.scenario != scenario.name:
-        return f"has examples of {printable(prompt.examples.scenario)}, which {scenario.name} is not"
+    if (
+        prompt.examples
+        and not prompt.examples.everywhere
+        and prompt.examples.scenario != scenario.name
+    ):
+        return (
+            f"has examples of {printable(prompt.examples.scenario)}, which {scenario.name} is not"
+        )
     for role, actions in ((role, scenario.actions) for role in ROLES):
         named = {action.casefold() for action in actions}
-        if taken := [name for name in prompt.shape(role, actions).further if name.casefold() in named]:
+        if taken := [
+            name for name in prompt.shape(role, actions).further if name.casefold() in named
+        ]:
             return f"has {taken[0]} in answer.json, which is an action of {scenario.name}"
     return None
 
@@ -267,40 +306,61 @@ def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
 def load(version: str, where: Path | None = None) -> Prompt:
     """Load a version by name, from a folder if one is given.
 
-    Raises UserError if there is no such version, its files are wrong, or it was released and has changed.
+    Raises UserError if there is no such version, its files are wrong,
+    or it was released and has changed.
     """
     if version not in names(where):
         raise unknown("prompt", version, names(where))
     if not version.isprintable():  # it is in many a line
-        raise UserError(f"prompt {printable(version)} has a name of more than plain signs; rename its folder")
+        raise UserError(
+            f"prompt {printable(version)} has a name of more than plain signs; rename its folder"
+        )
     base = _base(version, where)
     optional = [name for name in (EXAMPLES, ANSWER) if os.path.lexists(base / version / name)]
     texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
     released = _released(base)
     if version in released and released[version] != digest(texts):
         raise UserError(
-            f"prompt {version} was released and its text has changed; restore it, or copy it to a new "
+            f"prompt {version} was released and its text has changed; restore it, or copy it to a "
+            "new "
             f"version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     return made(version, texts, version in released)
 
 
 def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prompt:
-    """Make a version of the texts of its files, in the order of `FILES`. Raises UserError if one is wrong."""
+    """Make a version of the texts of its files, in the order of `FILES`.
+    Raises UserError if one is wrong.
+    """
     what, sha256 = f"prompt {version} prompt.toml", digest(texts)
     table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **loads(texts["prompt.toml"], what)}
-    examples = read_examples(texts[EXAMPLES], f"prompt {version} {EXAMPLES}") if EXAMPLES in texts else None
-    extension = read_extension(texts[ANSWER], f"prompt {version} {ANSWER}") if ANSWER in texts else None
+    examples = (
+        read_examples(texts[EXAMPLES], f"prompt {version} {EXAMPLES}")
+        if EXAMPLES in texts
+        else None
+    )
+    extension = (
+        read_extension(texts[ANSWER], f"prompt {version} {ANSWER}") if ANSWER in texts else None
+    )
     prompt = convert(
-        table, Prompt, what, version=version, sha256=sha256, released=released,
-        texts={role: texts[f"{role}.j2"] for role in ROLES}, examples=examples,
-        extension=extension or {}, files=texts,
-    )  # fmt: skip
+        table,
+        Prompt,
+        what,
+        version=version,
+        sha256=sha256,
+        released=released,
+        texts={role: texts[f"{role}.j2"] for role in ROLES},
+        examples=examples,
+        extension=extension or {},
+        files=texts,
+    )
     if not prompt.example_sets:
         return prompt
     n = min(len(examples.of(role)) for role in ROLES) if examples else 0
     if wrong := [number for some in prompt.example_sets for number in some if not 0 < number <= n]:
-        raise UserError(f"{what}: example_sets has {wrong[0]}, and examples.json has {n} a role; fix one")
+        raise UserError(
+            f"{what}: example_sets has {wrong[0]}, and examples.json has {n} a role; fix one"
+        )
     return replace(prompt, examples=examples and examples.only(prompt.example_sets[0]))
 
 
@@ -319,9 +379,11 @@ def lock(version: str, where: Path | None = None) -> str:
     base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
     head = (
-        "# Digests of released prompt versions (`harness prompt release`). A changed text is a new version.\n"
+        "# Digests of released prompt versions (`harness prompt release`). A changed text is a new "
+        "version.\n"
     )
-    lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]  # quoted: v1.1 is one key
+    # quoted: v1.1 is one key
+    lines = [f'{canonical_json(v)} = "{d}"\n' for v, d in sorted(pins.items())]
     write_whole(base / "released.toml", head + "".join(lines))
     return prompt.sha256
 
@@ -332,7 +394,9 @@ def _base(version: str, where: Path | None) -> Path:
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Return the digest of a version's files, which are in the order of `FILES`, with the others last."""
+    """Return the digest of a version's files, which are in the order of `FILES`,
+    with the others last.
+    """
     return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 
 
@@ -341,7 +405,9 @@ def _text(file: Path) -> str:
         return text_of(file)
     except (OSError, UnicodeDecodeError) as error:
         reason = printable(getattr(error, "strerror", None) or error)
-        raise UserError(f"prompt file {printable(file)} cannot be read: {reason}; replace the file") from None
+        raise UserError(
+            f"prompt file {printable(file)} cannot be read: {reason}; replace the file"
+        ) from None
 
 
 def _released(base: Path) -> dict[str, str]:

@@ -1,7 +1,8 @@
-"""CSMA/CA of broadcasts with one contention window: free time, access delay, and collisions in one slot.
+"""CSMA/CA of broadcasts with one contention window:
+free time, access delay, and collisions in one slot.
 
-All vehicles that share a medium hear each other here; packets have equal length and arrive at random.
-`tests/test_its_g5.py` simulates the slots to check each function.
+All vehicles that share a medium hear each other here; packets have equal length and arrive at
+random. `tests/test_its_g5.py` simulates the slots to check each function.
 """
 
 import math
@@ -34,8 +35,9 @@ def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
 def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
     """Return the mean seconds from the wish to send until the medium is taken.
 
-    A packet on air ends first; then the medium must be idle for an AIFS, and for each slot of the back-off. A
-    packet in between costs its airtime and another AIFS. Packets begin at random in idle time.
+    A packet on air ends first; then the medium must be idle for an AIFS, and for each slot of the
+    back-off. A packet in between costs its airtime and another AIFS. Packets begin at random in
+    idle time.
     """
     per_s = float(begin_per_s(busy, packet_s))
     aifs_idle_s = _idle_s(aifs_s, per_s, packet_s)
@@ -44,15 +46,19 @@ def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> f
 
 
 def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
-    """Return the mean time until the medium has been idle without a break; interruptions cost `cost_s`."""
+    """Return the mean time until the medium has been idle without a break;
+    interruptions cost `cost_s`.
+    """
     return needed_s if per_s == 0 else math.expm1(per_s * needed_s) * (1 / per_s + cost_s)
 
 
 @lru_cache(maxsize=64)
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
-    """Return the distribution of the access delay, whose mean is `mean_access_s`, by its generating function.
+    """Return the distribution of the access delay, whose mean is `mean_access_s`,
+    by its generating function.
 
-    These are probabilities and seconds: with each probability the delay is no longer than the seconds.
+    These are probabilities and seconds:
+    with each probability the delay is no longer than the seconds.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time
@@ -74,14 +80,16 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
 
 
 @lru_cache(maxsize=64)
-def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: int) -> tuple[float, float]:
+def same_slot(
+    per_slot: float, packet_slots: float, aifs_slots: float, window: int
+) -> tuple[float, float]:
     """Return the share of packets that begin with another, if all can hear all, and the busy ratio.
 
-    Vehicles that want to send while the medium is busy end their back-off soon after it, so packets collide
-    more often than if they began at random. The model follows the mean number of vehicles with each back-off
-    count, slot by slot from one busy period to the next. Numbers are assumed to be Poisson; the vehicles that
-    a busy period leaves waiting are a fixed point. `per_slot` counts the packets of all vehicles that arrive
-    in a slot; back-off is uniform from 0 to `window` slots.
+    Vehicles that want to send while the medium is busy end their back-off soon after it, so packets
+    collide more often than if they began at random. The model follows the mean number of vehicles
+    with each back-off count, slot by slot from one busy period to the next. Numbers are assumed to
+    be Poisson; the vehicles that a busy period leaves waiting are a fixed point. `per_slot` counts
+    the packets of all vehicles that arrive in a slot; back-off is uniform from 0 to `window` slots.
     """
     counts = window + 1
     slot, count = np.arange(counts + 1)[:, None], np.arange(counts)
@@ -103,10 +111,11 @@ def same_slot(per_slot: float, packet_slots: float, aifs_slots: float, window: i
 
 
 def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
-    """Return how many times as often packets begin in one slot as if they began at random in free time.
+    """Return how many times as often packets begin in one slot as if they began at random in free
+    time.
 
-    It is that of vehicles which all hear each other and together cause this busy ratio; above `SATURATED` it
-    is constant.
+    It is that of vehicles which all hear each other and together cause this busy ratio;
+    above `SATURATED` it is constant.
     """
     packet_slots = packet_s / SLOT_S
     per_slot = min(busy, SATURATED) / packet_slots

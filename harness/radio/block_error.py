@@ -1,10 +1,12 @@
-"""Block error rates over the signal-to-interference-and-noise ratio (SINR), by modulation and coding.
+"""Block error rates over the signal-to-interference-and-noise ratio (SINR),
+by modulation and coding.
 
-Every curve already includes fast fading, so a model adds none. `block_error_points.csv` has points read off
-3GPP R1-160284 (190 bytes, 280 km/h, vehicles on a highway), and those of Goubet et al. (IEEE TVT 64(9), 2015,
-figure 14, L = 1) as Sepulcre et al. use them, over the energy of a bit (`its_g5`). `block_error_fits.csv` has
-logistic curves that were fitted to the tables of packet error that come with WiLabV2Xsim (root mean square
-error 0.012 at most); a name says technology, modulation and coding, size and surroundings.
+Every curve already includes fast fading, so a model adds none. `block_error_points.csv` has points
+read off 3GPP R1-160284 (190 bytes, 280 km/h, vehicles on a highway), and those of Goubet et al.
+(IEEE TVT 64(9), 2015, figure 14, L = 1) as Sepulcre et al. use them, over the energy of a bit
+(`its_g5`). `block_error_fits.csv` has logistic curves that were fitted to the tables of packet
+error that come with WiLabV2Xsim (root mean square error 0.012 at most); a name says technology,
+modulation and coding, size and surroundings.
 """
 
 import csv
@@ -25,7 +27,8 @@ BlockError = Callable[[Floats], Floats]
 
 @cache
 def block_error(curve: str) -> BlockError:
-    """Return a curve by name; points are interpolated linearly, and the end values hold beyond them.
+    """Return a curve by name; points are interpolated linearly,
+    and the end values hold beyond them.
 
     Raises UserError for an unknown name.
     """
@@ -45,8 +48,8 @@ def block_error(curve: str) -> BlockError:
 def threshold(bits_per_s_per_hz: float, efficiency: float) -> BlockError:
     """Return a step curve: blocks are lost below the SINR 2^(spectral efficiency / efficiency) - 1.
 
-    It is for codings without a curve (Wu et al., arXiv 2203.17114). `efficiency` is the share of Shannon's
-    bound that an implementation reaches: 0.37 for LTE and 802.11p, 0.4 for NR.
+    It is for codings without a curve (Wu et al., arXiv 2203.17114). `efficiency` is the share of
+    Shannon's bound that an implementation reaches: 0.37 for LTE and 802.11p, 0.4 for NR.
     """
     least_db = 10 * np.log10(2 ** (bits_per_s_per_hz / efficiency) - 1)
     return lambda sinr_db: np.where(sinr_db < least_db, 1.0, 0.0)

@@ -1,7 +1,8 @@
 """The interface of a V2V channel: which replies arrive, and when.
 
-A consultation is a round trip: the request and the reply must both be received. A new model is a file beside
-this one, with a frozen dataclass that has `request` and `deliver`; profiles are read by `profiles.py`.
+A consultation is a round trip: the request and the reply must both be received. A new model is a
+file beside this one, with a frozen dataclass that has `request` and `deliver`; profiles are read by
+`profiles.py`.
 """
 
 from collections.abc import Mapping
@@ -32,10 +33,11 @@ class Site:
     """The true positions of the ego and its helpers, and what stands between them."""
 
     xy_m: Floats  # positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper
-    sight: Ints  # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
+    # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
+    sight: Ints
     blocker_m: Floats  # height of the tallest vehicle between them, `(..., H)`; 0 without one
-    # distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN if the
-    # streets do not cross
+    # distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN if
+    # the streets do not cross
     corner_m: Floats
     # height of the antenna at the first position; None if it is as high as all others
     first_m: float | None = None
@@ -49,17 +51,28 @@ class Site:
 
     @property
     def between(self) -> tuple[Ints, Floats, Floats, float | None]:
-        """The inputs of `Propagation` besides distances: sight, blocker, corner, first antenna's height."""
+        """The inputs of `Propagation` besides distances:
+        sight, blocker, corner, first antenna's height.
+        """
         return self.sight, self.blocker_m, self.corner_m, self.first_m
 
     def take(self, at: Any) -> "Site":
         """Select sites by places of the leading dimension."""
         units = {unit: its.take(at) for unit, its in self.units.items()}
-        return Site(self.xy_m[at], self.sight[at], self.blocker_m[at], self.corner_m[at], self.first_m, units)
+        return Site(
+            self.xy_m[at],
+            self.sight[at],
+            self.blocker_m[at],
+            self.corner_m[at],
+            self.first_m,
+            units,
+        )
 
     def select(self, links: slice) -> "Site":
         """Select some of the links, `(..., h)`."""
-        xy_m = np.concatenate([self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2)
+        xy_m = np.concatenate(
+            [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
+        )
         sight, blocker_m = self.sight[..., links], self.blocker_m[..., links]
         return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
@@ -80,8 +93,8 @@ class Site:
 class Draws:
     """The channel's draws in [0, 1), which are the same for every operating point."""
 
-    # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an episode
-    # under block fading
+    # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
+    # episode under block fading
     link: Floats
     jitter: Floats  # draw of each reply's delay, `(..., H)`
     # the keys of further draws, which only physical radios make; None if there are none
@@ -94,7 +107,9 @@ class Draws:
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
-        """Select the draws of helpers by their places, `(n, H')`; a repeated helper has the same link."""
+        """Select the draws of helpers by their places, `(n, H')`;
+        a repeated helper has the same link.
+        """
         link = np.take_along_axis(self.link, places[..., None], axis=-2)
         return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
 
@@ -109,7 +124,9 @@ class Draws:
         return self._uniforms[..., 0]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
-        """Return the shadowing of each helper's link, `(..., H)`, standard normal: `fading.Trips.shadow`."""
+        """Return the shadowing of each helper's link, `(..., H)`,
+        standard normal: `fading.Trips.shadow`.
+        """
         return self._trips.shadow(xy_m, decorrelation_m)
 
     def of(self, links: str) -> "Draws":
@@ -118,12 +135,16 @@ class Draws:
 
     @cached_property
     def first_packets(self) -> Floats:
-        """Draws of one wait and two packets for a link that exists even without helpers, `(..., 3)`."""
+        """Draws of one wait and two packets for a link that exists even without helpers,
+        `(..., 3)`.
+        """
         return self._trips.uniforms(1)
 
     @cached_property
     def latency(self) -> Floats:
-        """Draws of how long each helper's request and reply take, `(..., H, 2)`, new at every step."""
+        """Draws of how long each helper's request and reply take, `(..., H, 2)`,
+        new at every step.
+        """
         return self.of(f"{self._trips.links}.latency").packet
 
     @cached_property
@@ -160,8 +181,10 @@ NO_SITE = (
 class Links:
     """The inputs of a channel about the links between the ego and its helpers."""
 
-    asked: Bools  # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
-    # seconds from the start of the request until the helper has heard it and has its own answer, `(..., H)`
+    # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
+    asked: Bools
+    # seconds from the start of the request until the helper has heard it and has its own answer,
+    # `(..., H)`
     ready_s: Floats
     range_m: Floats  # ego-helper distance, `(..., H)`, as the ego knows it, with the beacon's error
     payload_bits: Floats  # size of the reply, `(..., H)`
@@ -181,9 +204,15 @@ class Links:
     def take(self, at: Any) -> "Links":
         """Select links by places of the leading dimension."""
         return Links(
-            self.asked[at], self.ready_s[at], self.range_m[at], self.payload_bits[at], self.in_radius[at],
-            self.rounds[at], self.request_bits, self.site and self.site.take(at),
-        )  # fmt: skip
+            self.asked[at],
+            self.ready_s[at],
+            self.range_m[at],
+            self.payload_bits[at],
+            self.in_radius[at],
+            self.rounds[at],
+            self.request_bits,
+            self.site and self.site.take(at),
+        )
 
 
 # The place of a message's draw among those of its link: a request or another broadcast, or a reply.
@@ -195,8 +224,8 @@ REPLY: Way = 1
 class Broadcast(NamedTuple):
     """The times of a request's broadcast."""
 
-    # seconds from the decision to ask until the helpers have the request, `(...)` or one number; NaN if it
-    # depends on the link (`ByLink`)
+    # seconds from the decision to ask until the helpers have the request, `(...)` or one number;
+    # NaN if it depends on the link (`ByLink`)
     heard_s: Floats | float
     airtime_s: Floats | float  # seconds that it occupies the medium, `(...)` or one number
 
@@ -204,26 +233,31 @@ class Broadcast(NamedTuple):
 class Delivery(NamedTuple):
     """What becomes of the replies on a channel."""
 
-    up: Bools  # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
-    # seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that were not
-    # asked. A lost reply keeps its slot
+    # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
+    up: Bools
+    # seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that were
+    # not asked. A lost reply keeps its slot
     delay_s: Floats
-    # probability that one transmission, a request or a reply, is lost, `(..., H)`; `(..., 1)` if all links
-    # have the same
+    # probability that one transmission, a request or a reply, is lost, `(..., H)`; `(..., 1)` if
+    # all links have the same
     loss: Floats
-    # seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not asked, NaN if
-    # the model does not know it
+    # seconds that the reply occupies the medium, `(..., H)`; anything for helpers that were not
+    # asked, NaN if the model does not know it
     airtime_s: Floats
 
 
 @runtime_checkable
 class Channel(Protocol):
-    """A channel model: a frozen dataclass. Overrides of an operating point replace fields by name."""
+    """A channel model: a frozen dataclass.
+    Overrides of an operating point replace fields by name.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when helpers have a request or other broadcast of so many bits, `(...)` or one number."""
+        """Return when helpers have a request or other broadcast of so many bits,
+        `(...)` or one number.
+        """
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return what happens to the request and the reply of each link."""
@@ -233,7 +267,8 @@ class Channel(Protocol):
 class Physical(Channel, Protocol):
     """A channel whose losses follow from the vehicles' positions and what stands between them.
 
-    Only such a channel reads `Links.site` and the draws of trips. It does not read `Links.in_radius`.
+    Only such a channel reads `Links.site` and the draws of trips.
+    It does not read `Links.in_radius`.
     """
 
     @property
@@ -241,16 +276,22 @@ class Physical(Channel, Protocol):
         """Decorrelation distance of shadowing (`fading.Trips.shadow`); inf without shadowing."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of packets of the background's size that are received at distances `(n,)`.
+        """Return the share of packets of the background's size that are received at distances
+        `(n,)`.
 
-        It is averaged over shadowing, and without `sight` also over obstacles as in the model's source.
+        It is averaged over shadowing, and without `sight` also over obstacles as in the model's
+        source.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost, `(..., H)`, given each link's shadowing."""
+        """Return the probability that a message is lost, `(..., H)`,
+        given each link's shadowing.
+        """
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio under the background load; NaN if the model does not have it."""
+        """Return the channel busy ratio under the background load;
+        NaN if the model does not have it.
+        """
 
 
 @runtime_checkable
@@ -265,12 +306,14 @@ class ByLink(Physical, Protocol):
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
-    """Return when each slot `(..., H)` on a serial medium ends: first come, first served, nearest first."""
+    """Return when each slot `(..., H)` on a serial medium ends:
+    first come, first served, nearest first.
+    """
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)
     busy_s = np.cumsum(served_slot_s, axis=-1)
-    # A slot starts when the one before it ends or its helper is ready, whichever is later: the end of
-    # slot k is the largest, over j <= k, of ready_j plus the slots j..k.
+    # A slot starts when the one before it ends or its helper is ready, whichever is later: the end
+    # of slot k is the largest, over j <= k, of ready_j plus the slots j..k.
     waits_s = np.take_along_axis(ready_s, order, axis=-1) - (busy_s - served_slot_s)
     end_s = np.empty_like(busy_s)
     np.put_along_axis(end_s, order, busy_s + np.maximum.accumulate(waits_s, axis=-1), axis=-1)

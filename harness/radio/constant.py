@@ -1,7 +1,8 @@
-"""A channel with one latency and one loss for all links: the paper's declared assumptions, no link budget.
+"""A channel with one latency and one loss for all links:
+the paper's declared assumptions, no link budget.
 
-Nothing here was measured on a radio. If the draws of a link are the same at every step of an episode, fading
-is block fading: a blocked link stays blocked.
+Nothing here was measured on a radio. If the draws of a link are the same at every step of an
+episode, fading is block fading: a blocked link stays blocked.
 """
 
 from dataclasses import dataclass
@@ -19,28 +20,34 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 class Radio:
     """A channel with a nominal latency and one loss for all links."""
 
-    latency_s: Seconds  # nominal seconds of one exchange, the request included, without serialisation
-    # probability that one transmission is lost. If helpers open rounds of their own, it is the loss with that
-    # many active vehicles, if that is larger
+    # nominal seconds of one exchange, the request included, without serialisation
+    latency_s: Seconds
+    # probability that one transmission is lost. If helpers open rounds of their own, it is the loss
+    # with that many active vehicles, if that is larger
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
     # bits per second while a message is on air
     bandwidth_bps: Annotated[float, Meta(ge=1, le=1e15, description="bits per second, 1 or more")]
     # `serial`: replies share one medium and are served one after another, so the k-th pays k slots;
     # `parallel`: all replies are on air at once
     access: Literal["serial", "parallel"]
-    jitter_s: Seconds = 0.0  # largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s)
+    # largest extra delay of a reply's hop; the delay is uniform in [0, jitter_s)
+    jitter_s: Seconds = 0.0
     # whether the loss follows from the vehicles in the radius, the ego included, asked or not
     density_coupled: bool = False
-    # whether replies also travel over a roadside edge node, in a second hop as long as the first, with its
-    # jitter. The two paths are declared independent. Requests are direct
+    # whether replies also travel over a roadside edge node, in a second hop as long as the first,
+    # with its jitter. The two paths are declared independent. Requests are direct
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """A request takes its serialisation only; the rest of its time is in the nominal latency."""
+        """A request takes its serialisation only;
+        the rest of its time is in the nominal latency.
+        """
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """A serial medium serves the first helper that is ready, so a slow helper delays no other."""
+        """A serial medium serves the first helper that is ready,
+        so a slow helper delays no other.
+        """
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + count_of(active)[..., None])
         loss = loss if self.density_coupled else np.maximum(self.loss, loss)
@@ -55,18 +62,20 @@ class Radio:
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
-    """Return the loss of one transmission if `n_active` vehicles `(...)`, with the ego, share the channel.
+    """Return the loss of one transmission if `n_active` vehicles `(...)`, with the ego,
+    share the channel.
 
-    It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles), clipped
-    to [0, 1]; a single vehicle loses nothing.
+    It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active
+    vehicles), clipped to [0, 1]; a single vehicle loses nothing.
     """
     return np.where(n_active > 1, np.clip(0.006 + 0.03 * (n_active - 2), 0.0, 1.0), 0.0)
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return which helpers' request and reply are both received, `(..., H)`; the probability is (1 - loss)^2.
+    """Return which helpers' request and reply are both received, `(..., H)`;
+    the probability is (1 - loss)^2.
 
-    `uniforms` are the request's and the reply's draws, `(..., H, 2)`. At a roadside edge a reply has a second
-    path, so that it is lost with probability loss^2.
+    `uniforms` are the request's and the reply's draws, `(..., H, 2)`. At a roadside edge a reply
+    has a second path, so that it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

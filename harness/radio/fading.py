@@ -1,10 +1,11 @@
-"""Random draws of physical radios for shadowing and packets, keyed by the channel's seed and the layout.
+"""Random draws of physical radios for shadowing and packets,
+keyed by the channel's seed and the layout.
 
-A world may be walked in any order and from any point, so a draw must not depend on the one before it.
-Shadowing is therefore a field over the positions of both ends, and not a chain along the trip: a sum of waves
-whose directions and lengths are drawn once for a link. With wave vectors of a multivariate Cauchy
-distribution its correlation is exp(-moved / decorrelation), that of the usual chain S' = exp(-moved/D) S +
-noise, and it is nearly normal (kurtosis 3 - 1.5 / WAVES).
+A world may be walked in any order and from any point, so a draw must not depend on the one before
+it. Shadowing is therefore a field over the positions of both ends, and not a chain along the trip:
+a sum of waves whose directions and lengths are drawn once for a link. With wave vectors of a
+multivariate Cauchy distribution its correlation is exp(-moved / decorrelation), that of the usual
+chain S' = exp(-moved/D) S + noise, and it is nearly normal (kurtosis 3 - 1.5 / WAVES).
 """
 
 import math
@@ -35,15 +36,17 @@ class Trips:
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:
-        """Return the draws of each decision's packets, `(..., 1 + 2H)`: one for the wait, then H pairs."""
+        """Return the draws of each decision's packets, `(..., 1 + 2H)`:
+        one for the wait, then H pairs.
+        """
         pairs_draws, place = self._once_a_pair(_packets, self.steps, helpers)
         return pairs_draws[place, self.step]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of the link to each helper, `(..., H)`, standard normal.
 
-        Positions are those of the ego and its helpers, `(..., 1+H, 2)`. The correlation is 1/e when both ends
-        have moved `decorrelation_m` (root of the sum of squares).
+        Positions are those of the ego and its helpers, `(..., 1+H, 2)`. The correlation is 1/e when
+        both ends have moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
         waves, place = self._once_a_pair(_waves, helpers)
@@ -57,21 +60,31 @@ class Trips:
             block = slice(start, start + BLOCK)
             drawn = waves[place[block]]
             turns = drawn[..., 0] + np.matmul(drawn[..., 1:], ends[block])[..., 0]
-            # The fraction of a turn is exact enough in single precision, whose cosine is much faster.
+            # The fraction of a turn is exact enough in single precision, whose cosine is much
+            # faster.
             angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
             total[block] = np.cos(angle).sum(axis=-1)
         return total.reshape(*xy_m.shape[:-2], helpers) * math.sqrt(2 / WAVES)
 
     def _once_a_pair(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
-        """Return the draws for each seed and layout, (P, ...), and each decision's index in them, `(...)`."""
+        """Return the draws for each seed and layout, (P, ...),
+        and each decision's index in them, `(...)`.
+        """
         seeds, seed = np.unique(self.seed, return_inverse=True)
         layouts, layout = np.unique(self.layout_seed, return_inverse=True)
         pairs, place = np.unique(seed * len(layouts) + layout, return_inverse=True)
-        keys = zip(seeds[pairs // len(layouts)].tolist(), layouts[pairs % len(layouts)].tolist(), strict=True)
-        return np.array([drawn(self.links, *pair, *args) for pair in keys]), place.reshape(self.seed.shape)
+        keys = zip(
+            seeds[pairs // len(layouts)].tolist(),
+            layouts[pairs % len(layouts)].tolist(),
+            strict=True,
+        )
+        return np.array([drawn(self.links, *pair, *args) for pair in keys]), place.reshape(
+            self.seed.shape
+        )
 
 
-# Helpers' draws follow each other, so that a batch with more helpers changes no other helper's draws.
+# Helpers' draws follow each other, so that a batch with more helpers changes no other helper's
+# draws.
 @lru_cache(maxsize=1 << 14)
 def _packets(links: str, seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
     return noise.uniforms((1 + 2 * helpers, steps), f"packets{links}", seed, layout_seed).T
@@ -79,7 +92,11 @@ def _packets(links: str, seed: int, layout_seed: int, steps: int, helpers: int) 
 
 @lru_cache(maxsize=1 << 14)
 def _waves(links: str, seed: int, layout_seed: int, helpers: int) -> Floats:
-    """Draw phases and 4-dimensional wave vectors, in turns per decorrelation distance, (H, WAVES, 5)."""
-    drawn = noise.generator(f"shadowing{links}", seed, layout_seed).standard_normal((helpers, WAVES, 7))
+    """Draw phases and 4-dimensional wave vectors, in turns per decorrelation distance,
+    (H, WAVES, 5).
+    """
+    drawn = noise.generator(f"shadowing{links}", seed, layout_seed).standard_normal(
+        (helpers, WAVES, 7)
+    )
     phase = np.arctan2(drawn[..., :1], drawn[..., 1:2])
     return np.concatenate([phase, drawn[..., 2:6] / np.abs(drawn[..., 6:])], axis=-1) / (2 * np.pi)

@@ -1,25 +1,29 @@
-"""802.11p (ITS-G5, DSRC): broadcast under CSMA/CA in 10 MHz, with the beacons of background traffic.
+"""802.11p (ITS-G5, DSRC): broadcast under CSMA/CA in 10 MHz,
+with the beacons of background traffic.
 
-Sepulcre, Gonzalez-Martín, Gozalvez, Molina-Masegosa, Coll-Perales, "Analytical Models of the Performance of
-IEEE 802.11p Vehicle to Vehicle Communications", IEEE TVT 71(1), 2022 (arXiv 2104.07923): numbers in brackets
-are its equations, and the defaults its own. A packet is lost below the sensing threshold (12), to a receiver
-that is locked to another one's packet (14), to noise (24) or to a collision (26): with a hidden node, or with
-one that hears the sender and ends its back-off in the same slot. This model differs from the source:
+Sepulcre, Gonzalez-Martín, Gozalvez, Molina-Masegosa, Coll-Perales, "Analytical Models of the
+Performance of IEEE 802.11p Vehicle to Vehicle Communications", IEEE TVT 71(1), 2022 (arXiv
+2104.07923): numbers in brackets are its equations, and the defaults its own. A packet is lost below
+the sensing threshold (12), to a receiver that is locked to another one's packet (14), to noise (24)
+or to a collision (26): with a hidden node, or with one that hears the sender and ends its back-off
+in the same slot. This model differs from the source:
 
-- A link keeps its shadowing: `loss` is that at the power received, and `reception` the mean over shadowing,
-  where the source multiplies means.
-- Background traffic is a line of equal density, so a product over vehicles is the exponential of an integral.
-- Nobody begins to send in the AIFS after a busy period either (`free_share`); the source counts only the busy
-  time in (16), (18) and (22). Vehicles that waited for its end begin soon after it, close together
-  (`crowding`).
-- A message of another size than the background's collides with packets that begin while it is on air (so its
-  own length counts), and with packets that were on air before (so their length counts).
-- Replies that end their back-off in one slot are lost together; one that becomes ready while another is on
-  air waits for its end. All helpers of an ego are assumed to hear each other. `loss` does not include that.
+- A link keeps its shadowing: `loss` is that at the power received, and `reception` the mean over
+  shadowing, where the source multiplies means.
+- Background traffic is a line of equal density,
+  so a product over vehicles is the exponential of an integral.
+- Nobody begins to send in the AIFS after a busy period either (`free_share`); the source counts
+  only the busy time in (16), (18) and (22). Vehicles that waited for its end begin soon after it,
+  close together (`crowding`).
+- A message of another size than the background's collides with packets that begin while it is on
+  air (so its own length counts), and with packets that were on air before (so their length counts).
+- Replies that end their back-off in one slot are lost together; one that becomes ready while
+  another is on air waits for its end. All helpers of an ego are assumed to hear each other. `loss`
+  does not include that.
 
-As in the source, a block error curve holds for frames of any size, a receiver that has locked to a packet
-does not leave it for a stronger one, and all background vehicles are in line of sight. A message is one frame
-of any length; 802.11 would split one of more than 2304 bytes.
+As in the source, a block error curve holds for frames of any size, a receiver that has locked to a
+packet does not leave it for a stronger one, and all background vehicles are in line of sight. A
+message is one frame of any length; 802.11 would split one of more than 2304 bytes.
 """
 
 import math
@@ -48,15 +52,18 @@ STRONGEST_DB = 80.0  # highest power in the tables, above the sensing threshold
 QUANTILES = 400  # quantiles of shadowing in `reception`
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 BY_BIT = "11p-goubet"  # a curve over the energy of a bit
-CURVES_MBPS = {"11p-mcs2": 6.0, "11p-mcs4": 12.0}  # data rate of other curves, by the beginning of their name
+# data rate of other curves, by the beginning of their name
+CURVES_MBPS = {"11p-mcs2": 6.0, "11p-mcs4": 12.0}
 IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arXiv 2203.17114
 
 
 class Hazards(NamedTuple):
-    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of STEP_DB)."""
+    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of
+    STEP_DB).
+    """
 
-    # packets that began earlier or at the same time and that the receiver is locked to, or that spoil this
-    # one, `(D, P)`
+    # packets that began earlier or at the same time and that the receiver is locked to, or that
+    # spoil this one, `(D, P)`
     before: Floats
     during: Floats  # later packets that spoil it, for each second that it is on air, `(D, P)`
 
@@ -65,7 +72,8 @@ class Hazards(NamedTuple):
 class ItsG5(Transceiver):
     """802.11p with background traffic, which sends packets of one size at one rate."""
 
-    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89  # carrier frequency, here the control channel's
+    # carrier frequency, here the control channel's
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
     # see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.5
     antenna_m: Annotated[float, between(0, 10)] = 1.5  # height of every antenna
@@ -78,21 +86,26 @@ class ItsG5(Transceiver):
     data_rate_mbps: Annotated[float, between(1, 100)] = 6.0
     # slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663)
     aifs_slots: Annotated[int, between(0, 15)] = 6
-    # back-off is uniform from 0 to this number of slots; a broadcast never doubles it. There is always a
-    # back-off, as after a packet of one's own
+    # back-off is uniform from 0 to this number of slots; a broadcast never doubles it. There is
+    # always a back-off, as after a packet of one's own
     contention_window: Annotated[int, between(1, 1023)] = 15
-    # block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the source's, is over
-    # the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or 12 Mb/s) is shifted for
-    # another rate by the additional SINR that an implementation at 0.37 of Shannon's rate needs
+    # block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the
+    # source's, is over the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or
+    # 12 Mb/s) is shifted for another rate by the additional SINR that an implementation at 0.37 of
+    # Shannon's rate needs
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.data_rate_mbps not in RATES_MBPS:
             allowed = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
-            raise UserError(f"its-g5: data_rate_mbps is {self.data_rate_mbps}; it must be one of {allowed}")
+            raise UserError(
+                f"its-g5: data_rate_mbps is {self.data_rate_mbps}; it must be one of {allowed}"
+            )
         if self.curve != BY_BIT and self.curve[:8] not in CURVES_MBPS:
-            raise UserError(f"its-g5: curve is {self.curve!r}; it must be {BY_BIT} or begin with 11p-mcs")
+            raise UserError(
+                f"its-g5: curve is {self.curve!r}; it must be {BY_BIT} or begin with 11p-mcs"
+            )
         block_error(self.curve)
 
     @property
@@ -119,12 +132,15 @@ class ItsG5(Transceiver):
         return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio (35): the source's fit to its simulations of a load (34) up to 1.3.
+        """Return the channel busy ratio (35):
+        the source's fit to its simulations of a load (34) up to 1.3.
 
         Beyond the maximum of the fit's parabola, 0.84 at a load of 1.84, it stays constant.
         """
         sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
-        load = min(self.density_per_km / 1000 * self.rate_hz * self.packet_s * sensed_m, 0.913 / 0.4962)
+        load = min(
+            self.density_per_km / 1000 * self.rate_hz * self.packet_s * sensed_m, 0.913 / 0.4962
+        )
         return (-0.2481 * load + 0.913) * load + 0.003844 * (load > 0)
 
     def lost_share(self, sinr_db: Floats) -> Floats:
@@ -135,16 +151,20 @@ class ItsG5(Transceiver):
         return block_error(self.curve)(sinr_db - more_db)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of background packets received at distances `(n,)`, averaged over shadowing.
+        """Return the share of background packets received at distances `(n,)`,
+        averaged over shadowing.
 
-        Without `sight`, it is also averaged over clear and blocked links by the environment's shares.
+        Without `sight`, it is also averaged over clear and blocked links by the environment's
+        shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]
 
         def received(sight: Ints | int) -> Floats:
             mean_dbm = self.received_dbm(self.path_loss_db(distance_m, sight))
-            unspoilt, spoils_hz = self._fate(distance_m, mean_dbm + self.shadowing_db(sight) * shadow)
+            unspoilt, spoils_hz = self._fate(
+                distance_m, mean_dbm + self.shadowing_db(sight) * shadow
+            )
             return np.asarray(np.mean(unspoilt * np.exp(-self.packet_s * spoils_hz), axis=-1))
 
         if sight is not None:
@@ -155,7 +175,9 @@ class ItsG5(Transceiver):
     def _turns(
         self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
     ) -> tuple[Bools, Floats]:
-        """Replies are sent one after another; those that end their back-off in one slot are lost together."""
+        """Replies are sent one after another;
+        those that end their back-off in one slot are lost together.
+        """
         begins_s = np.where(links.asked, begins_s, np.inf)
         alone = np.sum(_near(begins_s, SLOT_S / 2), axis=-1) == 1
         return alone, served_s(begins_s, np.where(links.asked, airtime_s, 0.0), links.range_m)
@@ -176,7 +198,8 @@ class ItsG5(Transceiver):
 
     def wait_s(self, uniforms: Floats) -> Floats:
         return np.interp(
-            uniforms, *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window)
+            uniforms,
+            *back_off.access(self.busy_ratio(), self.packet_s, self.aifs_s, self.contention_window),
         )
 
 
@@ -213,24 +236,32 @@ def _hazards(radio: ItsG5) -> Hazards:
 
 
 def _overlap(radio: ItsG5, apart_m: Floats) -> Floats:
-    """Return the share of what one vehicle senses that another senses as well, by their distance (20)."""
+    """Return the share of what one vehicle senses that another senses as well,
+    by their distance (20).
+    """
     sensed = _sensed(radio, np.abs(np.arange(-SENSED_M, SENSED_M + 1)))
     shared = np.correlate(sensed, sensed, "full")[sensed.size - 1 :]
     return np.asarray(np.interp(apart_m, np.arange(shared.size), shared / shared[0]))
 
 
 def _spoils(radio: ItsG5, power_dbm: Floats, interferer_m: Floats) -> Floats:
-    """Return the probability (31) that a concurrent packet spoils one, `(P, interferers)`, noise excluded."""
+    """Return the probability (31) that a concurrent packet spoils one, `(P, interferers)`,
+    noise excluded.
+    """
     noise = noise_dbm(BANDWIDTH_HZ, radio.noise_figure_db)
     shadow, weights = np.polynomial.hermite_e.hermegauss(15)
     mean_dbm = radio.received_dbm(radio.path_loss_db(interferer_m))
-    others_dbm = 10 * np.log10(10 ** (noise / 10) + 10 ** ((mean_dbm + radio.shadowing_db() * shadow) / 10))
+    others_dbm = 10 * np.log10(
+        10 ** (noise / 10) + 10 ** ((mean_dbm + radio.shadowing_db() * shadow) / 10)
+    )
     lost = radio.lost_share(power_dbm[:, None, None] - others_dbm) @ (weights / weights.sum())
     survives = 1 - radio.lost_share(power_dbm - noise)[:, None]
     return np.asarray(np.clip(1 - (1 - lost) / np.maximum(survives, 1e-12), 0.0, 1.0))
 
 
 def _near(at: Floats, within: float) -> Bools:
-    """Return which of these times `(..., H)` are near each other, `(..., H, H)`; infinite ones never are."""
+    """Return which of these times `(..., H)` are near each other, `(..., H, H)`;
+    infinite ones never are.
+    """
     finite = np.where(np.isfinite(at), at, np.nan)
     return np.asarray(np.abs(finite[..., :, None] - finite[..., None, :]) < within)

@@ -6,7 +6,9 @@ from typing import Any
 
 
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a sentence for each setting outside the limits for which the source validated the model."""
+    """Return a sentence for each setting outside the limits for which the source validated the
+    model.
+    """
     return [
         f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "
         f"{low:g} to {high:g}."

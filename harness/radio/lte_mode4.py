@@ -1,9 +1,10 @@
-"""LTE-V2X Mode 4: vehicles choose their resources themselves, by sensing and semi-persistent scheduling.
+"""LTE-V2X Mode 4: vehicles choose their resources themselves,
+by sensing and semi-persistent scheduling.
 
-Parameters are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019):
-10 MHz at 5.9 GHz, packets of 190 bytes in sub-channels of a 1 ms subframe, WINNER+ B1 with an effective
-antenna height of 1.5 m, block errors of 3GPP R1-160284. They validated it by simulation at 100 to 300
-vehicles a kilometre, 10 and 20 Hz, 20 and 23 dBm, distances up to 500 m.
+Parameters are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2),
+2019): 10 MHz at 5.9 GHz, packets of 190 bytes in sub-channels of a 1 ms subframe, WINNER+ B1 with
+an effective antenna height of 1.5 m, block errors of 3GPP R1-160284. They validated it by
+simulation at 100 to 300 vehicles a kilometre, 10 and 20 Hz, 20 and 23 dBm, distances up to 500 m.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 class LteMode4(Sidelink):
     """Mode 4 in 10 MHz."""
 
-    # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2 at 0.5
+    # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2
+    # at 0.5
     subchannels: Literal[2, 4] = 4
     ranks: ClassVar[bool] = True
 

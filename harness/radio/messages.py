@@ -1,18 +1,18 @@
 """The bits of messages by the encoding rules of the standards.
 
-`messages.csv` lists the members of each message: what values a member may have, the bits of one, how often it
-is there, and where it is defined. Messages are in unaligned PER (ITU-T X.691): an integer of n values takes
-the bits of n - 1, as do an enumeration and a choice; an optional member of a sequence takes one bit more, and
-so does whatever may be extended. An open type fills whole octets, behind their number. The signed envelope is
-in OER (X.696), whole octets throughout. So no size depends on values, only on how much is listed.
+`messages.csv` lists the members of each message: what values a member may have, the bits of one,
+how often it is there, and where it is defined. Messages are in unaligned PER (ITU-T X.691): an
+integer of n values takes the bits of n - 1, as do an enumeration and a choice; an optional member
+of a sequence takes one bit more, and so does whatever may be extended. An open type fills whole
+octets, behind their number. The signed envelope is in OER (X.696), whole octets throughout. So no
+size depends on values, only on how much is listed.
 
     etsi   CAM (TS 103 900, and bit for bit EN 302 637-2), CPM (TS 103 324), GeoNetworking and BTP-B
-    sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3)
-    both   the envelope of IEEE 1609.2 by the profile of TS 103 097: a digest of the sender's certificate, and
-           now and then the certificate
+    sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3) both   the envelope of IEEE 1609.2 by the
+    profile of TS 103 097: a digest of the sender's certificate, and now and then the certificate
 
-No standard has a message for an intent or for its request. Theirs are containers of our own, made of the
-standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
+No standard has a message for an intent or for its request. Theirs are containers of our own, made
+of the standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
 
 `harness.coordination.encodings` chooses among these and the size of a reply's text.
 """
@@ -37,11 +37,12 @@ NAMES: Mapping[Encoding, Mapping[str, str]] = {
     "sae": {"beacon": "BSM", "objects": "SDSM", "intent": "sae-intent", "request": "sae-request"},
 }
 MOST = {"CPM": 255, "SDSM": 256}  # objects in one message
-# Seconds after which a message has the certificate again: TS 103 097 7.1.1, and CertAttachInt of J2945/1 as
-# Rostami, Krishnan and Gruteser (2018), table 1, give it. TS 103 097 adds one for new neighbours, left out.
+# Seconds after which a message has the certificate again: TS 103 097 7.1.1, and CertAttachInt of
+# J2945/1 as Rostami, Krishnan and Gruteser (2018), table 1, give it. TS 103 097 adds one for new
+# neighbours, left out.
 CERTIFICATE_EVERY_S: Mapping[Encoding, float] = {"etsi": 1.0, "sae": 0.45}
-# Number of an application (ITS-AID in TS 102 965, PSID in IEEE 1609.12). A container of ours has none yet: in
-# its place is any that takes two octets.
+# Number of an application (ITS-AID in TS 102 965, PSID in IEEE 1609.12). A container of ours has
+# none yet: in its place is any that takes two octets.
 PSIDS, OTHER_PSID = {"CAM": 36, "BSM": 32, "CPM": 639, "SDSM": 144}, 1000
 # Sizes in octets from which the number of octets takes one octet more: X.691 11.9, X.696 8.6.
 LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
@@ -51,8 +52,8 @@ class Counts(NamedTuple):
     """How much a message holds; each message has its part of it. Arrays broadcast."""
 
     objects: Count = 0  # listed in a CPM or SDSM
-    # whether objects have what is optional and scene graphs know: in a CPM speed, heading and class, in an
-    # SDSM class and lights
+    # whether objects have what is optional and scene graphs know: in a CPM speed, heading and
+    # class, in an SDSM class and lights
     optional: Count = True
     points: Count = 0  # of the path behind, in a CAM's low-frequency container or a BSM's part II
     actions: Count = 0  # whose probabilities are in an intent
@@ -65,7 +66,8 @@ class Member(NamedTuple):
 
     type: str  # the message or sequence that it is a member of
     member: str
-    values: str  # what it may be; or its type, `open` or `opaque` if that is in octets behind their number
+    # what it may be; or its type, `open` or `opaque` if that is in octets behind their number
+    values: str
     bits: int | None  # None where a type says it
     each: str  # what there is one of it for, such as a field of `Counts`; empty if nothing
     source: str
@@ -139,18 +141,23 @@ def wraps(
         bits: its bits.
         since_certificate_s: seconds since the sender's last message with its certificate. From
             `CERTIFICATE_EVERY_S` on this one has it, else the certificate's digest.
-        headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio never do:
-            `its-g5` adds its `header_bytes`, and a sidelink's blocks are taken as they are.
+        headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio
+            never do: `its-g5` adds its `header_bytes`, and a sidelink's blocks are taken as they
+            are.
     """
     encoding = _encoding_of(name)
     certificate = np.asarray(since_certificate_s) >= CERTIFICATE_EVERY_S[encoding]
     psid = PSIDS.get(name, OTHER_PSID)
     counts: dict[str, Count] = {
-        "psid": 1 + (psid > 255), "p_encoded_psid": 1 + (psid > 127),
-        "certificate": certificate, "digest": ~certificate,
-    }  # fmt: skip
+        "psid": 1 + (psid > 255),
+        "p_encoded_psid": 1 + (psid > 127),
+        "certificate": certificate,
+        "digest": ~certificate,
+    }
     added, octets = list[Share](), np.asarray(bits, dtype=float) / 8
-    for layer in (f"{encoding}-network", "envelope", f"{encoding}-link") if headers else ("envelope",):
+    for layer in (
+        (f"{encoding}-network", "envelope", f"{encoding}-link") if headers else ("envelope",)
+    ):
         inside = _shares(layer, {**counts, "payload": octets}, 1.0, (layer,))
         own = [share for share in inside if share.path[-1] != "content"]
         octets = octets + _total(own) / 8
@@ -186,7 +193,9 @@ def _total(shares: Iterable[Share]) -> Floats:
 def _shares(
     kind: str, counts: Mapping[str, Count], times: Floats | float, path: tuple[str, ...]
 ) -> Iterator[Share]:
-    """Yield the shares of a type's members; one in octets behind their number is there once at most."""
+    """Yield the shares of a type's members;
+    one in octets behind their number is there once at most.
+    """
     for member in table()[kind]:
         here = (*path, member.member)
         number = np.asarray(times * (counts.get(member.each, 0) if member.each else 1), dtype=float)
@@ -200,4 +209,6 @@ def _shares(
             bits = _total(inside)
             octets = np.ceil(bits / 8)
             length = np.searchsorted(LENGTHS[wrap], octets, side="right")
-            yield Share((*here, "length"), number * (8 * (length + octets) - bits), "X.691 11.9, X.696 8.6")
+            yield Share(
+                (*here, "length"), number * (8 * (length + octets) - bits), "X.691 11.9, X.696 8.6"
+            )

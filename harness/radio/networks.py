@@ -51,5 +51,7 @@ def _read(path: Path) -> Network:
     times_ms = list(network.quantiles_ms.values())
     ends = percents[:1] == [0.0] and percents[-1:] == [100.0] and min(times_ms) >= 0
     if not (ends and np.all(np.diff(percents) > 0) and np.all(np.diff(times_ms) >= 0)):
-        raise UserError(f"{where}: quantiles_ms must go from 0 to 100, percentages and milliseconds growing")
+        raise UserError(
+            f"{where}: quantiles_ms must go from 0 to 100, percentages and milliseconds growing"
+        )
     return network

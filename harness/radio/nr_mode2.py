@@ -1,16 +1,18 @@
-"""NR-V2X Mode 2: vehicles choose their resources themselves, from the control information they decoded.
+"""NR-V2X Mode 2: vehicles choose their resources themselves,
+from the control information they decoded.
 
-The model of Mode 4 with slots for subframes and without ranking: a vehicle takes any resource that it has
-not sensed as taken (TS 38.214, 8.1.4), which is Step 2 of that model alone. The chance that two vehicles
-choose the same does not depend on the length of the selection window, if all have the same (Brady, Cao and
-Roy, arXiv 2309.16680: the overlap of two windows cancels); the window is in the delay alone. Re-evaluation
-shortly before sending is not modelled.
+The model of Mode 4 with slots for subframes and without ranking: a vehicle takes any resource that
+it has not sensed as taken (TS 38.214, 8.1.4), which is Step 2 of that model alone. The chance that
+two vehicles choose the same does not depend on the length of the selection window, if all have the
+same (Brady, Cao and Roy, arXiv 2309.16680: the overlap of two windows cancels); the window is in
+the delay alone. Re-evaluation shortly before sending is not modelled.
 
-Defaults are those of 5G-LENA's highway example: 40 MHz at 5.89 GHz, numerology 0, MCS 14, sub-channels of 50
-resource blocks, packets of 200 bytes, window of slots 2 to 33, no resource kept. What a receiver takes for a
-packet, and senses, is the control channel above `sensing_dbm`. All of the transmit power goes into the
-resource blocks that are sent, so the power of a packet does not depend on its width. The default threshold is
-Mode 4's; the profile `mode2` has that of the simulations it is held against.
+Defaults are those of 5G-LENA's highway example: 40 MHz at 5.89 GHz, numerology 0, MCS 14,
+sub-channels of 50 resource blocks, packets of 200 bytes, window of slots 2 to 33, no resource kept.
+What a receiver takes for a packet, and senses, is the control channel above `sensing_dbm`. All of
+the transmit power goes into the resource blocks that are sent, so the power of a packet does not
+depend on its width. The default threshold is Mode 4's; the profile `mode2` has that of the
+simulations it is held against.
 """
 
 import csv
@@ -27,10 +29,12 @@ from harness.radio.block_error import BlockError, block_error, threshold
 from harness.radio.propagation import Environment, noise_dbm
 from harness.radio.sidelink import Sidelink
 
-# Resource blocks by bandwidth in MHz, for subcarriers of 15, 30 and 60 kHz (TS 38.101-1, table 5.3.2-1).
+# Resource blocks by bandwidth in MHz, for subcarriers of 15, 30 and 60 kHz (TS 38.101-1, table
+# 5.3.2-1).
 BLOCKS = {10: (52, 24, 11), 20: (106, 51, 24), 30: (160, 78, 38), 40: (216, 106, 51)}
 
-# Resource elements with reference signals, of 12 subcarriers in 13 symbols, by numerology (WiLabV2Xsim's).
+# Resource elements with reference signals, of 12 subcarriers in 13 symbols, by numerology
+# (WiLabV2Xsim's).
 REFERENCES = (24, 18, 12)
 
 CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
@@ -45,16 +49,17 @@ class NrMode2(Sidelink):
     t1_slots: Annotated[int, between(0, 10000)] = 2
     t2_slots: Annotated[int, between(0, 10000)] = 33
     bandwidth_mhz: Literal[10, 20, 30, 40] = 40  # 10, 20, 30 or 40
-    numerology: Literal[0, 1, 2] = 0  # 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz
+    # 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz
+    numerology: Literal[0, 1, 2] = 0
     # resource blocks of a sub-channel. A packet takes as many of these as it needs
     subchannel_blocks: Annotated[int, between(10, 100)] = 50
-    # modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block error, the
-    # others a threshold of SINR
+    # modulation and coding, 0 to 28 (TS 38.214, table 5.1.3.1-1). 7 and 21 have curves of block
+    # error, the others a threshold of SINR
     mcs: Annotated[int, between(0, 28)] = 14
     packet_bytes: Annotated[int, between(1, 10000)] = 200  # size of a background packet
     # share of Shannon's bound that codings without a curve reach (`block_error.threshold`). 0.4 is
-    # WiLabV2Xsim's for moving vehicles, 0.62 that of MCS 14 in 5G-LENA's tables without fading: half of the
-    # blocks are lost at 10.1 dB
+    # WiLabV2Xsim's for moving vehicles, 0.62 that of MCS 14 in 5G-LENA's tables without fading:
+    # half of the blocks are lost at 10.1 dB
     efficiency: Annotated[float, between(0.1, 1)] = 0.4
     ranks: ClassVar[bool] = False
 
@@ -73,7 +78,11 @@ class NrMode2(Sidelink):
 
     @property
     def blocks_per_slot(self) -> int:
-        return BLOCKS[self.bandwidth_mhz][self.numerology] // self.subchannel_blocks // self._subchannels
+        return (
+            BLOCKS[self.bandwidth_mhz][self.numerology]
+            // self.subchannel_blocks
+            // self._subchannels
+        )
 
     @property
     def block_bits(self) -> int:

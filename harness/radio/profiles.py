@@ -1,7 +1,8 @@
-"""Channel profiles by name: files `channels/*.toml`, shipped and a project's, and those that packages add.
+"""Channel profiles by name: files `channels/*.toml`, shipped and a project's,
+and those that packages add.
 
-A file names a model and its parameters, and states their source. A package adds a profile by an entry point
-in the group `swarmdrive.channels`.
+A file names a model and its parameters, and states their source. A package adds a profile by an
+entry point in the group `swarmdrive.channels`.
 """
 
 import os
@@ -22,8 +23,8 @@ from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 from harness.radio.wrapped import is_ours
 
-# Models by name: a class, or a function of a file's parameters, its folder and their name in messages.
-# Physical models are slow to import, so a model is imported only when a profile names it.
+# Models by name: a class, or a function of a file's parameters, its folder and their name in
+# messages. Physical models are slow to import, so a model is imported only when a profile names it.
 MODELS = {
     "constant": "harness.radio.constant:Radio",
     "lte-v2x-mode4": "harness.radio.lte_mode4:LteMode4",
@@ -64,7 +65,9 @@ class Profiles(FilesAndPlugins[Channel]):
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
 
     def files(self, name: str) -> dict[str, Path]:
-        """Return a profile's file and the table that it names, by their paths within `channels/`."""
+        """Return a profile's file and the table that it names,
+        by their paths within `channels/`.
+        """
         file = self.file(name)
         if file is None:
             return {}
@@ -74,7 +77,9 @@ class Profiles(FilesAndPlugins[Channel]):
         return files
 
     def unchanged(self, name: str, recorded: Any) -> bool:
-        """Return whether the channel does what a record of it said; a newer parameter had its default."""
+        """Return whether the channel does what a record of it said;
+        a newer parameter had its default.
+        """
         if name not in self:
             return False
         now, then = self.record(name), msgspec.to_builtins(recorded)
@@ -113,4 +118,6 @@ def _read(path: Path) -> tuple[Profile, Channel]:
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})
 
 # A vehicle without a radio: comparisons with a NaN loss are false, so nothing is ever received.
-NO_CHANNEL = Radio(latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0)
+NO_CHANNEL = Radio(
+    latency_s=0.0, loss=np.nan, bandwidth_bps=np.inf, access="parallel", jitter_s=0.0
+)

@@ -1,8 +1,8 @@
 """Radio propagation: path loss, blockage, shadowing and noise.
 
-Sources: 3GPP TR 37.885 (tables 6.2-1, 6.2.1-1 and 6.2.1-2) for highway and urban links, WINNER+ D5.3 B1 as
-Gonzalez-Martin et al. (IEEE TVT 68(2), 2019) use it, and Mangel, Klemp and Hartenstein (EURASIP JWCN
-2011:182), as Abbas et al. (2015, equation 6) print it, for links round a corner.
+Sources: 3GPP TR 37.885 (tables 6.2-1, 6.2.1-1 and 6.2.1-2) for highway and urban links, WINNER+
+D5.3 B1 as Gonzalez-Martin et al. (IEEE TVT 68(2), 2019) use it, and Mangel, Klemp and Hartenstein
+(EURASIP JWCN 2011:182), as Abbas et al. (2015, equation 6) print it, for links round a corner.
 """
 
 import math
@@ -19,22 +19,26 @@ from harness.radio.channel import CLEAR, VEHICLE
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
 
 LIGHT_M_PER_S = 3e8
-NEAREST_M = 3.0  # no formula here is valid below this distance; a shorter link has the loss of this distance
+# no formula here is valid below this distance; a shorter link has the loss of this distance
+NEAREST_M = 3.0
 
 
 @dataclass(frozen=True)
 class Propagation:
-    """The laws of propagation with their heights and widths. A radio model inherits these as settings."""
+    """The laws of propagation with their heights and widths.
+    A radio model inherits these as settings.
+    """
 
     # law of links without a building between, with its LOS probabilities and decorrelation
     environment: Environment = "winner-b1"
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.91  # carrier frequency
     antenna_m: Annotated[float, between(0, 100)] = 1.5  # height of every antenna
-    # average height of the vehicles' surroundings, for `winner-b1` only. The effective antenna height is
-    # `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m with 1 (TR 36.885), 12 dB more at
-    # 100 m
+    # average height of the vehicles' surroundings, for `winner-b1` only. The effective antenna
+    # height is `antenna_m` less this: 1.5 m with 0 (Gonzalez-Martin et al.), 0.5 m with 1 (TR
+    # 36.885), 12 dB more at 100 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.0
-    # height of a blocking vehicle if no scene gives it: 1.6 m is a car, 3.0 m a lorry (TR 37.885, 6.1.2)
+    # height of a blocking vehicle if no scene gives it: 1.6 m is a car, 3.0 m a lorry (TR 37.885,
+    # 6.1.2)
     blocker_m: Annotated[float, between(0, 100)] = 1.6
     # width of the receiver's street, in the law of the corner
     street_m: Annotated[float, between(0.1, 1000)] = 14.0
@@ -52,9 +56,10 @@ class Propagation:
     ) -> Floats:
         """Return the mean loss `(...)` of links `(...)`, with the blockage of a vehicle between.
 
-        The height of a vehicle between, `blocker_m`, is the model's own if None; `first_m` is that of one
-        antenna, if it is not `antenna_m`. `corner_m` are the distances of both ends to the crossing's centre,
-        `(..., 2)`; NaN if the building is not at a corner. Then the NLOS law of TR 37.885 holds.
+        The height of a vehicle between, `blocker_m`, is the model's own if None; `first_m` is that
+        of one antenna, if it is not `antenna_m`. `corner_m` are the distances of both ends to the
+        crossing's centre, `(..., 2)`; NaN if the building is not at a corner. Then the NLOS law of
+        TR 37.885 holds.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
         clear_db = self.clear_db(distance_m, first_m)
@@ -82,7 +87,9 @@ class Propagation:
         return 38.77 + 16.7 * np.log10(distance_m) + 18.2 * math.log10(self.frequency_ghz)
 
     def _mean_height_m(self, first_m: float | None, less_m: float = 0.0) -> float:
-        """Return the geometric mean of both antennas' heights above `less_m`, as in two-ray propagation."""
+        """Return the geometric mean of both antennas' heights above `less_m`,
+        as in two-ray propagation.
+        """
         heights_m = (self.antenna_m, self.antenna_m if first_m is None else first_m)
         one_m, other_m = (max(height - less_m, 0.1) for height in heights_m)
         return one_m if first_m is None else math.sqrt(one_m * other_m)
@@ -93,31 +100,37 @@ class Propagation:
         blocker_m: Floats | float | None = None,
         first_m: float | None = None,
     ) -> tuple[Floats, Floats]:
-        """Return the additional loss of a vehicle between (TR 37.885, 6.2.1): mean and deviation, `(...)`.
+        """Return the additional loss of a vehicle between (TR 37.885, 6.2.1):
+        mean and deviation, `(...)`.
 
-        The loss is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both antennas are lower than
-        the blocker, 5 and 4 if only one is. There is none if both are higher. Beyond 541 m the mean grows by
-        15 log10 d - 41.
+        The loss is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both antennas are
+        lower than the blocker, 5 and 4 if only one is. There is none if both are higher. Beyond 541
+        m the mean grows by 15 log10 d - 41.
         """
         blocker_m = self.blocker_m if blocker_m is None else blocker_m
         other_m = self.antenna_m if first_m is None else first_m
         low_m, high_m = sorted((self.antenna_m, other_m))
-        higher = np.greater(blocker_m, high_m).astype(np.int64) - np.less(blocker_m, low_m)  # 1, 0 or -1
+        # 1, 0 or -1
+        higher = np.greater(blocker_m, high_m).astype(np.int64) - np.less(blocker_m, low_m)
         mean_db, deviation_db = np.array(_BLOCKAGE_DB).T
         growth_db = np.maximum(0.0, 15 * np.log10(np.maximum(distance_m, NEAREST_M)) - 41)
         return np.where(higher < 0, 0.0, mean_db[higher] + growth_db), deviation_db[higher]
 
     def corner_db(self, corner_m: Floats, first_m: float | None = None) -> Floats:
-        """Return the loss `(...)` round a corner, from the ends' distances to its centre, `(..., 2)`.
+        """Return the loss `(...)` round a corner, from the ends' distances to its centre,
+        `(..., 2)`.
 
-        The law is not quite reciprocal, but a radio link is, so the mean of both directions in dB is taken.
+        The law is not quite reciprocal, but a radio link is,
+        so the mean of both directions in dB is taken.
         """
         one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
         height_m = self._mean_height_m(first_m)
         there_db = self._corner_one_way_db(one_m, other_m, height_m)
         return 0.5 * (there_db + self._corner_one_way_db(other_m, one_m, height_m))
 
-    def _corner_one_way_db(self, transmitter_m: Floats, receiver_m: Floats, height_m: float) -> Floats:
+    def _corner_one_way_db(
+        self, transmitter_m: Floats, receiver_m: Floats, height_m: float
+    ) -> Floats:
         # The breakpoint is that of the two-ray model; Abbas et al. use the same symbol for it.
         wave_m = LIGHT_M_PER_S / (self.frequency_ghz * 1e9)
         break_m = 4 * height_m**2 / wave_m
@@ -134,26 +147,32 @@ class Propagation:
     ) -> Floats:
         """Return the standard deviation `(...)` of shadowing and blockage together.
 
-        3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a building
-        (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a corner (Mangel et al.).
+        3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a
+        building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a corner
+        (Mangel et al.).
         """
         behind: Floats | float = 4.0
         if corner_m is not None:
             behind = np.where(np.isnan(corner_m).any(axis=-1), 4.0, 4.1)
         vehicle_db = np.hypot(3.0, self.blockage_db(np.array(NEAREST_M), blocker_m, first_m)[1])
-        return np.select([np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind)
+        return np.select(
+            [np.equal(sight, CLEAR), np.equal(sight, VEHICLE)], [3.0, vehicle_db], behind
+        )
 
     @property
     def decorrelation_m(self) -> float:
-        """Distance over which shadowing's correlation falls to 1/e: 25 m on a highway and 10 m in a town.
+        """Distance over which shadowing's correlation falls to 1/e:
+        25 m on a highway and 10 m in a town.
 
-        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links without line
-        of sight; here these have 10 m as well, so that shadowing does not jump when sight is lost.
+        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links
+        without line of sight; here these have 10 m as well, so that shadowing does not jump when
+        sight is lost.
         """
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 
     def clear_probability(self, distance_m: Floats) -> Floats:
-        """Return the share of links that no vehicle blocks, without buildings (TR 37.885, table 6.2-1).
+        """Return the share of links that no vehicle blocks,
+        without buildings (TR 37.885, table 6.2-1).
 
         In `winner-b1` no link is blocked.
         """
@@ -173,7 +192,8 @@ def _clipped(mean: float, deviation: float) -> tuple[float, float]:
     return first, math.sqrt((mean**2 + deviation**2) * above + mean * deviation * at - first**2)
 
 
-# Mean and deviation for a blocker between the antennas' heights, higher than both, and lower than both.
+# Mean and deviation for a blocker between the antennas' heights, higher than both, and lower than
+# both.
 _BLOCKAGE_DB = [_clipped(5.0, 4.0), _clipped(9.0, 4.5), (0.0, 0.0)]
 
 
@@ -196,5 +216,7 @@ def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
 
 
 def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Return thermal noise at 290 K plus the receiver's: -95 dBm in 10 MHz with a noise figure of 9 dB."""
+    """Return thermal noise at 290 K plus the receiver's:
+    -95 dBm in 10 MHz with a noise figure of 9 dB.
+    """
     return -174 + 10 * math.log10(bandwidth_hz) + noise_figure_db

@@ -1,4 +1,6 @@
-"""Reception against distance: a channel's own curve, the messages it delivers, and others' curves."""
+"""Reception against distance: a channel's own curve, the messages it delivers,
+and others' curves.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -48,8 +50,12 @@ def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[s
     return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
 
 
-def latencies_ms(channel: Channel, distances_m: Sequence[float]) -> dict[str, dict[str, list[float]]]:
-    """Return `p50` and `p95` of a message's latency behind each of `SIGHTS`; nothing if no table has them."""
+def latencies_ms(
+    channel: Channel, distances_m: Sequence[float]
+) -> dict[str, dict[str, list[float]]]:
+    """Return `p50` and `p95` of a message's latency behind each of `SIGHTS`;
+    nothing if no table has them.
+    """
     if not (isinstance(channel, Trace) and channel.spread):
         return {}
     metres = np.asarray(distances_m, dtype=float)
@@ -69,15 +75,25 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
         draws = Draws(trips.uniforms(1)[:, None, 1:], trips.uniforms(1)[:, :1], trips)
         shape = (n, 1)
         site = Site(
-            np.broadcast_to([[0.0, 0.0], [distance_m, 0.0]], (n, 2, 2)), np.full(shape, CLEAR),
-            np.zeros(shape), np.full((n, 1, 2), np.nan),
-        )  # fmt: skip
+            np.broadcast_to([[0.0, 0.0], [distance_m, 0.0]], (n, 2, 2)),
+            np.full(shape, CLEAR),
+            np.zeros(shape),
+            np.full((n, 1, 2), np.nan),
+        )
         ones = np.ones(shape, dtype=bool)
         links = Links(
-            ones, np.zeros(shape), np.full(shape, distance_m), np.full(shape, PAYLOAD_BITS), ones,
-            np.zeros(shape, dtype=bool), 400.0, site,
-        )  # fmt: skip
-        ready_s = np.broadcast_to(heard_s(channel, channel.request(400.0, draws), links, draws), shape)
+            ones,
+            np.zeros(shape),
+            np.full(shape, distance_m),
+            np.full(shape, PAYLOAD_BITS),
+            ones,
+            np.zeros(shape, dtype=bool),
+            400.0,
+            site,
+        )
+        ready_s = np.broadcast_to(
+            heard_s(channel, channel.request(400.0, draws), links, draws), shape
+        )
         up, delay_s, loss, _ = channel.deliver(replace(links, ready_s=ready_s), draws)
         crossed = draws.packet[..., 1] >= np.broadcast_to(loss, shape)
         crossing, round_trip = (rate_interval(each[:, 0].astype(float)) for each in (crossed, up))
@@ -87,7 +103,9 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 
 @dataclass(frozen=True)
 class Gap:
-    """How long a receiver waits from one of a vehicle's packets to the next that it gets, at one distance."""
+    """How long a receiver waits from one of a vehicle's packets to the next that it gets,
+    at one distance.
+    """
 
     distance_m: float  # between the two
     mean_s: Estimate  # over trips
@@ -96,10 +114,12 @@ class Gap:
 
 
 def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
-    """Drive `n` trips of two vehicles at each distance, in sight, 14 m/s on one road, for `PACKETS`.
+    """Drive `n` trips of two vehicles at each distance, in sight,
+    14 m/s on one road, for `PACKETS`.
 
-    Their shadowing changes as they go; a packet is drawn by its own loss, as runs draw messages. What a
-    trip's end cuts off is left out, so waits that would be longer than a tenth of a trip are unknown.
+    Their shadowing changes as they go; a packet is drawn by its own loss, as runs draw messages.
+    What a trip's end cuts off is left out, so waits that would be longer than a tenth of a trip are
+    unknown.
     """
     moved_m = MPS / channel.rate_hz * np.arange(PACKETS)
     numbers = np.broadcast_to(np.arange(n)[:, None], (n, PACKETS))
@@ -109,15 +129,21 @@ def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int =
     result = []
     for distance_m, share in zip(distances_m, reception.tolist(), strict=True):
         ends_m = moved_m[:, None] + [0.0, distance_m]
-        xy_m = np.broadcast_to(np.stack([ends_m, np.zeros_like(ends_m)], axis=-1), (n, PACKETS, 2, 2))
+        xy_m = np.broadcast_to(
+            np.stack([ends_m, np.zeros_like(ends_m)], axis=-1), (n, PACKETS, 2, 2)
+        )
         none = np.zeros((n, PACKETS, 1))
         site = Site(xy_m, np.full(none.shape, CLEAR), none, np.full((*none.shape, 2), np.nan))
-        loss = channel.loss(site, trips.shadow(xy_m, channel.decorrelation_m), channel.packet_bits)[..., 0]
+        loss = channel.loss(site, trips.shadow(xy_m, channel.decorrelation_m), channel.packet_bits)[
+            ..., 0
+        ]
         trip, packet = np.nonzero((uniforms >= loss) & (PACKETS * share > 10))
         same = np.diff(trip) == 0
         waits_s, trip = np.diff(packet)[same] / channel.rate_hz, trip[1:][same]
         independent_s = 1 / (channel.rate_hz * share) if share else math.inf
-        result.append(Gap(distance_m, episode_interval(waits_s, trip), _p95(waits_s, trip), independent_s))
+        result.append(
+            Gap(distance_m, episode_interval(waits_s, trip), _p95(waits_s, trip), independent_s)
+        )
     return result
 
 
@@ -143,7 +169,8 @@ class Curve:
 
 
 def curves_of(path: Path) -> list[Curve]:
-    """Read curves from a CSV: `distance_m`, `reception`, and if it has them `configuration` and `source`.
+    """Read curves from a CSV: `distance_m`, `reception`,
+    and if it has them `configuration` and `source`.
 
     Raises UserError, with file, line and value, if it is none or a value is not allowed.
     """
@@ -160,7 +187,9 @@ def curves_of(path: Path) -> list[Curve]:
         key = row.get("configuration", ""), row.get("source") or path.name
         curves.setdefault(key, []).append(point)
     if not curves:
-        raise UserError(f"{shown} has no rows; give distance_m and reception at one distance at least")
+        raise UserError(
+            f"{shown} has no rows; give distance_m and reception at one distance at least"
+        )
     return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
 
 
@@ -184,7 +213,9 @@ class Compared:
 
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
-    """Compare the channel, with the curve's settings, with the curve. Raises UserError for an unknown one."""
+    """Compare the channel, with the curve's settings, with the curve.
+    Raises UserError for an unknown one.
+    """
     adapted = changed(channel, pairs(curve.configuration), where)
     assert isinstance(adapted, Physical)
     return Compared(curve, adapted.reception(curve.distance_m))
@@ -207,15 +238,19 @@ class Check:
 
 
 def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
-    """Simulate `n` messages at each of `DISTANCES_M`, and compare the radio with the curves of CSV files.
+    """Simulate `n` messages at each of `DISTANCES_M`,
+    and compare the radio with the curves of CSV files.
 
-    Raises UserError if a file has no curves, or one states a setting that the radio `where` does not have.
+    Raises UserError if a file has no curves,
+    or one states a setting that the radio `where` does not have.
     """
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(
         n,
         known(channel.busy_ratio()),
-        gaps(channel, DISTANCES_M, n // 10) if isinstance(channel, Transceiver) and channel.rate_hz else [],
+        gaps(channel, DISTANCES_M, n // 10)
+        if isinstance(channel, Transceiver) and channel.rate_hz
+        else [],
         drawn(channel, DISTANCES_M, n),
         curves,
     )
@@ -224,10 +259,12 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
 def crowds(
     channels: Mapping[str, Channel], radius_m: float, distance_m: float, sight: str
 ) -> dict[str, Floats]:
-    """Return the loss of one transmission among each of `VEHICLES`, by the name of a channel, `(n,)`.
+    """Return the loss of one transmission among each of `VEHICLES`,
+    by the name of a channel, `(n,)`.
 
-    Vehicles are within a radius; sender and receiver, `distance_m` apart with one of `SIGHTS` between, are
-    two of them, the others the background's load, evenly along one road. `paper` is the paper's line.
+    Vehicles are within a radius; sender and receiver, `distance_m` apart with one of `SIGHTS`
+    between, are two of them, the others the background's load, evenly along one road. `paper` is
+    the paper's line.
     """
     losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
     for name, channel in channels.items():

@@ -1,13 +1,13 @@
 """A roadside unit: an antenna with a link to each vehicle, which relays replies or fuses them.
 
-Its links are the channel's: the unit is one end, with its own antenna height and its own obstacles to each
-vehicle. Their shadowing and packets are drawn separately, so a unit changes no other link. In both modes
-`delay_s` lies between the end of what the unit receives and what it sends for that: its processing and its
-backhaul.
+Its links are the channel's: the unit is one end, with its own antenna height and its own obstacles
+to each vehicle. Their shadowing and packets are drawn separately, so a unit changes no other link.
+In both modes `delay_s` lies between the end of what the unit receives and what it sends for that:
+its processing and its backhaul.
 
-As a relay it sends every reply that reaches it once more. As a place of fusion it gets the ego's request and
-intent, asks the helpers, fuses, and sends the ego a policy. An intent or a policy alone counts as large as a
-request: a distribution over three actions is about 50 bytes of compact JSON.
+As a relay it sends every reply that reaches it once more. As a place of fusion it gets the ego's
+request and intent, asks the helpers, fuses, and sends the ego a policy. An intent or a policy alone
+counts as large as a request: a distribution over three actions is about 50 bytes of compact JSON.
 """
 
 from collections.abc import Callable
@@ -28,8 +28,8 @@ class Relay(Wrapped):
     """A channel with a unit that sends replies once more; requests go directly.
 
     A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
-    that comes first: the direct one, unless latencies depend on the link. Copies are sent whether or not the
-    ego needs them, since the unit cannot know, and do not wait for other messages.
+    that comes first: the direct one, unless latencies depend on the link. Copies are sent whether
+    or not the ego needs them, since the unit cannot know, and do not wait for other messages.
     """
 
     unit: Unit  # the unit
@@ -38,7 +38,9 @@ class Relay(Wrapped):
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """A lost reply keeps its slot, and that of its copy if there is one."""
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
-        has_request = draws.packet[..., 0] >= link_loss(self.channel, links.where, draws, links.request_bits)
+        has_request = draws.packet[..., 0] >= link_loss(
+            self.channel, links.where, draws, links.request_bits
+        )
         at_unit = links.where.units[self.unit]
         there = delivered(
             self.channel,
@@ -50,7 +52,8 @@ class Relay(Wrapped):
         copy = broadcast(self.channel, links.payload_bits, replace(copies, given=copies.packet))
         to_ego = replace(links, site=at_unit.select(EGO))
         copied = heard & (
-            copies.packet[..., 1] >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
+            copies.packet[..., 1]
+            >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
         )
         if isinstance(innermost(self.channel), ByLink):
             at_unit_s, copy_s = there.delay_s, heard_s(self.channel, copy, to_ego, copies)
@@ -69,11 +72,15 @@ class Relay(Wrapped):
 class Consulted(NamedTuple):
     """Result of a consultation, in seconds from the ego's request."""
 
-    asked: Bools  # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
-    up: Bools  # whether request and reply were received, and a unit's policy if it sent one, `(..., H)`
-    end_s: Floats  # end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked
+    # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
+    asked: Bools
+    # whether request and reply were received, and a unit's policy if it sent one, `(..., H)`
+    up: Bools
+    # end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked
+    end_s: Floats
     fused: Bools  # which replies may be part of the policy, `(..., H)`
-    acts_s: Floats  # when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy
+    # when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy
+    acts_s: Floats
     loss: Floats  # probability that a reply is lost, `(..., H)` or `(..., 1)`
     requests: Ints  # number of requests of the ego and the unit, `(...)`
     request_bits: Floats  # their size, with the ego's intent in its request to a unit, `(...)`
@@ -92,13 +99,13 @@ def by_unit(
 ) -> Consulted:
     """Let a unit ask the helpers for the ego, and send the ego a policy in time.
 
-    The unit sends when the last reply's slot has ended, but not so late that its own wait and time on air
-    take the policy out of the window: it knows the slot that it has taken, or a table's latency, and until
-    when the ego waits. An ego without a policy by then acts alone.
+    The unit sends when the last reply's slot has ended, but not so late that its own wait and time
+    on air take the policy out of the window: it knows the slot that it has taken, or a table's
+    latency, and until when the ego waits. An ego without a policy by then acts alone.
 
-    `delay_s` lies between what the unit has received and what it sends for that. The `ready_s` of the links
-    is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have the request, of the
-    same shape or `(..., 1)`. The window closes in `left_s`, `(...)`.
+    `delay_s` lies between what the unit has received and what it sends for that. The `ready_s` of
+    the links is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have
+    the request, of the same shape or `(..., 1)`. The window closes in `left_s`, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
     ego_link, helper_links = (replace(links, site=at_unit.select(ends)) for ends in (EGO, HELPERS))
@@ -130,7 +137,9 @@ def by_unit(
         up=up,
         end_s=replies.delay_s,
         fused=up & crossed[..., None] & (replies.delay_s <= latest_s[..., None]),
-        acts_s=np.where(wanted, np.where(crossed, np.minimum(replied_s + back_s, left_s), left_s), 0.0),
+        acts_s=np.where(
+            wanted, np.where(crossed, np.minimum(replied_s + back_s, left_s), left_s), 0.0
+        ),
         loss=replies.loss,
         requests=wanted.astype(int) + reached,
         request_bits=bits * (2.0 * wanted + reached),
@@ -140,5 +149,7 @@ def by_unit(
 
 
 def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one transmission of so many bits is lost on each link, `(..., H)`."""
+    """Return the probability that one transmission of so many bits is lost on each link,
+    `(..., H)`.
+    """
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -1,14 +1,14 @@
 """The base of sidelink radios (LTE Mode 4, NR Mode 2): broadcasts under background load.
 
-The model of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019; equation numbers
-are theirs): a packet is lost because the receiver was sending (half duplex), because it came too faintly to
-be sensed, because of noise, or because others chose its resource. The paper averages over the shadowing of
-links in line of sight. `loss` is that of one link whose shadowing and obstacles are known; `reception`
-averages it again, and in line of sight is the paper's curve.
+The model of Gonzalez-Martin, Sepulcre, Molina-Masegosa and Gozalvez (IEEE TVT 68(2), 2019; equation
+numbers are theirs): a packet is lost because the receiver was sending (half duplex), because it
+came too faintly to be sensed, because of noise, or because others chose its resource. The paper
+averages over the shadowing of links in line of sight. `loss` is that of one link whose shadowing
+and obstacles are known; `reception` averages it again, and in line of sight is the paper's curve.
 
-Background vehicles stand evenly along a straight road through the receiver, with vehicles between them if the
-environment has a probability for that. Swarm messages add no load. Two replies in one slot and sub-channel
-are both lost; `loss` does not include that.
+Background vehicles stand evenly along a straight road through the receiver, with vehicles between
+them if the environment has a probability for that. Swarm messages add no load. Two replies in one
+slot and sub-channel are both lost; `loss` does not include that.
 """
 
 from abc import abstractmethod
@@ -27,26 +27,30 @@ from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
 from harness.radio.sps import Scheduling
 from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
-# Interferers farther away do not count, as in the source; longer links have this length's collisions.
+# Interferers farther away do not count, as in the source; longer links have this length's
+# collisions.
 FURTHEST_M = 1000
 
-# Power cells above the sensing threshold; with the distances they form the grid of the success table.
+# Power cells above the sensing threshold; with the distances they form the grid of the success
+# table.
 CELLS = 160
 
 
 @dataclass(frozen=True)
 class Sidelink(Transceiver):
-    """The common part of LTE Mode 4 and NR Mode 2; its fields and `Transceiver`'s are settings of both."""
+    """The common part of LTE Mode 4 and NR Mode 2;
+    its fields and `Transceiver`'s are settings of both.
+    """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second
     # probability that a vehicle keeps its resource when it might choose a new one
     keep: Annotated[float, between(0, 1)] = 0.0
-    # how often every vehicle sends each block (blind repetition). Given the link's shadowing, copies are
-    # received independently, and not combined
+    # how often every vehicle sends each block (blind repetition). Given the link's shadowing,
+    # copies are received independently, and not combined
     transmissions: Annotated[int, between(1, 100)] = 1
     t1_slots: Annotated[int, between(0, 10000)] = 1  # first slot of the selection window
-    # last slot. A message takes a random slot of the window (one-shot), since a triggered message has no
-    # reservation
+    # last slot. A message takes a random slot of the window (one-shot), since a triggered message
+    # has no reservation
     t2_slots: Annotated[int, between(0, 10000)] = 100
 
     # Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4).
@@ -92,10 +96,13 @@ class Sidelink(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the share of background packets received, averaged over shadowing, `(n,)` (6).
 
-        Without `sight`, no building stands between, and vehicles do with the environment's probability.
+        Without `sight`, no building stands between,
+        and vehicles do with the environment's probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
-        success = np.array([np.interp(distance_m, _DISTANCE_M, column) for column in _success(self).T]).T
+        success = np.array(
+            [np.interp(distance_m, _DISTANCE_M, column) for column in _success(self).T]
+        ).T
         received: Floats = 1 - (1 - success) ** self.transmissions
         return np.asarray(np.sum(self._shares(distance_m, sight) * received, axis=-1))
 
@@ -138,20 +145,32 @@ class Sidelink(Transceiver):
         return Scheduling(
             per_m=self.density_per_km / 1000 * self.transmissions,
             resources=self.blocks_per_slot / (self.slot_s * self.rate_hz),
-            # A vehicle may choose a new resource once a second (5 to 15 packets at 10 Hz, 10 to 30 at 20 Hz).
+            # A vehicle may choose a new resource once a second (5 to 15 packets at 10 Hz, 10 to 30
+            # at 20 Hz).
             forgotten=min(1.0, (1 - self.keep) / self.rate_hz),
             sensed=self._sensed,
             threshold_dbm=self.sensing_dbm,
         )
 
-    def _states(self, distance_m: Floats, sight: Ints | int | None) -> list[tuple[Floats, Floats, float]]:
-        """Return for each kind of obstacle: share `(n,)`, mean received power `(n,)` and deviation in dB."""
+    def _states(
+        self, distance_m: Floats, sight: Ints | int | None
+    ) -> list[tuple[Floats, Floats, float]]:
+        """Return for each kind of obstacle:
+        share `(n,)`, mean received power `(n,)` and deviation in dB.
+        """
         clear = self.clear_probability(distance_m)
         shares = {CLEAR: clear, VEHICLE: 1 - clear}
         if sight is not None:
-            shares = {state: (sight == state) * np.ones_like(clear) for state in (CLEAR, VEHICLE, BUILDING)}
+            shares = {
+                state: (sight == state) * np.ones_like(clear)
+                for state in (CLEAR, VEHICLE, BUILDING)
+            }
         return [
-            (share, self.received_dbm(self.path_loss_db(distance_m, state)), float(self.shadowing_db(state)))
+            (
+                share,
+                self.received_dbm(self.path_loss_db(distance_m, state)),
+                float(self.shadowing_db(state)),
+            )
             for state, share in shares.items()
             if share.any()
         ]
@@ -159,10 +178,14 @@ class Sidelink(Transceiver):
     def _sensed(self, distance_m: Floats, threshold_dbm: float) -> Floats:
         """Return the share of packets from these distances that are above a threshold (11)."""
         states = self._states(distance_m, None)
-        return np.asarray(sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states))
+        return np.asarray(
+            sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states)
+        )
 
     def _shares(self, distance_m: Floats, sight: Ints | int | None) -> Floats:
-        """Return the shares of the power cells, `(n, CELLS)`; the rest to 1 is below the threshold (10)."""
+        """Return the shares of the power cells, `(n, CELLS)`;
+        the rest to 1 is below the threshold (10).
+        """
         edges = self.sensing_dbm + STEP_DB * np.arange(CELLS + 1)
         edges[-1] = np.inf
         states = self._states(distance_m, sight)
@@ -175,7 +198,9 @@ _DISTANCE_M: Floats = np.arange(0.0, FURTHEST_M + STEP_M, STEP_M)
 
 @lru_cache(maxsize=64)
 def _success(radio: Sidelink) -> Floats:
-    """Return the share of sensed packets that are received, by distance and received power, `(D, CELLS)`."""
+    """Return the share of sensed packets that are received, by distance and received power,
+    `(D, CELLS)`.
+    """
     power_dbm: Floats = radio.sensing_dbm + STEP_DB * (np.arange(CELLS, dtype=np.float64) + 0.5)
     noise_lost = radio.block_error(power_dbm - radio.noise_dbm)
     shares = radio._shares(_DISTANCE_M, None) * (1 - noise_lost)
@@ -187,7 +212,10 @@ def _success(radio: Sidelink) -> Floats:
     scheduling = radio._scheduling()
     busy = min(max(2 * scheduling.busy_ratio - 0.4, 0.0), 1.0) if radio.ranks else 1.0  # (22)
     free, free_on_average = np.zeros(shares.shape), np.zeros(len(shares))
-    for weight, same in ((busy, scheduling.same_by_exclusion), (1 - busy, scheduling.same_by_ranking)):
+    for weight, same in (
+        (busy, scheduling.same_by_exclusion),
+        (1 - busy, scheduling.same_by_ranking),
+    ):
         if weight:
             # Interferers stand on both sides of the receiver (14, 15).
             sides = [
@@ -199,8 +227,9 @@ def _success(radio: Sidelink) -> Floats:
             free += weight * np.array(for_each)
             mean_hit = shares @ hit
             free_on_average += weight * _none(*(side * mean_hit for side in sides))
-    # The source multiplies the interferers' average collisions. A link's own power is the same against all of
-    # them, so the average of the products is a little larger; it is scaled to the source's curve.
+    # The source multiplies the interferers' average collisions. A link's own power is the same
+    # against all of them, so the average of the products is a little larger; it is scaled to the
+    # source's curve.
     average_free = np.sum(shares * free, axis=-1)
     scale = np.where(average_free > 0, free_on_average / np.maximum(average_free, 1e-300), 1.0)
     free *= scale[:, None]
@@ -215,15 +244,19 @@ def _none(left: Floats, right: Floats) -> Floats:
 
 
 def _hit(radio: Sidelink, power_dbm: Floats, noise_lost: Floats, interferers_m: Floats) -> Floats:
-    """Return the probability that an interferer on the same resource destroys a packet, `(P, K)` (17, 18).
+    """Return the probability that an interferer on the same resource destroys a packet,
+    `(P, K)` (17, 18).
 
-    Packets that noise would destroy are excluded. The interferer's shadowing is integrated with 15 nodes.
+    Packets that noise would destroy are excluded.
+    The interferer's shadowing is integrated with 15 nodes.
     """
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
     lost = np.zeros((len(power_dbm), len(interferers_m)))
     for share, mean_dbm, deviation_db in radio._states(interferers_m, None):
         interference_mw = 10 ** ((mean_dbm[:, None] + deviation_db * nodes) / 10)
         noise_db = 10 * np.log10(interference_mw + 10 ** (radio.noise_dbm / 10))
-        lost += share * (radio.block_error(power_dbm[:, None, None] - noise_db) @ (weights / weights.sum()))
+        lost += share * (
+            radio.block_error(power_dbm[:, None, None] - noise_db) @ (weights / weights.sum())
+        )
     left = 1 - noise_lost[:, None]
     return np.where(left > 0, (lost - noise_lost[:, None]) / np.where(left > 0, left, 1.0), 0.0)

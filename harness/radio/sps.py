@@ -1,9 +1,10 @@
-"""Semi-persistent scheduling on a sidelink: how many resources are taken, and how often two vehicles collide.
+"""Semi-persistent scheduling on a sidelink:
+how many resources are taken, and how often two vehicles collide.
 
-Vehicles stand evenly along a road, all send at one rate, and each chooses at random from the resources that
-it has not sensed as taken. Equation numbers are those of Gonzalez-Martin, Sepulcre, Molina-Masegosa and
-Gozalvez, "Analytical Models of the Performance of C-V2X Mode 4 Vehicular Communications", IEEE TVT 68(2),
-2019.
+Vehicles stand evenly along a road, all send at one rate, and each chooses at random from the
+resources that it has not sensed as taken. Equation numbers are those of Gonzalez-Martin, Sepulcre,
+Molina-Masegosa and Gozalvez, "Analytical Models of the Performance of C-V2X Mode 4 Vehicular
+Communications", IEEE TVT 68(2), 2019.
 """
 
 from collections.abc import Callable
@@ -29,11 +30,11 @@ class Scheduling:
 
     per_m: float  # packets that the vehicles on one metre of road send in a period
     resources: float  # number of resources in a period (28)
-    # share of the choices in which a vehicle that could sense another does not know of the other's choice,
-    # since both were made anew within one period (24)
+    # share of the choices in which a vehicle that could sense another does not know of the other's
+    # choice, since both were made anew within one period (24)
     forgotten: float
-    # share of the packets of a vehicle so many metres away whose power is above a threshold in dBm (11), for
-    # an array of metres; the second argument is the threshold
+    # share of the packets of a vehicle so many metres away whose power is above a threshold in dBm
+    # (11), for an array of metres; the second argument is the threshold
     sensed: Callable[[Floats, float], Floats]
     threshold_dbm: float  # sensing threshold of a receiver
 
@@ -42,16 +43,18 @@ class Scheduling:
         return self._taken(self.threshold_dbm, 1) / self.resources
 
     def same_by_exclusion(self, apart_m: Floats) -> Floats:
-        """Return the probability that a vehicle `apart_m` away takes the same resource, by Step 2 (23).
+        """Return the probability that a vehicle `apart_m` away takes the same resource,
+        by Step 2 (23).
 
-        Both exclude the resources that they sense. The source does not limit them; at most 80 % can be
-        excluded.
+        Both exclude the resources that they sense. The source does not limit them;
+        at most 80 % can be excluded.
         """
         taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
         return self._same(apart_m, taken, self.threshold_dbm)
 
     def same_by_ranking(self, apart_m: Floats) -> Floats:
-        """Return the same probability if both then keep the fifth of the resources with the least power.
+        """Return the same probability if both then keep the fifth of the resources with the least
+        power.
 
         Step 3, (31) to (33): as if the threshold had been raised until only these were left.
         """
@@ -66,10 +69,11 @@ class Scheduling:
         return taken(packets, self.resources)
 
     def _same(self, apart_m: Floats, taken: float, threshold_dbm: float) -> Floats:
-        """Apply (24) to (27) and (30): the nearer two vehicles are, the more remaining resources they share.
+        """Apply (24) to (27) and (30):
+        the nearer two vehicles are, the more remaining resources they share.
 
-        The result is at least that of two vehicles that sense independently; the source's equations fall
-        below that at a busy ratio of about 0.75 and more.
+        The result is at least that of two vehicles that sense independently; the source's equations
+        fall below that at a busy ratio of about 0.75 and more.
         """
         sensed = self.sensed(METRES, self.threshold_dbm)
         size = 2 * sensed.size - 1
@@ -87,9 +91,11 @@ class Scheduling:
 
 
 def taken(packets: float, resources: float) -> float:
-    """Return the resources taken by packets (29): half of them do not overlap, the others fall at random.
+    """Return the resources taken by packets (29):
+    half of them do not overlap, the others fall at random.
 
-    There are never more than `resources`; the equation does not state that, but it holds in its range.
+    There are never more than `resources`;
+    the equation does not state that, but it holds in its range.
     """
     half = packets / 2
     free = resources - half

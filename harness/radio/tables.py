@@ -9,7 +9,8 @@ from pathlib import Path
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
 
-DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 1")  # the most, and in words
+# the most, and in words
+DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 1")
 
 
 def rows_of(
@@ -17,7 +18,8 @@ def rows_of(
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Return the columns of a CSV, and its rows, each with the number of its line.
 
-    Raises UserError if it is no table, lacks a column that is `needed`, or has one that is not `known`.
+    Raises UserError if it is no table, lacks a column that is `needed`,
+    or has one that is not `known`.
     """
     shown = printable(path)
     try:
@@ -39,7 +41,9 @@ def rows_of(
 def number_of(
     where: str, row: dict[str, str], column: str, most: float, allowed: str, least: float = 0.0
 ) -> float:
-    """Return the number in a column of a row. Raises UserError, with what is `allowed`, for any other."""
+    """Return the number in a column of a row.
+    Raises UserError, with what is `allowed`, for any other.
+    """
     try:
         value = float(row[column])
     except (TypeError, ValueError):

@@ -1,10 +1,11 @@
-"""A channel from a user's table of packet reception by distance, such as a run of ns-3 or Veins gives.
+"""A channel from a user's table of packet reception by distance,
+such as a run of ns-3 or Veins gives.
 
-The table is a CSV file with the columns `distance_m` and `reception` (share of packets received), and
-optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and latencies: `latency_ms`, or
-their median `latency_p50_ms` and 95th percentile `latency_p95_ms`. A latency may be blank or `nan` where
-nothing is received. Values are interpolated linearly between distances; below the first distance its values
-hold, and beyond the last its latencies.
+The table is a CSV file with the columns `distance_m` and `reception` (share of packets received),
+and optionally `sight` (`clear`, `vehicle` or `building`, with a curve for each) and latencies:
+`latency_ms`, or their median `latency_p50_ms` and 95th percentile `latency_p95_ms`. A latency may
+be blank or `nan` where nothing is received. Values are interpolated linearly between distances;
+below the first distance its values hold, and beyond the last its latencies.
 """
 
 import math
@@ -74,16 +75,17 @@ class Table:
 class Trace:
     """A channel with the reception of a table.
 
-    The table is averaged over shadowing and for one packet size, so a link's own shadowing and a message's
-    bits change nothing, and replies do not wait for each other. A request reaches each helper after the
-    latency of its own distance. Between two percentiles a message's latency is drawn from the lognormal
-    distribution that has them; that it is lognormal, and that messages draw independently, is assumed.
+    The table is averaged over shadowing and for one packet size, so a link's own shadowing and a
+    message's bits change nothing, and replies do not wait for each other. A request reaches each
+    helper after the latency of its own distance. Between two percentiles a message's latency is
+    drawn from the lognormal distribution that has them; that it is lognormal, and that messages
+    draw independently, is assumed.
     """
 
     receptions: Table  # the table
     latency_s: Seconds = 0.025  # latency of each message if the table has none
-    # reception beyond the last distance: `zero`, since a table usually ends where packets are no longer
-    # received, or `held`, that of the last row, for a table that ends early
+    # reception beyond the last distance: `zero`, since a table usually ends where packets are no
+    # longer received, or `held`, that of the last row, for a table that ends early
     beyond: Literal["zero", "held"] = "zero"
     decorrelation_m: ClassVar[float] = math.inf
 
@@ -97,7 +99,9 @@ class Trace:
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Helpers have a request after the latency of their own links; its time on air is not known."""
+        """Helpers have a request after the latency of their own links;
+        its time on air is not known.
+        """
         return Broadcast(math.nan, math.nan)
 
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
@@ -153,13 +157,16 @@ class Trace:
 
 
 def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
-    """Build the channel of a profile that names a `file` beside it. Raises UserError if it is wrong."""
+    """Build the channel of a profile that names a `file` beside it.
+    Raises UserError if it is wrong.
+    """
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
     path = folder / parameters["file"]
     if not path.resolve().is_relative_to(folder.resolve()):  # a profile may come from others
         raise UserError(
-            f"{where}: file {printable(parameters['file'])!r} lies elsewhere; put it beside the profile"
+            f"{where}: file {printable(parameters['file'])!r} lies elsewhere; put it beside the "
+            "profile"
         )
     points = read(path)
     table = Table(parameters["file"], sha256_file(path, "text"), points)
@@ -168,7 +175,9 @@ def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Tra
 
 
 def read(path: Path) -> tuple[Point, ...]:
-    """Read the rows of a table, sorted by sight and distance. Raises UserError if the table is wrong."""
+    """Read the rows of a table, sorted by sight and distance.
+    Raises UserError if the table is wrong.
+    """
     shown = printable(path)
     columns, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
     _refuse_mixed_latencies(shown, columns)
@@ -178,11 +187,15 @@ def read(path: Path) -> tuple[Point, ...]:
     sights = {p.sight for p in points}
     if sights != {None} and sights != {*SIGHTS}:
         lacks = next(name for name in SIGHTS if name not in sights)
-        raise UserError(f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}")
+        raise UserError(
+            f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}"
+        )
     points = _with_latencies(sorted(points, key=_place))
     for a, b in pairwise(points):
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
-            raise UserError(f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once")
+            raise UserError(
+                f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once"
+            )
     return tuple(points)
 
 
@@ -193,20 +206,26 @@ def _place(point: Point) -> tuple[int, float]:
 def _refuse_mixed_latencies(shown: str, columns: Sequence[str]) -> None:
     has = [name for name in SPREAD if name in columns]
     if has and MEAN in columns:
-        raise UserError(f"{shown}: has both {MEAN} and {has[0]}; give {MEAN}, or {' and '.join(SPREAD)}")
+        raise UserError(
+            f"{shown}: has both {MEAN} and {has[0]}; give {MEAN}, or {' and '.join(SPREAD)}"
+        )
     if len(has) == 1:
         lacks = next(name for name in SPREAD if name not in has)
         raise UserError(f"{shown}: has {has[0]} without {lacks}; add {lacks}, or give {MEAN} alone")
 
 
 def _with_latencies(points: Sequence[Point]) -> list[Point]:
-    """Give points where nothing is received, which have no latency of their own, that of a point beside them.
+    """Give points where nothing is received, which have no latency of their own,
+    that of a point beside them.
 
-    Reception is interpolated, so that something is received next to them. The point before them comes first,
-    so that no row changes what is nearer. Points are sorted by sight and distance.
+    Reception is interpolated, so that something is received next to them. The point before them
+    comes first, so that no row changes what is nearer. Points are sorted by sight and distance.
     """
     known = [point for point in points if not _blank(point)]
-    return [point._replace(latency_s=_beside(point, known)) if _blank(point) else point for point in points]
+    return [
+        point._replace(latency_s=_beside(point, known)) if _blank(point) else point
+        for point in points
+    ]
 
 
 def _blank(point: Point) -> bool:
@@ -214,11 +233,18 @@ def _blank(point: Point) -> bool:
 
 
 def _beside(point: Point, known: Iterable[Point]) -> float | Spread | None:
-    """Return the latency of the point before, else after; where this sight has none, of the next sight."""
+    """Return the latency of the point before, else after;
+    where this sight has none, of the next sight.
+    """
 
     def how_far(other: Point) -> tuple[bool, int, bool, float]:
         after = other.distance_m > point.distance_m
-        return other.sight != point.sight, _place(other)[0], after, abs(other.distance_m - point.distance_m)
+        return (
+            other.sight != point.sight,
+            _place(other)[0],
+            after,
+            abs(other.distance_m - point.distance_m),
+        )
 
     nearest = min(known, key=how_far, default=None)
     return nearest and nearest.latency_s

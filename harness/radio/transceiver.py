@@ -1,4 +1,6 @@
-"""The base of radio models with background traffic: a power budget, and requests and replies over it."""
+"""The base of radio models with background traffic:
+a power budget, and requests and replies over it.
+"""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -38,7 +40,9 @@ class Transceiver(Propagation, Physical):
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Return the seconds from the wish to send until sending begins: the quantiles at these draws."""
+        """Return the seconds from the wish to send until sending begins:
+        the quantiles at these draws.
+        """
 
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
@@ -51,23 +55,31 @@ class Transceiver(Propagation, Physical):
 
     @abstractmethod
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Any:
-        """Return the part of the losses at these received powers that does not depend on message size."""
+        """Return the part of the losses at these received powers that does not depend on message
+        size.
+        """
 
     @abstractmethod
     def _lost(self, fate: Any, bits: Floats | float) -> Floats:
-        """Return the probability that a message of so many bits is lost, given the result of `_fate`."""
+        """Return the probability that a message of so many bits is lost,
+        given the result of `_fate`.
+        """
 
     @abstractmethod
     def _turns(
         self, links: Links, begins_s: Floats, airtime_s: Floats, uniforms: Floats, replied: Bools
     ) -> tuple[Bools, Floats]:
-        """Resolve how replies affect each other: which survive, and when each has ended, all `(..., H)`.
+        """Resolve how replies affect each other:
+        which survive, and when each has ended, all `(..., H)`.
 
-        `uniforms` are the draws that chose when each begins; `replied` says which helpers have the request.
+        `uniforms` are the draws that chose when each begins;
+        `replied` says which helpers have the request.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost on each link, `(..., H)`; any for absent helpers."""
+        """Return the probability that a message is lost on each link, `(..., H)`;
+        any for absent helpers.
+        """
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
@@ -77,7 +89,9 @@ class Transceiver(Propagation, Physical):
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         fate = self._fate_at(links.where, draws.shadow(links.where.xy_m, self.decorrelation_m))
-        request_loss, loss = (self._lost(fate, bits) for bits in (links.request_bits, links.payload_bits))
+        request_loss, loss = (
+            self._lost(fate, bits) for bits in (links.request_bits, links.payload_bits)
+        )
         airtime_s = self.message_s(links.payload_bits)
         replied = links.asked & (draws.packet[..., 0] >= request_loss)
         begins_s = links.ready_s + self.wait_s(draws.jitter)
@@ -91,10 +105,16 @@ class Transceiver(Propagation, Physical):
         mean_dbm = self.received_dbm(self.path_loss_db(site.distance_m, *site.between))
         return self._fate(site.distance_m, mean_dbm + self.shadowing_db(*site.between) * shadow)
 
-    def _read(self, table: Floats, distance_m: Floats, power_dbm: Floats, first_db: float) -> Floats:
-        """Interpolate a table `(D, P)` whose first column is `first_db` above the sensing threshold."""
+    def _read(
+        self, table: Floats, distance_m: Floats, power_dbm: Floats, first_db: float
+    ) -> Floats:
+        """Interpolate a table `(D, P)` whose first column is `first_db` above the sensing
+        threshold.
+        """
         from scipy.ndimage import map_coordinates
 
-        at = np.broadcast_arrays(distance_m / STEP_M, (power_dbm - self.sensing_dbm - first_db) / STEP_DB)
+        at = np.broadcast_arrays(
+            distance_m / STEP_M, (power_dbm - self.sensing_dbm - first_db) / STEP_DB
+        )
         # An absent helper has NaN coordinates, but the table must be read somewhere.
         return map_coordinates(table, np.nan_to_num(at), order=1, mode="nearest")

@@ -5,7 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats, Ints, check_shape, numbers, read_only
-from harness.radio.channel import REQUEST, Broadcast, ByLink, Channel, Delivery, Draws, Links, Physical, Site
+from harness.radio.channel import (
+    REQUEST,
+    Broadcast,
+    ByLink,
+    Channel,
+    Delivery,
+    Draws,
+    Links,
+    Physical,
+    Site,
+)
 
 
 @dataclass(frozen=True)
@@ -45,9 +55,11 @@ def is_ours(channel: Channel) -> bool:
 
 
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
-    """Let a channel deliver. A package's cannot write to what it gets, and what it returns is checked.
+    """Let a channel deliver. A package's cannot write to what it gets,
+    and what it returns is checked.
 
-    Raises ValueError if that has a wrong shape or type, or states what cannot be of helpers that were asked.
+    Raises ValueError if that has a wrong shape or type,
+    or states what cannot be of helpers that were asked.
     """
     if is_ours(channel):
         return channel.deliver(links, draws)
@@ -84,7 +96,9 @@ def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast
 
 
 def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) -> Floats:
-    """Return when each receiver has a broadcast, `(..., H)`, or `(..., 1)` if all have it at once."""
+    """Return when each receiver has a broadcast, `(..., H)`,
+    or `(..., 1)` if all have it at once.
+    """
     model = innermost(channel)
     if isinstance(model, ByLink):
         if is_ours(model):
@@ -96,7 +110,9 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """A physical channel that loses every transmission with one probability, wherever its ends are."""
+    """A physical channel that loses every transmission with one probability,
+    wherever its ends are.
+    """
 
     probability: float  # probability that one transmission is lost
 

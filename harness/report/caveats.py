@@ -1,4 +1,6 @@
-"""What must be said before a run's numbers, a function a sentence; `findings` has them in their order."""
+"""What must be said before a run's numbers, a function a sentence;
+`findings` has them in their order.
+"""
 
 import math
 from collections import Counter
@@ -29,13 +31,17 @@ _FAILED = {
     "merge": ("the fusion calls'", "the ego keeps the policy it had without them"),
 }
 _CONTROLS = {
-    "shuffled": "what helpers say in another layout, while a decision's page shows what its own helpers say",
+    "shuffled": "what helpers say in another layout, while a "
+    "decision's page shows what its own helpers "
+    "say",
     "blind": "helpers that are shown nothing",
 }
 
 
 def looked_at(run: Run) -> Iterator[str]:
-    """Yield when a run was looked at, and which of its intervals hold though it may have stopped early."""
+    """Yield when a run was looked at, and which of its intervals hold though it may have stopped
+    early.
+    """
     looks = run.manifest.world.looks
     if looks is None:
         return
@@ -51,8 +57,10 @@ def looked_at(run: Run) -> Iterator[str]:
         else f"It took {every}, and still it is not so that"
     )
     yield (
-        f"{how} {what} in every condition. It was looked at {amount(len(looks.at), 'time')}: intervals of "
-        "success and of its gain hold at every look; all others are for a number of layouts fixed before, "
+        f"{how} {what} in every condition. It was looked at {amount(len(looks.at), 'time')}: "
+        "intervals of "
+        "success and of its gain hold at every look; all others are for a number of layouts fixed "
+        "before, "
         "and too narrow."
     )
 
@@ -96,22 +104,30 @@ def few(run: Run) -> Iterator[str]:
 
 
 def saturated(run: Run) -> Iterator[str]:
-    """Yield each half of balanced success that is 0 or 100 % under every condition, as it can say nothing."""
-    for name, where in zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True):
+    """Yield each half of balanced success that is 0 or 100 % under every condition,
+    as it can say nothing.
+    """
+    for name, where in zip(
+        entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True
+    ):
         scores = [run.score(condition, name) for condition in run.conditions]
         values = {None if score is None else score.value for score in scores}
         if values in ({0.0}, {1.0}) and len(scores) > 1:
             same = PERCENT.text(values.pop())
             layouts = amount(max(score.n for score in scores if score), "layout")
             yield (
-                f"{where}, success is {same} under every condition in {layouts}: none changes that half of "
-                "the balance here. In other layouts one may, by as much as the interval of its gain says."
+                f"{where}, success is {same} under every condition in {layouts}: none changes that "
+                "half of "
+                "the balance here. In other layouts one may, by as much as the interval of its "
+                "gain says."
             )
 
 
 def earlier_gains(run: Run) -> Iterator[str]:
     """Yield that gains have the intervals of older rules."""
-    if any(score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores):
+    if any(
+        score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores
+    ):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
 
 
@@ -178,7 +194,8 @@ def unmeasured(run: Run) -> Iterator[str]:
     if all(e.short_ttc is None for e in run.episodes):
         older = "dataset" if run.world == "frozen" else "run"
         yield (
-            f"Time to collision and post-encroachment time are unknown: this {older} is older than these "
+            f"Time to collision and post-encroachment time are unknown: this {older} is older than "
+            "these "
             "measures."
         )
 
@@ -215,19 +232,27 @@ def of_extensions(run: Run) -> Iterator[str]:
 
 
 def by_letter(run: Run) -> Iterator[str]:
-    """Yield whose read-outs follow the letter more than all else, where they were read over cyclic orders."""
+    """Yield whose read-outs follow the letter more than all else,
+    where they were read over cyclic orders.
+    """
     for role, (whose, _) in _FAILED.items():
-        share, follows = (run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter"))
+        share, follows = (
+            run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter")
+        )
         if share and follows and (share.value or 0.0) > MOST_SHARE:
             yield (
-                f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the letter and "
-                f"not the action: one letter is the likeliest in every order in {_hits(follows)} of "
+                f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the "
+                "letter and "
+                f"not the action: one letter is the likeliest in every order in {_hits(follows)} "
+                "of "
                 f"{follows.n}. The average over the orders cancels that, and adds no judgement."
             )
 
 
 def unheard(run: Run) -> Iterator[str]:
-    """Yield the conditions under which replies arrive, and every one of them too late to be heard."""
+    """Yield the conditions under which replies arrive,
+    and every one of them too late to be heard.
+    """
     d = run.decisions
     delivered, on_time = (d.of_messages(name) == 1.0 for name in ("delivered", "on_time"))
     conditions = d.codes("condition", run.conditions)
@@ -235,40 +260,52 @@ def unheard(run: Run) -> Iterator[str]:
         arrived = int(delivered[conditions == place].sum())
         if arrived and not on_time[conditions == place].any():
             yield (
-                f"Under {printable(name)}, nobody is heard: of {arrived} messages that arrived, none came "
+                f"Under {printable(name)}, nobody is heard: of {arrived} messages that arrived, "
+                "none came "
                 "within the decision window, so that the ego decided alone."
             )
 
 
 def lost_at_once(run: Run) -> Iterator[str]:
-    """That episodes are lost before the ego's first action, so that no model could have saved them."""
+    """That episodes are lost before the ego's first action,
+    so that no model could have saved them.
+    """
     world = run.manifest.world
     if isinstance(world, ClosedLoop):
         lag_s = world.scenario["parameters"].get("decision_lag_s", Parameters.decision_lag_s)
     else:
         lag_s = world.decision_lag_s
-    ended = [(e.episode, e.failure == "collision" and (e.time_s or math.inf) <= lag_s) for e in run.episodes]
+    ended = [
+        (e.episode, e.failure == "collision" and (e.time_s or math.inf) <= lag_s)
+        for e in run.episodes
+    ]
     lost = {episode for episode, at_once in ended if at_once}
     lost -= {episode for episode, at_once in ended if not at_once}
     if lost:
         yield (
-            f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first action, in a "
+            f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first "
+            "action, in a "
             "collision that no answer could prevent."
         )
 
 
 def moved_system(run: Run) -> Iterator[str]:
-    """Yield whose system text stands in the first user turn, since the chat template has no place for it."""
+    """Yield whose system text stands in the first user turn,
+    since the chat template has no place for it.
+    """
     models = [agent["model"] for agent in (run.manifest.agent(0), *run.manifest.helpers)]
     for name in dict.fromkeys(str(model["name"]) for model in models if model.get("system")):
         yield (
-            f"{printable(name, 30)} reads the system text at the beginning of the first user turn: its chat "
+            f"{printable(name, 30)} reads the system text at the beginning of the first user turn: "
+            "its chat "
             "template has no place for a system message."
         )
 
 
 def on_device(run: Run) -> Iterator[str]:
-    """Whose answers, and on what computer, the times and the joules of a run with a device profile are of."""
+    """Whose answers, and on what computer,
+    the times and the joules of a run with a device profile are of.
+    """
     manifest = run.manifest
     if (device := manifest.device_profile) is None:
         return
@@ -277,25 +314,34 @@ def on_device(run: Run) -> Iterator[str]:
         name = str(agent["model"]["name"])
         if name.partition(":")[0] != speed.model:
             yield (
-                f"Times and energy are conditional: the token counts are those of {printable(name, 30)}, the "
+                "Times and energy are conditional: the token counts are those of "
+                f"{printable(name, 30)}, the "
                 f"speed is that of {printable(speed.model)} on {printable(device.name)}."
             )
 
 
 def beyond_sources(run: Run) -> Iterator[str]:
-    """Yield conditions whose radio has settings that its model's source never held against anything."""
+    """Yield conditions whose radio has settings that its model's source never held against
+    anything.
+    """
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"
 
 
 def no_prompt(runs: Mapping[str, Run]) -> list[str]:
-    """A sentence about the models that read no prompt, and one about those that look at nothing either."""
+    """A sentence about the models that read no prompt,
+    and one about those that look at nothing either.
+    """
     manifests = [run.manifest for run in runs.values()]
     rules: dict[str, list[tuple[str, str]]] = {"by the scene graph": [], "without looking": []}
-    for agent in (agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)):
+    for agent in (
+        agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)
+    ):
         name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))
         if not reads_prompts(engine):
-            how = "without looking" if engine == "driver" and name in BLIND else "by the scene graph"
+            how = (
+                "without looking" if engine == "driver" and name in BLIND else "by the scene graph"
+            )
             rules[how].append((printable(name, 30), printable(str(agent["prompt"]["version"]), 20)))
     return [_no_prompt(how, *zip(*of, strict=True)) for how, of in rules.items() if of]
 
@@ -305,4 +351,7 @@ def _no_prompt(how: str, models: Sequence[str], prompts: Sequence[str]) -> str:
     versions = " or ".join(dict.fromkeys(prompts))
     if not names:
         return f"{last} reads no prompt: it decides {how}, whatever {versions} says."
-    return f"{', '.join(names)} and {last} read no prompt: they decide {how}, whatever {versions} says."
+    return (
+        f"{', '.join(names)} and {last} read no prompt: they decide {how}, whatever {versions} "
+        "says."
+    )

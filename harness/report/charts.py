@@ -1,7 +1,8 @@
-"""The report's charts, as Vega-Lite specifications: https://vega.github.io/vega-lite/docs/spec.html.
+"""The report's charts, as Vega-Lite specifications:
+https://vega.github.io/vega-lite/docs/spec.html.
 
-Colours are those of the palette (`drawing/colours.py`), and shape or place says the same again. What is drawn
-in `currentColor` is light on dark and dark on light.
+Colours are those of the palette (`drawing/colours.py`), and shape or place says the same again.
+What is drawn in `currentColor` is light on dark and dark on light.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,14 +16,29 @@ Rows = Sequence[Mapping[str, Any]]
 
 # Vega keeps some groups by name in JavaScript objects, in which these are there from the start.
 TAKEN = {
-    "__proto__", "constructor", "hasOwnProperty", "isPrototypeOf", "propertyIsEnumerable", "toLocaleString",
-    "toString", "valueOf", "__defineGetter__", "__defineSetter__", "__lookupGetter__", "__lookupSetter__",
-}  # fmt: skip
+    "__proto__",
+    "constructor",
+    "hasOwnProperty",
+    "isPrototypeOf",
+    "propertyIsEnumerable",
+    "toLocaleString",
+    "toString",
+    "valueOf",
+    "__defineGetter__",
+    "__defineSetter__",
+    "__lookupGetter__",
+    "__lookupSetter__",
+}
 RULE: Spec = {"type": "rule", "color": "currentColor", "strokeDash": [4, 3]}
 NAME: Spec = {
-    "type": "text", "align": "left", "dx": 4, "dy": -8, "color": "currentColor", "opacity": 0.8,
+    "type": "text",
+    "align": "left",
+    "dx": 4,
+    "dy": -8,
+    "color": "currentColor",
+    "opacity": 0.8,
     "fontSize": 10.5,
-}  # fmt: skip
+}
 FOOT: Spec = {"y": {"value": "height"}}
 RUN = "run"  # name of the parameter that chooses one of several runs
 NUMBER: Spec = {"type": "quantitative"}
@@ -32,9 +48,13 @@ VERDICTS = {"strict": [GOOD], "recovered": [LATE], "failed": FAILURES}
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
 ENERGIES = {"ego's inference": ROLES["ego"], "helpers' inference": ROLES["helper"], "radios": BAD}
 TIMES = {
-    "inference": PALE, "reply on time": GOOD, "reply late": LATE, "reply lost": BAD,
-    "fusion": ROLES["fusion"], "decision": GREY,
-}  # fmt: skip
+    "inference": PALE,
+    "reply on time": GOOD,
+    "reply late": LATE,
+    "reply lost": BAD,
+    "fusion": ROLES["fusion"],
+    "decision": GREY,
+}
 APART = 0.05  # of success between two names of lines, the height of one
 # The paper's table of operating points: ms and success rate.
 PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.941)}
@@ -43,13 +63,16 @@ PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.
 def success_latency(
     rows: Rows, references: Mapping[str, float], window_ms: Sequence[float], label: str
 ) -> Spec:
-    """Draw success over latency, a point a run and condition, and the paper's; references are lines.
+    """Draw success over latency, a point a run and condition, and the paper's;
+    references are lines.
 
     `label` is what leads, in words.
     """
     untitled = {"legend": {"orient": "top", "title": None}}
     condition = condition_colours(rows) | untitled
-    shape = shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition") | untitled
+    shape = (
+        shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition") | untitled
+    )
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", f"{label} rate")
     present = {key for row in rows for key, value in row.items() if value is not None}
     along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
@@ -74,7 +97,13 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
         for name in conditions
         if name in PAPER
     ]
-    ring = {"type": "point", "shape": "circle", "filled": False, "size": 60, "color": "currentColor"}
+    ring = {
+        "type": "point",
+        "shape": "circle",
+        "filled": False,
+        "size": 60,
+        "color": "currentColor",
+    }
     text = {key: value for key, value in NAME.items() if key != "dy"} | {"dx": 7}
     tip = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
     layer = [
@@ -85,9 +114,12 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
-    """Return a dashed line for each value; names of lines too near for one each stand above the highest."""
+    """Return a dashed line for each value;
+    names of lines too near for one each stand above the highest.
+    """
     lines: list[dict[str, Any]] = [
-        {"reference": name, "success": success[name]} for name in sorted(success, key=lambda n: -success[n])
+        {"reference": name, "success": success[name]}
+        for name in sorted(success, key=lambda n: -success[n])
     ]
     names: list[dict[str, Any]] = []
     for above, line in zip([None, *lines], lines, strict=False):
@@ -100,7 +132,11 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
     named = {"y": y, "x": {"value": "width"}, "text": {"field": "named"}}
     return {
         "layer": [
-            {"data": {"values": lines}, "mark": {**RULE, "opacity": 0.6}, "encoding": {"y": y, **tip}},
+            {
+                "data": {"values": lines},
+                "mark": {**RULE, "opacity": 0.6},
+                "encoding": {"y": y, **tip},
+            },
             {"data": {"values": names}, "mark": text, "encoding": named},
         ]
     }
@@ -109,7 +145,10 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 def statuses(rows: Rows) -> Spec:
     """Draw statuses of answers, a stacked bar a run and role."""
     # A run's file may say anything; what is no verdict is no answer.
-    met = {(v if (v := row["verdict"]) in VERDICTS else "failed", str(row["status"])): None for row in rows}
+    met = {
+        (v if (v := row["verdict"]) in VERDICTS else "failed", str(row["status"])): None
+        for row in rows
+    }
     colours = {
         status: shades[n % len(shades)]
         for verdict, shades in VERDICTS.items()
@@ -119,7 +158,9 @@ def statuses(rows: Rows) -> Spec:
 
 
 def policies(actions: Sequence[str]) -> Spec:
-    """Return one decision's distributions around fusion; the page fills in `values`: who, what, action, p."""
+    """Return one decision's distributions around fusion; the page fills in `values`:
+    who, what, action, p.
+    """
     scale = {"domain": list(actions), "range": list(colours.actions(actions).values())}
     return {
         **BASE,
@@ -130,16 +171,21 @@ def policies(actions: Sequence[str]) -> Spec:
             "yOffset": {"field": "action", "sort": None},
             "x": {**x_axis("p", "probability"), "scale": {"domain": [0, 1]}},
             "color": {
-                "field": "action", "type": "nominal", "sort": None, "scale": scale,
+                "field": "action",
+                "type": "nominal",
+                "sort": None,
+                "scale": scale,
                 "legend": {"orient": "top", "title": None},
             },
             "tooltip": [{"field": f} for f in ("who", "what", "action", "p")],
         },
-    }  # fmt: skip
+    }
 
 
 def timeline() -> Spec:
-    """When what happens in one decision; the page fills in `values`: who, what, from, to; and `window`."""
+    """When what happens in one decision; the page fills in `values`:
+    who, what, from, to; and `window`.
+    """
     return layered(
         {
             "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
@@ -163,7 +209,8 @@ def timeline() -> Spec:
 def stacked(
     rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
 ) -> Spec:
-    """Return a bar a run and `by`, in parts of the values of a field, in the order of their colours.
+    """Return a bar a run and `by`, in parts of the values of a field,
+    in the order of their colours.
 
     Their lengths are shares, or another `amount` of the rows.
     """
@@ -176,9 +223,12 @@ def stacked(
     if amount == "share":
         x |= {"axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
     encoding = {
-        "y": {**names_axis("bar"), "axis": {"labelLimit": 260}}, "x": x, "color": colour(field, colours),
-        "order": {"field": "order"}, "tooltip": tooltip(bars),
-    }  # fmt: skip
+        "y": {**names_axis("bar"), "axis": {"labelLimit": 260}},
+        "x": x,
+        "color": colour(field, colours),
+        "order": {"field": "order"},
+        "tooltip": tooltip(bars),
+    }
     return {
         **BASE,
         "height": 26 * len({bar["bar"] for bar in bars}),
@@ -189,7 +239,12 @@ def stacked(
 
 
 def shares(
-    rows: Rows, field: str, title: str, what: str, diagonal: bool = False, rules: Sequence[float] = ()
+    rows: Rows,
+    field: str,
+    title: str,
+    what: str,
+    diagonal: bool = False,
+    rules: Sequence[float] = (),
 ) -> Spec:
     """Draw shares over a field, a line a condition; on the `diagonal` the two agree."""
     x, y = x_axis(field, title), share_axis("share", what)
@@ -198,7 +253,10 @@ def shares(
         y["scale"] = {"zero": True, "nice": True}
     layers: list[Spec] = [
         interval(x=x, y={**y, "field": "low"}, y2={"field": "high"}, color=condition),
-        {"mark": {"type": "line", "strokeWidth": 1.5}, "encoding": {"x": x, "y": y, "color": condition}},
+        {
+            "mark": {"type": "line", "strokeWidth": 1.5},
+            "encoding": {"x": x, "y": y, "color": condition},
+        },
         point(55, x=x, y=y, color=condition, tooltip=tooltip(rows), shape=shape),
     ]
     if diagonal:
@@ -209,9 +267,16 @@ def shares(
 
 
 def bars(
-    rows: Rows, field: str, title: str, what: str, width: float, *,
-    series: str = "", rules: Sequence[float] = (), within: tuple[float, float] | None = None,
-) -> Spec:  # fmt: skip
+    rows: Rows,
+    field: str,
+    title: str,
+    what: str,
+    width: float,
+    *,
+    series: str = "",
+    rules: Sequence[float] = (),
+    within: tuple[float, float] | None = None,
+) -> Spec:
     """Draw counts over a field in bins of one width, with a shaded budget to be `within`."""
     bars = [{**row, "to": row[field] + width} for row in rows]
     met = {row[series] for row in rows} if series else set()
@@ -233,7 +298,9 @@ def bars(
 
 
 def named(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row in which no text is one that Vega stumbles over; what is added is not to be seen."""
+    """Return a row in which no text is one that Vega stumbles over;
+    what is added is not to be seen.
+    """
     return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
 
 
@@ -252,21 +319,34 @@ def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) 
 def x_axis(field: str, title: str) -> Spec:
     """Return a field along x, where its values are."""
     axis = {"labelOverlap": True, "tickCount": 8}
-    return {"field": field, **NUMBER, "title": title, "axis": axis, "scale": {"zero": False, "nice": True}}
+    return {
+        "field": field,
+        **NUMBER,
+        "title": title,
+        "axis": axis,
+        "scale": {"zero": False, "nice": True},
+    }
 
 
 def share_axis(field: str, title: str) -> Spec:
     """Return a share along y, from 0 to 100 %."""
-    return {"field": field, **NUMBER, "title": title, "axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
+    return {
+        "field": field,
+        **NUMBER,
+        "title": title,
+        "axis": {"format": "%"},
+        "scale": {"domain": [0, 1]},
+    }
 
 
 def colour(field: str, colours: Mapping[str, str]) -> Spec:
     """Return a colour for each value of a field, whose name the legend leaves out."""
     return {
-        "field": field, "type": "nominal",
+        "field": field,
+        "type": "nominal",
         "scale": {"domain": list(colours), "range": list(colours.values())},
         "legend": {"orient": "top", "title": None},
-    }  # fmt: skip
+    }
 
 
 def condition_colours(rows: Rows) -> Spec:
@@ -279,7 +359,12 @@ def condition_colours(rows: Rows) -> Spec:
 def shapes_of(rows: Rows, field: str) -> Spec:
     """Return a shape where `condition_colours` has a colour; of one field, both have one legend."""
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
-    return {"field": field, "type": "nominal", "scale": {"domain": domain}, "legend": {"orient": "top"}}
+    return {
+        "field": field,
+        "type": "nominal",
+        "scale": {"domain": domain},
+        "legend": {"orient": "top"},
+    }
 
 
 def names_axis(field: str) -> Spec:
@@ -289,7 +374,10 @@ def names_axis(field: str) -> Spec:
 
 def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
     """Return a filled point for each row."""
-    return {"mark": {"type": "point", "filled": True, "size": size, "opacity": 1}, "encoding": encoding}
+    return {
+        "mark": {"type": "point", "filled": True, "size": size, "opacity": 1},
+        "encoding": encoding,
+    }
 
 
 def tooltip(rows: Rows) -> list[Spec]:
@@ -301,7 +389,9 @@ def tooltip(rows: Rows) -> list[Spec]:
 
 
 def interval(**encoding: Spec) -> Spec:
-    """A line from one end of an interval, along x or y, to the other, which is the channel x2 or y2."""
+    """A line from one end of an interval, along x or y, to the other,
+    which is the channel x2 or y2.
+    """
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
 

@@ -1,4 +1,6 @@
-"""Say of a language model what it answers most often, and how much that moves with what it is shown."""
+"""Say of a language model what it answers most often,
+and how much that moves with what it is shown.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -18,7 +20,8 @@ DRIVERS = {action: driver for driver, action in ALWAYS.items()}
 class Commonest:
     """What an ego answers most often."""
 
-    actions: Sequence[str]  # the likeliest action of these answers; several where they are equally likely
+    # the likeliest action of these answers; several where they are equally likely
+    actions: Sequence[str]
     count: int  # in how many readable answers
     n: int  # how many are readable
     moves: float  # standard deviation of the action's probability over all readable answers
@@ -36,7 +39,9 @@ class Commonest:
 
 
 def commonest(run: Run) -> Commonest | None:
-    """Return what a language model's ego answers most often; None with fewer readable ones than `LEAST`."""
+    """Return what a language model's ego answers most often;
+    None with fewer readable ones than `LEAST`.
+    """
     engine = ENGINES.get(run.manifest.model["engine"])
     if engine is None or not engine.capabilities.language_model:
         return None
@@ -51,13 +56,17 @@ def commonest(run: Run) -> Commonest | None:
 
 
 def ignores_input(run: Run) -> Iterator[str]:
-    """Yield the sentence on an ego whose likeliest action is nearly always the same one (`CONSTANT`)."""
+    """Yield the sentence on an ego whose likeliest action is nearly always the same one
+    (`CONSTANT`).
+    """
     common = commonest(run)
     if common and common.constant:
         like = f" Without messages it drives as {_like(run, common)}." if common.all_read else ""
         yield (
-            f"The model ignores its input: {common.likeliest} in {common.count} of the ego's {common.n} "
-            f"readable answers, and its probability moves by {common.moves:.3f} (standard deviation) between "
+            f"The model ignores its input: {common.likeliest} in {common.count} of the ego's "
+            f"{common.n} "
+            f"readable answers, and its probability moves by {common.moves:.3f} (standard "
+            "deviation) between "
             f"them.{like}"
         )
 
@@ -74,11 +83,14 @@ def _like(run: Run, common: Commonest) -> str:
 
 
 def in_a_line(run: Run) -> Iterator[str]:
-    """Yield what a language model's ego answers most often, where `ignores_input` has not said it."""
+    """Yield what a language model's ego answers most often,
+    where `ignores_input` has not said it.
+    """
     common = commonest(run)
     if common and not common.constant:
         yield (
-            f"ego answers: {common.likeliest} in {100 * common.count / common.n:.0f} % of {common.n}; its "
+            f"ego answers: {common.likeliest} in {100 * common.count / common.n:.0f} % of "
+            f"{common.n}; its "
             f"probability moves by {common.moves:.2f} (standard deviation)"
         )
 
@@ -86,8 +98,15 @@ def in_a_line(run: Run) -> Iterator[str]:
 def tile(run: Run) -> list[dict[str, str]]:
     """Return the same as a figure of a page's first screen; none without a language model."""
     common = commonest(run)
-    return [] if common is None else [{
-        "what": f"ego's answers in which {common.likeliest}",
-        "value": f"{100 * common.count / common.n:.0f} %",
-        "interval": f"its probability moves by {common.moves:.2f}", "n": f"n = {common.n} readable answers",
-    }]  # fmt: skip
+    return (
+        []
+        if common is None
+        else [
+            {
+                "what": f"ego's answers in which {common.likeliest}",
+                "value": f"{100 * common.count / common.n:.0f} %",
+                "interval": f"its probability moves by {common.moves:.2f}",
+                "n": f"n = {common.n} readable answers",
+            }
+        ]
+    )

@@ -1,4 +1,6 @@
-"""What a page shows of each decision: what was seen, asked, answered and decided, and where it led."""
+"""What a page shows of each decision: what was seen, asked, answered and decided,
+and where it led.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,25 +48,61 @@ Sent = Callable[[Scene, str, Messages], Sequence[Mapping[str, str]]]
 Prompts = Callable[[Run], Sent | None]
 GOOD, SLOW, BAD, BLAMELESS = "s", "d", "u", "n"
 KEPT = (
-    "role", "raw", "finish_reason", "error", "status", "verdict", "faults", "repairs", "detail", "intent",
-    "mass", "message", "prompt_tokens", "completion_tokens", "seconds", "label_mass", "retries", "cached",
-    "first_raw", "first_status",
-)  # fmt: skip
+    "role",
+    "raw",
+    "finish_reason",
+    "error",
+    "status",
+    "verdict",
+    "faults",
+    "repairs",
+    "detail",
+    "intent",
+    "mass",
+    "message",
+    "prompt_tokens",
+    "completion_tokens",
+    "seconds",
+    "label_mass",
+    "retries",
+    "cached",
+    "first_raw",
+    "first_status",
+)
 ENDING = (
-    "condition", "seed", "partner", "striker", "fault", "time_s", "delay_s", "least_gap_m", "hard_brakings",
-    "other_crashes", "least_ttc_s", "least_pet_s",
-)  # fmt: skip
+    "condition",
+    "seed",
+    "partner",
+    "striker",
+    "fault",
+    "time_s",
+    "delay_s",
+    "least_gap_m",
+    "hard_brakings",
+    "other_crashes",
+    "least_ttc_s",
+    "least_pet_s",
+)
 # Of a decision, besides its policy and its messages.
 SHOWN = (
-    "condition", "action", "entropy_nats", "triggered", "own_failed", "own_weight", "latency_ms", "fusion_ms",
+    "condition",
+    "action",
+    "entropy_nats",
+    "triggered",
+    "own_failed",
+    "own_weight",
+    "latency_ms",
+    "fusion_ms",
     "deadline_missed",
-)  # fmt: skip
+)
 OF_DRIVEN = ("acts_at_s", "acted")  # known in the closed loop only
 OF_MESSAGE = ("delivered", "on_time", "arrival_ms", "weight", "trust", "attacker")
 
 
 def prompts_of(run: Run) -> Sent | None:
-    """Gives the chat messages that a viewer was sent; None if one of its prompts is neither here nor kept."""
+    """Gives the chat messages that a viewer was sent;
+    None if one of its prompts is neither here nor kept.
+    """
     manifest, prompts = run.manifest, dict[str, Prompt]()
     failed = set[str]()
     for agent in (manifest.agent(0), *manifest.helpers):
@@ -118,7 +156,9 @@ class Details:
             scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
             shown = {scene.record.episode for scene in scenes.values()}
             # A small dataset's trees are laid out once, and a large one's where they are shown.
-            forest = (dataset if len(dataset.trees) <= TREES_AT_ONCE else dataset.of_episodes(shown)).forest
+            forest = (
+                dataset if len(dataset.trees) <= TREES_AT_ONCE else dataset.of_episodes(shown)
+            ).forest
         for at in range(0, len(ids), BLOCK):
             yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
 
@@ -146,16 +186,22 @@ class Details:
     def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
         sent: dict[str, Any] = {}
         runs = [self._of_run(n, name, scene, sent) for n in range(len(self.runs.runs))]
-        asked = {tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]}
+        asked = {
+            tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]
+        }
         return {
             "world": scene and _world(scene.seat or self.runs.scenario, scene, asked),
-            "cameras": scene and name in self.framed and cameras(scene.seat or self.runs.scenario, scene),
+            "cameras": scene
+            and name in self.framed
+            and cameras(scene.seat or self.runs.scenario, scene),
             "outcomes": forest and _outcomes(forest, name),
             "runs": runs,
             "prompts": list(sent.values()),
         }
 
-    def _of_run(self, n: int, name: str, scene: Scene | None, sent: dict[str, Any]) -> dict[str, Any] | None:
+    def _of_run(
+        self, n: int, name: str, scene: Scene | None, sent: dict[str, Any]
+    ) -> dict[str, Any] | None:
         run, prompts = self.runs.runs[n], self._sent[n]
         rows = run.decisions.scenes.get(name)
         if rows is None:
@@ -165,13 +211,18 @@ class Details:
         for answer in by_viewer.values():
             if scene and answer.viewer not in scene.viewers:
                 raise UserError(
-                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(answer.viewer)} in "
-                    f"scene {printable(name)}, where nobody of that name answers; make the run again"
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of "
+                    f"{printable(answer.viewer)} in "
+                    f"scene {printable(name)}, where nobody of that name answers; make the run "
+                    "again"
                 )
             shown = {
                 key: v
                 for key in KEPT
-                if (v := getattr(answer, key)) is not None and v is not False and v is not UNSET and v != ()
+                if (v := getattr(answer, key)) is not None
+                and v is not False
+                and v is not UNSET
+                and v != ()
             }
             shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
             asked: int | None = None  # place among the prompts; False for one that is left out
@@ -233,7 +284,9 @@ class Part:
 
 
 def _columns(d: Decisions) -> list[str]:
-    of_messages = [f"{name}_{n}" for n in range(1, d.helpers + 1) for name in ("helper", *OF_MESSAGE)]
+    of_messages = [
+        f"{name}_{n}" for n in range(1, d.helpers + 1) for name in ("helper", *OF_MESSAGE)
+    ]
     return ["seed", *SHOWN, *OF_DRIVEN, *(f"fused_{action}" for action in d.actions), *of_messages]
 
 
@@ -262,7 +315,9 @@ def _end(e: Episode) -> dict[str, Any]:
 
 
 def _ends(run: Run) -> Any:
-    """What each decision led to, a letter a decision (n,); in the closed loop, what its episode came to."""
+    """What each decision led to, a letter a decision (n,);
+    in the closed loop, what its episode came to.
+    """
     d = run.decisions
     if run.world == "closed-loop":
         letters = {"": GOOD, "late": SLOW}
@@ -271,7 +326,8 @@ def _ends(run: Run) -> Any:
     return np.where(d.flags("value"), np.where(d.flags("safe"), safe, BAD), BLAMELESS)
 
 
-# A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of each colour.
+# A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of
+# each colour.
 FRAME_PX = 256, 128
 SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 
@@ -279,7 +335,8 @@ SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -> dict[str, Any]:
     """Return what is where, in m to the east and to the north, and what each viewer sees of it.
 
-    Of each viewer, too, the part that is shown of it: for whom the ego asked in each of some decisions.
+    Of each viewer, too, the part that is shown of it:
+    for whom the ego asked in each of some decisions.
     """
     state, danger = scene.state, scene.record.danger.vehicle
     zone_m, heard = scenario.road().zone_m, sorted({(), *asked})
@@ -287,15 +344,22 @@ def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -
         "time_s": round(state.time_s, 3),
         "vehicles": [
             {
-                "id": v.id, "kind": v.kind, "part": "danger" if v.id == danger else v.part,
-                "x": round(v.x_m, 2), "y": round(-v.y_m, 2), "heading": round(-v.heading_rad, 4),
-                "length": v.length_m, "width": v.width_m, "speed": round(v.speed_mps, 2),
+                "id": v.id,
+                "kind": v.kind,
+                "part": "danger" if v.id == danger else v.part,
+                "x": round(v.x_m, 2),
+                "y": round(-v.y_m, 2),
+                "heading": round(-v.heading_rad, 4),
+                "length": v.length_m,
+                "width": v.width_m,
+                "speed": round(v.speed_mps, 2),
                 "crashed": v.crashed,
             }
             for v in state.vehicles
         ],
         "buildings": [
-            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()} for b in state.buildings
+            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()}
+            for b in state.buildings
         ],
         "viewers": {
             viewer: {
@@ -304,18 +368,25 @@ def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -
                 "occluded": [*graph.occluded],
                 "conflicts": _conflicts(*crossed),
                 "views": {
-                    " ".join(ids): [round(view.west_m, 1), round(view.south_m, 1), round(view.width_m, 1)]
+                    " ".join(ids): [
+                        round(view.west_m, 1),
+                        round(view.south_m, 1),
+                        round(view.width_m, 1),
+                    ]
                     for ids in heard
                     for view in [view_of(spots(state, zone_m, graph, (danger, *ids), crossed))]
                 },
             }
-            for viewer, graph in scene.graphs.items() for crossed in [conflict_points(state, graph)]
+            for viewer, graph in scene.graphs.items()
+            for crossed in [conflict_points(state, graph)]
         },
-    }  # fmt: skip
+    }
 
 
 def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
-    """Of each viewer, what its cameras see and boxes around what its sensors list (`Frame.boxes`)."""
+    """Of each viewer, what its cameras see and boxes around what its sensors list
+    (`Frame.boxes`).
+    """
     shown = {}
     for viewer, graph in scene.graphs.items():
         seen = frame(scenario, scene.state, viewer, FRAME_PX)
@@ -336,14 +407,22 @@ def _conflicts(conflicts: Sequence[Conflict], points: Floats) -> list[dict[str, 
 
 
 def _outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
-    """Return what each action leads to at a decision point if the full-view driver takes the rest."""
+    """Return what each action leads to at a decision point if the full-view driver takes the
+    rest.
+    """
     n = forest.place[name]
     last = forest.then_full_view[n]
     in_time = forest.succeeds(last, forest.tree[n])
-    rows = zip(forest.actions, last.tolist(), in_time, forest.safe[n], forest.delay_s[n], strict=True)
+    rows = zip(
+        forest.actions, last.tolist(), in_time, forest.safe[n], forest.delay_s[n], strict=True
+    )
     return [
-        {**msgspec.to_builtins(end := forest.end(edge)), "action": action, "safe": bool(safe),
-         "result": "late" if end.result == "cleared" and not success else end.result,
-         "delay_s": None if np.isnan(delay_s) else round(float(delay_s), 3)}
+        {
+            **msgspec.to_builtins(end := forest.end(edge)),
+            "action": action,
+            "safe": bool(safe),
+            "result": "late" if end.result == "cleared" and not success else end.result,
+            "delay_s": None if np.isnan(delay_s) else round(float(delay_s), 3),
+        }
         for action, edge, success, safe, delay_s in rows
-    ]  # fmt: skip
+    ]

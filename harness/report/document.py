@@ -1,4 +1,6 @@
-"""A page of sentences, figures and tables that runs no script: of a study, a suite, or runs by date."""
+"""A page of sentences, figures and tables that runs no script:
+of a study, a suite, or runs by date.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +10,8 @@ from markupsafe import Markup
 from harness.core.figures import Bounded, known
 from harness.report.templating import environment, visible
 
-LONGEST_NUMBER = 40  # characters of a cell at the right of its column, such as a number with its interval
+# characters of a cell at the right of its column, such as a number with its interval
+LONGEST_NUMBER = 40
 WIDTH, HEIGHT = 240, 22  # of a line of a forest plot
 
 
@@ -24,7 +27,8 @@ class Table:
     # the columns that a terminal has room for; none where only the page shows the table
     terminal: Sequence[int] = ()
     most: int | None = None  # how many rows a terminal shows; None for all
-    left: bool = False  # whether all columns begin at the left and none wraps: text, or several lines a cell
+    # whether all columns begin at the left and none wraps: text, or several lines a cell
+    left: bool = False
     folded: bool = False  # whether the page shows it after a click
     total: bool = False  # whether the last row is about all others
 
@@ -56,7 +60,8 @@ class Section:
     warnings: Sequence[str] = ()  # why the outcome is none; they stand above it
     caveats: Sequence[str] = ()  # what a reader must know first
     numbers: Sequence[Mapping[str, str]] = ()  # what is read first, as `words.figures` gives it
-    pictures: Mapping[str, tuple[str, int]] = field(default_factory=dict)  # by name: address, width in rem
+    # by name: address, width in rem
+    pictures: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     more: Markup = field(default_factory=Markup)  # below the tables
 
 
@@ -87,7 +92,8 @@ def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
 
 
 def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Markup:
-    """Draw a value as a square and its interval as a line, with an upright line at 0 where that is between.
+    """Draw a value as a square and its interval as a line,
+    with an upright line at 0 where that is between.
 
     Args:
         bounded: the value, with its interval.
@@ -108,5 +114,6 @@ def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Ma
     at, name = x(value or 0.0), f"forest {verdict}".strip()
     return Markup(
         f'<svg class="{name}" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
-        f'aria-hidden="true">{zero}{spread}<rect x="{at - 3.5}" y="{y - 3.5}" width="7" height="7"/></svg>'
+        f'aria-hidden="true">{zero}{spread}<rect x="{at - 3.5}" y="{y - 3.5}" width="7" '
+        f'height="7"/></svg>'
     )

@@ -64,35 +64,43 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.VOID: [*map(each, (caveats.unanswered, caveats.unread))],
     Kind.CAVEAT: [
         caveats.no_prompt,
-        *map(each, (
-            caveats.of_extensions,
-            caveats.moved_system,
-            caveats.by_letter,
-            caveats.beyond_sources,
-            caveats.on_device,
-            caveats.looked_at,
-            ignores_input,
-            unchecked,
-            caveats.lost_messages,
-            caveats.retried,
-        )),
+        *map(
+            each,
+            (
+                caveats.of_extensions,
+                caveats.moved_system,
+                caveats.by_letter,
+                caveats.beyond_sources,
+                caveats.on_device,
+                caveats.looked_at,
+                ignores_input,
+                unchecked,
+                caveats.lost_messages,
+                caveats.retried,
+            ),
+        ),
     ],
-    Kind.LIMIT: [*map(each, (
-        caveats.causes,
-        caveats.few,
-        caveats.saturated,
-        caveats.earlier_gains,
-        caveats.sampled,
-        caveats.divided,
-        caveats.flipped,
-        caveats.controls,
-        caveats.unheard,
-        caveats.lost_at_once,
-        caveats.lagging,
-        caveats.unmeasured,
-    ))],
+    Kind.LIMIT: [
+        *map(
+            each,
+            (
+                caveats.causes,
+                caveats.few,
+                caveats.saturated,
+                caveats.earlier_gains,
+                caveats.sampled,
+                caveats.divided,
+                caveats.flipped,
+                caveats.controls,
+                caveats.unheard,
+                caveats.lost_at_once,
+                caveats.lagging,
+                caveats.unmeasured,
+            ),
+        )
+    ],
     Kind.FIGURE: [*map(each, (words.adjusted_lines, in_a_line))],
-}  # fmt: skip
+}
 # Of a run, or of a suite as a whole.
 OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
     Kind.PACE: [notes.pace],
@@ -108,7 +116,9 @@ OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
 
 
 def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
-    """Return what is said of a run, or of a suite and its runs, all of it or only of these kinds."""
+    """Return what is said of a run, or of a suite and its runs,
+    all of it or only of these kinds.
+    """
     runs = run.runs if isinstance(run, SuiteRun) else {"": run}
     return [*of_runs(runs, *kinds), *_said(OF_ONE, run, kinds)]
 
@@ -121,7 +131,8 @@ def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
 def _said(table: Mapping[Kind, Sequence[Source[T]]], of: T, kinds: Sequence[Kind]) -> list[Finding]:
     return [
         Finding(kind, sentence)
-        for kind, sources in table.items() if kind in (kinds or Kind)
+        for kind, sources in table.items()
+        if kind in (kinds or Kind)
         for source in sources
         for sentence in source(of)
-    ]  # fmt: skip
+    ]

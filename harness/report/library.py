@@ -1,9 +1,10 @@
-"""What a page carries besides its text: packed data, pictures, the charting library, and what lets it run.
+"""What a page carries besides its text:
+packed data, pictures, the charting library, and what lets it run.
 
-Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which the package
-django-js-lib-vega-embed carries as its authors built it. It is compressed in the page as everything large is;
-scripts are let run by their digest alone. The library's own digest stands here: what another package or
-release puts in its place runs in no page.
+Charts are drawn by Vega-Lite (BSD 3-Clause, University of Washington Interactive Data Lab), which
+the package django-js-lib-vega-embed carries as its authors built it. It is compressed in the page
+as everything large is; scripts are let run by their digest alone. The library's own digest stands
+here: what another package or release puts in its place runs in no page.
 """
 
 import base64
@@ -25,18 +26,33 @@ from harness.report.drawing.colours import BLACK, FAINT, INK, PAGE, PALE, WHITE
 
 # In the order in which they need each other.
 SCRIPTS = (
-    "dom", "tables", "charts", "ends", "scene", "cameras", "answers", "decision", "list", "episodes", "main",
-)  # fmt: skip
+    "dom",
+    "tables",
+    "charts",
+    "ends",
+    "scene",
+    "cameras",
+    "answers",
+    "decision",
+    "list",
+    "episodes",
+    "main",
+)
 FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
-BUNDLE_SHA256 = "b6f62605c995662b5682ff986bddf3a1e2fe7f309b8acc82db8b8a4feb4d9cef"  # of release 6.29.0.3
+# of release 6.29.0.3
+BUNDLE_SHA256 = "b6f62605c995662b5682ff986bddf3a1e2fe7f309b8acc82db8b8a4feb4d9cef"
 
-# What figures are drawn on and around their data with, and the colours of dark pages for it. What has no
-# colour is black.
+# What figures are drawn on and around their data with, and the colours of dark pages for it. What
+# has no colour is black.
 _DARK = (
     (f'path[style*="fill: {WHITE.lower()}"], rect[fill="{WHITE.lower()}"]', "fill", "paper"),
-    (f'[style*="fill: {INK}"], [style*="fill: {BLACK}"], text:not([style*="fill:"])', "fill", "ink"),
+    (
+        f'[style*="fill: {INK}"], [style*="fill: {BLACK}"], text:not([style*="fill:"])',
+        "fill",
+        "ink",
+    ),
     (f'[style*="stroke: {INK}"], [style*="stroke: {BLACK}"]', "stroke", "ink"),
     (f'[style*="stroke: {PALE.lower()}"]', "stroke", "line"),
     (f'[style*="fill: {FAINT.lower()}"]', "fill", "card"),
@@ -71,13 +87,20 @@ def licence() -> str:
     """Return which libraries the page carries; their licences are in templates/licences.txt."""
     package = distribution(PACKAGE)
     # As it stands in the file: newer Pythons refuse to write this message's long header as text.
-    carried = re.findall(r"^\s*- (Vega.*): ([\d.]+)$", package.read_text("METADATA") or "", re.MULTILINE)
+    carried = re.findall(
+        r"^\s*- (Vega.*): ([\d.]+)$", package.read_text("METADATA") or "", re.MULTILINE
+    )
     named = ", ".join(f"{name} {number}" for name, number in carried)
-    return f"Charts are drawn by {named}, which lie in this file as {PACKAGE} {package.version} has them"
+    return (
+        f"Charts are drawn by {named}, which lie in this file as {PACKAGE} {package.version} has "
+        "them"
+    )
 
 
 def packed(value: Any) -> Markup:
-    """Return text, or anything else as JSON, compressed, in characters that mean nothing in HTML."""
+    """Return text, or anything else as JSON, compressed,
+    in characters that mean nothing in HTML.
+    """
     text = value
     if not isinstance(value, str):
         text = json.dumps(value, separators=(",", ":"), allow_nan=False)
@@ -90,14 +113,18 @@ def picture(content: bytes, kind: str = "svg+xml") -> str:
 
 
 def on_dark_too(svg: bytes) -> bytes:
-    """Return a figure's SVG for a page, whose dark look it takes on; the file stays as papers print it."""
+    """Return a figure's SVG for a page, whose dark look it takes on;
+    the file stays as papers print it.
+    """
     rules = "".join(f"{what} {{{how}: {PAGE[name][1]} !important}} " for what, how, name in _DARK)
     style = f"<style>@media (prefers-color-scheme: dark) {{{rules}}}</style></defs>"
     return svg.replace(b"</defs>", style.encode(), 1)
 
 
 def policy(*scripts: str) -> str:
-    """Content security policy of a page that runs these scripts and nothing else, and requests nothing."""
+    """Content security policy of a page that runs these scripts and nothing else,
+    and requests nothing.
+    """
     allowed = " ".join(f"'sha256-{digest(script)}'" for script in scripts)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "

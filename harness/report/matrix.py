@@ -30,8 +30,10 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 class Behind:
     """A run against the best one, over the episodes that both have."""
 
-    change: Estimate  # of its success minus the best one's, as it leads, with a 95 % interval over these
-    p_value: float  # of no difference, by that interval, corrected by Holm's method for all pairs of runs
+    # of its success minus the best one's, as it leads, with a 95 % interval over these
+    change: Estimate
+    # of no difference, by that interval, corrected by Holm's method for all pairs of runs
+    p_value: float
 
     @property
     def undecided(self) -> bool:
@@ -48,7 +50,8 @@ class Line:
     answer: str  # answer mode
     condition: str  # operating point
     scores: Mapping[str, Score | None]  # metrics by name; None where the run has none
-    tokens: tuple[float | None, float | None]  # medians of a prompt and an answer; None where not counted
+    # medians of a prompt and an answer; None where not counted
+    tokens: tuple[float | None, float | None]
     mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
     behind: Behind | None  # how it stands to the best; None for the best
     lead: str  # the metric by which the runs are read together
@@ -64,15 +67,23 @@ class Grid:
     """Success under one condition, prompts across and models down."""
 
     condition: str  # operating point
-    prompts: tuple[str, ...]  # heads of the columns: version, and the answer mode where runs differ in it
+    # heads of the columns: version, and the answer mode where runs differ in it
+    prompts: tuple[str, ...]
     # a model, and what was run with each of these prompts: several if it was run again
     rows: tuple[tuple[str, tuple[tuple[Line, ...], ...]], ...]
 
 
 METRICS = (
-    *LEADING, SUCCESS, "strict_rate", "recovered_rate", "failed_rate", LATENCY, "latency_p95_ms", OPTIMAL,
+    *LEADING,
+    SUCCESS,
+    "strict_rate",
+    "recovered_rate",
+    "failed_rate",
+    LATENCY,
+    "latency_p95_ms",
+    OPTIMAL,
     "optimal_brier",
-)  # fmt: skip
+)
 
 
 def lines(runs: Runs) -> list[Line]:
@@ -95,7 +106,9 @@ def lines(runs: Runs) -> list[Line]:
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:
-    """Return the lines as a table a condition, with the models and prompts that were run under it."""
+    """Return the lines as a table a condition,
+    with the models and prompts that were run under it.
+    """
     modes = {line.answer for line in results}
     tables: dict[str, dict[tuple[str, str], list[Line]]] = {}
     for line in results:
@@ -105,7 +118,8 @@ def grids(results: Sequence[Line]) -> list[Grid]:
     for condition, cells in tables.items():
         models, prompts = (tuple(dict.fromkeys(key[place] for key in cells)) for place in (0, 1))
         rows = tuple(
-            (model, tuple(tuple(cells.get((model, prompt), ())) for prompt in prompts)) for model in models
+            (model, tuple(tuple(cells.get((model, prompt), ())) for prompt in prompts))
+            for model in models
         )
         grids.append(Grid(condition, prompts, rows))
     return grids
@@ -119,7 +133,9 @@ def _score(run: Run, condition: str, metric: str) -> Score | None:
 def _tokens(run: Run) -> tuple[float | None, float | None]:
     counts = [(a.prompt_tokens, a.completion_tokens) for a in run.answers]
     stated = ([count for count in of if count is not None] for of in zip(*counts, strict=True))
-    sent, answered = (float(median(of)) if of else None for of in stated) if counts else (None, None)
+    sent, answered = (
+        (float(median(of)) if of else None for of in stated) if counts else (None, None)
+    )
     return sent, answered
 
 
@@ -160,10 +176,11 @@ def marked(
 def _behind_best(
     ended: Sequence[Successes], dangerous: Container[int]
 ) -> tuple[int | None, dict[int, Behind]]:
-    """Return the best run and the others against it, p not yet corrected; None where there is no such run.
+    """Return the best run and the others against it, p not yet corrected;
+    None where there is no such run.
 
-    The best is not behind any other on the episodes and seeds that the two share: a run of other episodes is
-    no better for their being easy.
+    The best is not behind any other on the episodes and seeds that the two share:
+    a run of other episodes is no better for their being easy.
     """
     scored = [n for n, of in enumerate(ended) if of]
     for best in scored:
@@ -173,12 +190,16 @@ def _behind_best(
     return None, {}
 
 
-def _shared(first: Successes, second: Successes, dangerous: Container[int]) -> tuple[Success, Floats, Floats]:
+def _shared(
+    first: Successes, second: Successes, dangerous: Container[int]
+) -> tuple[Success, Floats, Floats]:
     """Successes of the episodes and seeds that both have, each (S, E), and how they count."""
     both = sorted(first.keys() & second.keys())
     episodes = sorted({episode for episode, _ in both})
     a, b = (
-        np.array([of[key] for key in both]).reshape(len(episodes), -1).T if both else np.empty((0, 0))
+        np.array([of[key] for key in both]).reshape(len(episodes), -1).T
+        if both
+        else np.empty((0, 0))
         for of in (first, second)
     )
     return Success(np.array([episode in dangerous for episode in episodes], dtype=bool)), a, b
@@ -199,16 +220,22 @@ def uneven(runs: Runs) -> str | None:
         for name, run in zip(runs.names, runs.runs, strict=True)
     )
     return (
-        f"The runs have different episodes × seeds ({each}): a success rate is over the run's own, and two "
+        f"The runs have different episodes × seeds ({each}): a success rate is over the run's own, "
+        "and two "
         "runs are compared on those that both have."
     )
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's leading success under each condition, with what it is and its interval."""
+    """Return the best run's leading success under each condition,
+    with what it is and its interval.
+    """
     of_best = [(line, line.success) for line in results if line.mark == BEST]
     return [
-        {"what": f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}", **shown(success)}
+        {
+            "what": f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}",
+            **shown(success),
+        }
         for line, success in of_best
         if success
     ]
@@ -217,7 +244,11 @@ def figures(results: Sequence[Line]) -> list[dict[str, str]]:
 def _rank(best: Line, results: Sequence[Line]) -> str:
     """Name the best run of a condition, unless others cannot be told from it."""
     close = _close(best.condition, results)
-    return f"the most of {len(close) + 1} runs that cannot be told apart" if close else f"best: {best.name}"
+    return (
+        f"the most of {len(close) + 1} runs that cannot be told apart"
+        if close
+        else f"best: {best.name}"
+    )
 
 
 def shared(results: Sequence[Line]) -> set[str]:
@@ -230,7 +261,9 @@ def _close(condition: str, results: Sequence[Line]) -> list[str]:
 
 
 def headline(results: Sequence[Line]) -> str:
-    """Name the best of several runs under each condition, or those that cannot be told apart there."""
+    """Name the best of several runs under each condition,
+    or those that cannot be told apart there.
+    """
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
         of_condition = [line for line in results if line.condition == condition]
@@ -238,7 +271,9 @@ def headline(results: Sequence[Line]) -> str:
         if best is not None and (success := best.success):
             if close := _close(condition, results):
                 apart = f"{some_of([best.name, *close])} cannot be told apart"
-                outcomes.append(f"{condition}: none clearly ({shown(success)['value']} at the most; {apart})")
+                outcomes.append(
+                    f"{condition}: none clearly ({shown(success)['value']} at the most; {apart})"
+                )
             else:
                 outcomes.append(f"{condition}: {best.name} {shown(success)['value']}")
         elif len(of_condition) > 1:
@@ -246,4 +281,8 @@ def headline(results: Sequence[Line]) -> str:
                 f"{condition}: no run, since each is behind another or shares no episodes with it"
             )
     by = " by balanced success" if results[0].lead == BALANCED else ""
-    return f"Best{by} under {'; '.join(outcomes)}." if outcomes else "No two runs have a condition in common."
+    return (
+        f"Best{by} under {'; '.join(outcomes)}."
+        if outcomes
+        else "No two runs have a condition in common."
+    )

@@ -1,4 +1,6 @@
-"""Where the numbers of a run or suite come from, a function a fact; `findings` has them in their order."""
+"""Where the numbers of a run or suite come from, a function a fact;
+`findings` has them in their order.
+"""
 
 from collections.abc import Iterator
 from typing import get_args
@@ -14,10 +16,11 @@ Shown = Run | SuiteRun
 
 
 def pace(run: Shown) -> Iterator[str]:
-    """Yield what prefill and decode take of answers that were asked alone, a role after the other, as lines.
+    """Yield what prefill and decode take of answers that were asked alone,
+    a role after the other, as lines.
 
-    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own answers;
-    where it knows none of these, of those that its latency was measured with.
+    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own
+    answers; where it knows none of these, of those that its latency was measured with.
     """
     manifest = run.manifest
     own = {role: took for role, took in manifest.answer_times.items() if took.first_token}
@@ -31,7 +34,10 @@ def pace(run: Shown) -> Iterator[str]:
             yield f"{word}: {text} (batch 1, measured where it ran)"
         for what, of in (("TTFT", first), ("TPOT", took.token)):
             if of:
-                half, high = _milliseconds(of.median_s, of.median_ci_s), _milliseconds(of.p95_s, of.p95_ci_s)
+                half, high = (
+                    _milliseconds(of.median_s, of.median_ci_s),
+                    _milliseconds(of.p95_s, of.p95_ci_s),
+                )
                 tail = f", p95 {high}" if of.n > 1 else ""
                 yield f"  {word} {what} {half} ms{tail}, n = {of.n}"
 
@@ -59,20 +65,27 @@ def latency_source(latency: Latency) -> str:
     if latency.ego_s is None or latency.fusion_s is None:
         return f"{source} ({printable(latency.basis)})"
     by_role = {
-        "ego": (latency.ego_s,), "helper": latency.helper_times_s(), "ego with messages": (latency.fusion_s,),
-    }  # fmt: skip
-    times = ", ".join(f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items())
+        "ego": (latency.ego_s,),
+        "helper": latency.helper_times_s(),
+        "ego with messages": (latency.fusion_s,),
+    }
+    times = ", ".join(
+        f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items()
+    )
     return f"{times}; {source} ({printable(latency.basis)})"
 
 
 def energy(run: Shown) -> Iterator[str]:
     """Yield what a decision takes in each condition; nothing without a device profile."""
     for name in run.conditions:
-        total, helpers, radio = (run.score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj"))
+        total, helpers, radio = (
+            run.score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj")
+        )
         if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
             joules = PLAIN.interval(total.value, total.low, total.high)
             yield (
-                f"{printable(name)}: {joules} J per decision, of which the helpers' inference takes "
+                f"{printable(name)}: {joules} J per decision, of which the helpers' inference "
+                "takes "
                 f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
             )
 
@@ -109,7 +122,9 @@ def readings(run: Shown) -> Iterator[str]:
 
 
 def _of_role(run: Shown, role: str) -> Iterator[str]:
-    shares = [run.score(ALL, f"{verdict}_rate_{role}") for verdict in ("strict", "recovered", "failed")]
+    shares = [
+        run.score(ALL, f"{verdict}_rate_{role}") for verdict in ("strict", "recovered", "failed")
+    ]
     if shares[0] is not None:
         values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
         yield f"answers strict / recovered / failed: {values} % of {shares[0].n}"
@@ -124,7 +139,9 @@ def _of_role(run: Shown, role: str) -> Iterator[str]:
 
 def _letters(run: Shown, role: str) -> str:
     """Return what a role's read-outs owe to the letters and to the order of the list of actions."""
-    share, follows = (run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter"))
+    share, follows = (
+        run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter")
+    )
     read = "letters read once"
     if share and follows:
         owed = f"{100 * (share.value or 0):.0f} % follows the letter"

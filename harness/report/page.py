@@ -1,8 +1,9 @@
 """One HTML file about one run or several: opens from disk, needs no network.
 
-Whatever a model, a prompt or a file name says is text: templates escape everything, the page's script makes
-text nodes and nothing else of what it reads, characters that show nothing or turn the line around are spelt
-out, and the page's own policy lets two scripts run, named by their digests, and forbids every request.
+Whatever a model, a prompt or a file name says is text: templates escape everything, the page's
+script makes text nodes and nothing else of what it reads, characters that show nothing or turn the
+line around are spelt out, and the page's own policy lets two scripts run, named by their digests,
+and forbids every request.
 """
 
 import re
@@ -51,12 +52,13 @@ def write_report(
     Args:
         runs: what to report.
         out: file to replace.
-        prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with what it
-            had heard; None where they are unknown. By default the run's own prompt version, if it is here.
+        prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with
+            what it had heard; None where they are unknown. By default the run's own prompt version,
+            if it is here.
         progress: called with the number of scenes just packed.
         workers: who packs the scenes of a report of many; `prompts` can be pickled then.
-        full: whether it also has the prompts that rules do not read, and the camera pictures of every
-            decision, not only those of models that see.
+        full: whether it also has the prompts that rules do not read, and the camera pictures of
+            every decision, not only those of models that see.
 
     Returns:
         The file written.
@@ -88,7 +90,8 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
     for what, why in lacks.items():
         if what not in lacked:
             raise UserError(
-                f"{printable(out)} is kept: a new page would lack its {what} ({why}); name another file with "
+                f"{printable(out)} is kept: a new page would lack its {what} ({why}); name another "
+                "file with "
                 f"{option}, or delete it"
             )
 
@@ -106,9 +109,11 @@ def save(pieces: Iterable[str], out: Path, option: str) -> None:
 
 @uncollected()
 def render(
-    runs: Runs, prompts: Prompts = prompts_of, progress: Callable[[int], None] = lambda done: None,
+    runs: Runs,
+    prompts: Prompts = prompts_of,
+    progress: Callable[[int], None] = lambda done: None,
     full: bool = False,
-) -> str:  # fmt: skip
+) -> str:
     """Return the page, as `write_report` writes it."""
     return "".join(_pieces(runs, Decisions(runs, prompts, full), progress, 1))
 
@@ -116,46 +121,56 @@ def render(
 def _pieces(
     runs: Runs, decisions: Decisions, progress: Callable[[int], None], workers: Workers
 ) -> Iterator[str]:
-    """The page in pieces, since that of a million decisions weighs as much as all that is read for it."""
+    """The page in pieces, since that of a million decisions weighs as much as all that is read for
+    it.
+    """
     lines = matrix.lines(runs)
     charts = list(panels(runs))
     alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
-    return environment().get_template("page.html.j2").generate(
-        runs=runs,
-        title=runs.names[0] if alone else f"{len(runs.names)} runs",
-        policy=library.policy(library.vega(), library.script()),
-        lacks=" ".join(decisions.lacks()),
-        warnings=of_runs(by_name, *FIRST),
-        size=contents.size(runs),
-        headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
-        key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])] if alone else matrix.figures(lines),
-        actions=_actions(runs),
-        lines=lines,
-        lead=IN_WORDS[lines[0].lead],
-        grids=matrix.grids(lines),
-        shared=matrix.shared(lines),
-        uneven=matrix.uneven(runs),
-        summaries=[contents.summary(run) for run in runs.runs],
-        answers=contents.answers(runs),
-        probabilities=contents.probabilities(runs),
-        least=LEAST,
-        charts=charts,
-        examples=contents.examples(runs),
-        remarks=sentences(runs),
-        sections=sections(runs),
-        notes=[findings(run, *LAST) for run in runs.runs],
-        sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
-        licence=library.licence(),
-        vega=library.packed(library.vega()),
-        script=library.script(),
-        about=library.packed(_about(runs, charts)),
-        index=library.packed(decisions.index),
-        blocks=_packed(decisions.parts(), progress, workers),
-    )  # fmt: skip
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .generate(
+            runs=runs,
+            title=runs.names[0] if alone else f"{len(runs.names)} runs",
+            policy=library.policy(library.vega(), library.script()),
+            lacks=" ".join(decisions.lacks()),
+            warnings=of_runs(by_name, *FIRST),
+            size=contents.size(runs),
+            headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
+            key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])]
+            if alone
+            else matrix.figures(lines),
+            actions=_actions(runs),
+            lines=lines,
+            lead=IN_WORDS[lines[0].lead],
+            grids=matrix.grids(lines),
+            shared=matrix.shared(lines),
+            uneven=matrix.uneven(runs),
+            summaries=[contents.summary(run) for run in runs.runs],
+            answers=contents.answers(runs),
+            probabilities=contents.probabilities(runs),
+            least=LEAST,
+            charts=charts,
+            examples=contents.examples(runs),
+            remarks=sentences(runs),
+            sections=sections(runs),
+            notes=[findings(run, *LAST) for run in runs.runs],
+            sweeps=[panel for run in runs.runs for panel in contents.sweeps(run)],
+            licence=library.licence(),
+            vega=library.packed(library.vega()),
+            script=library.script(),
+            about=library.packed(_about(runs, charts)),
+            index=library.packed(decisions.index),
+            blocks=_packed(decisions.parts(), progress, workers),
+        )
+    )
 
 
-def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Workers) -> Iterator[Markup]:
+def _packed(
+    parts: Sequence[Part], progress: Callable[[int], None], workers: Workers
+) -> Iterator[Markup]:
     if workers == 1 or len(parts) < PARTS_SHARED:
         for part in parts:
             for block in part.details.blocks(part.ids):
@@ -168,7 +183,14 @@ def _packed(parts: Sequence[Part], progress: Callable[[int], None], workers: Wor
         done[place] = blocks
         progress(len(parts[place].ids))
 
-    each(Part.packed, parts, workers, keep, lambda part: f"scenes {part.ids[0]} to {part.ids[-1]}", False)
+    each(
+        Part.packed,
+        parts,
+        workers,
+        keep,
+        lambda part: f"scenes {part.ids[0]} to {part.ids[-1]}",
+        False,
+    )
     for place in range(len(parts)):
         yield from done.pop(place)
 
@@ -182,7 +204,9 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
             {
                 "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
                 "points": {
-                    c["name"]: {key: c.get(key) for key in ("window_s", "consensus", "messages", "content")}
+                    c["name"]: {
+                        key: c.get(key) for key in ("window_s", "consensus", "messages", "content")
+                    }
                     for c in run.manifest.conditions
                 },
             }
@@ -190,14 +214,16 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
         ],
         "meanings": {str(member): member.meaning for member in (*Status, *Repair)},
         "ground": {
-            "view_m": VIEW_M, "outlines": [o.round(2).tolist() for o in surface.outlines],
-            "marks": [m.tolist() for m in surface.marks], "stops": [s.tolist() for s in surface.stops],
+            "view_m": VIEW_M,
+            "outlines": [o.round(2).tolist() for o in surface.outlines],
+            "marks": [m.tolist() for m in surface.marks],
+            "stops": [s.tolist() for s in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},
         "actions": _actions(runs),
         "policies": policies(runs.actions),
         "timeline": timeline(),
-    }  # fmt: skip
+    }
 
 
 def _actions(runs: Runs) -> dict[str, tuple[str, str]]:

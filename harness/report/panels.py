@@ -1,6 +1,7 @@
 """Which charts a report has: what is counted for each, and how it is read.
 
-The rows of a chart are plain. Shares are 0 to 1; `low` and `high` are a 95 % interval over episodes.
+The rows of a chart are plain. Shares are 0 to 1;
+`low` and `high` are a 95 % interval over episodes.
 """
 
 from collections import Counter
@@ -58,90 +59,140 @@ def panels(runs: Runs) -> Iterator[Panel]:
     lead = lead_of(*runs.runs)
     if rows := joined(lambda run: success(run, lead)):
         references, scenario = _references(runs, lead), runs.scenario
-        rates = {label(name, scenario): s.value for name, s in references.items() if s.value is not None}
+        rates = {
+            label(name, scenario): s.value for name, s in references.items() if s.value is not None
+        }
         yield Panel(
-            "success-latency", "overview", f"{IN_WORDS[lead].capitalize()} and latency",
-            "Each point is a condition; the lines through it are 95 % intervals over episodes. Rings: what "
-            "the paper reports, with other scenes and another model. A reply that arrives after the "
-            "decision window is not fused." + sentences(references, scenario, runs.dataset is not None),
+            "success-latency",
+            "overview",
+            f"{IN_WORDS[lead].capitalize()} and latency",
+            "Each point is a condition; the lines through it are 95 % intervals over episodes. "
+            "Rings: what "
+            "the paper reports, with other scenes and another model. A reply that arrives after "
+            "the "
+            "decision window is not fused."
+            + sentences(references, scenario, runs.dataset is not None),
             charts.success_latency(rows, rates, windows_ms, IN_WORDS[lead]),
-        )  # fmt: skip
+        )
     if rows := joined(statuses):
         yield Panel(
-            "statuses", "answers", "How answers were read",
-            "Share of each role's answers by status. Strict: the text fits the schema as it is. Recovered: "
+            "statuses",
+            "answers",
+            "How answers were read",
+            "Share of each role's answers by status. Strict: the text fits the schema as it is. "
+            "Recovered: "
             "it was read after repairs. All others failed and gave no distribution.",
             charts.statuses(rows),
-        )  # fmt: skip
+        )
     if rows := joined(reliability):
         yield Panel(
-            "reliability", "probabilities", "Is the policy as often right as it is sure?",
-            "Decisions in which exactly one action is optimal, so that success is possible after no other, "
+            "reliability",
+            "probabilities",
+            "Is the policy as often right as it is sure?",
+            "Decisions in which exactly one action is optimal, so that success is possible after "
+            "no other, "
             "are grouped by the probability of the likeliest action in the fused policy, in "
-            f"{BINS} bins of equal mass; each point shows how often that action was the optimal one. The "
-            "mean distance from the dashed line is the ECE; above the line the policy is less sure than it "
-            f"could be. Conditions with fewer than {LEAST} such decisions are left out. All seeds; 95 % "
+            f"{BINS} bins of equal mass; each point shows how often that action was the optimal "
+            "one. The "
+            "mean distance from the dashed line is the ECE; above the line the policy is less sure "
+            "than it "
+            f"could be. Conditions with fewer than {LEAST} such decisions are left out. All seeds; "
+            "95 % "
             "intervals over episodes.",
             charts.shares(
-                rows, "certainty", "fused probability of the likeliest action", "share optimal", diagonal=True
+                rows,
+                "certainty",
+                "fused probability of the likeliest action",
+                "share optimal",
+                diagonal=True,
             ),
-        )  # fmt: skip
+        )
     if rows := joined(entropies):
         yield Panel(
             "entropy",
             "answers",
             "Entropy of the ego's own answers",
-            "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, above "
+            "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, "
+            "above "
             "which the ego asks helpers.",
             charts.bars(rows, "entropy_nats", ENTROPY, "answers", ENTROPY_NATS, rules=tau_nats),
         )
     if rows := joined(errors):
         yield Panel(
-            "entropy-error", "probabilities", "Entropy against error",
-            "Share of decisions whose action was unsafe, by the entropy of the ego's own intent before "
-            "fusion. If high entropy predicts errors, the line of the condition without V2V rises to the "
-            "right. How far the other lines lie below it is what the helpers correct. All seeds; 95 % "
+            "entropy-error",
+            "probabilities",
+            "Entropy against error",
+            "Share of decisions whose action was unsafe, by the entropy of the ego's own intent "
+            "before "
+            "fusion. If high entropy predicts errors, the line of the condition without V2V rises "
+            "to the "
+            "right. How far the other lines lie below it is what the helpers correct. All seeds; "
+            "95 % "
             "intervals over episodes.",
             charts.shares(rows, "entropy_nats", ENTROPY, "share unsafe", rules=tau_nats),
-        )  # fmt: skip
+        )
     if rows := joined(tokens):
         yield Panel(
-            "tokens", "answers", "Length of prompts",
-            "Number of prompts by length, in tokens as the engine counted them. Shaded: the paper's budget "
+            "tokens",
+            "answers",
+            "Length of prompts",
+            "Number of prompts by length, in tokens as the engine counted them. Shaded: the "
+            "paper's budget "
             "of 200 to 400 tokens.",
             charts.bars(
-                rows, "tokens", "tokens in the prompt", "prompts", TOKENS, series="role",
+                rows,
+                "tokens",
+                "tokens in the prompt",
+                "prompts",
+                TOKENS,
+                series="role",
                 within=BUDGET,
             ),
-        )  # fmt: skip
+        )
     if rows := joined(replies):
         yield Panel(
-            "replies", "communication", "Replies on time, late and lost",
-            "Scheduled replies, all seeds. On time: the reply arrived within the decision window and was "
+            "replies",
+            "communication",
+            "Replies on time, late and lost",
+            "Scheduled replies, all seeds. On time: the reply arrived within the decision window "
+            "and was "
             "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
-        )  # fmt: skip
+        )
     if rows := joined(energies):
         yield Panel(
             "energy",
             "communication",
             "Energy of a decision",
-            "Joules of inference on the declared device and of the radios, as means over decisions; the "
-            "interval is that of the total, over episodes. All helpers in the radius infer from the start, "
-            "asked or not; with on_demand=true those alone that are asked. If the radios' part is too small "
+            "Joules of inference on the declared device and of the radios, as means over "
+            "decisions; the "
+            "interval is that of the total, over episodes. All helpers in the radius infer from "
+            "the start, "
+            "asked or not; with on_demand=true those alone that are asked. If the radios' part is "
+            "too small "
             "to see, cooperation costs energy because helpers infer, not because they transmit.",
-            charts.stacked(rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"),
+            charts.stacked(
+                rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"
+            ),
         )
     if rows := joined(arrivals):
         yield Panel(
-            "arrivals", "communication", "When replies arrive",
-            "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: the end of "
+            "arrivals",
+            "communication",
+            "When replies arrive",
+            "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: "
+            "the end of "
             "the decision window.",
             charts.bars(
-                rows, "arrival_ms", "arrival, ms from the start of the decision", "replies",
-                ARRIVAL_MS, series="condition", rules=windows_ms,
+                rows,
+                "arrival_ms",
+                "arrival, ms from the start of the decision",
+                "replies",
+                ARRIVAL_MS,
+                series="condition",
+                rules=windows_ms,
             ),
-        )  # fmt: skip
+        )
 
 
 def _references(runs: Runs, lead: str) -> dict[str, Score]:
@@ -158,11 +209,19 @@ def success(run: Run, lead: str) -> Table:
     for condition in run.conditions:
         latency, rate = run.score(condition, LATENCY), run.score(condition, lead)
         if latency and rate:
-            rows.append({
-                "condition": condition, "latency_ms": latency.value, "latency_low": latency.low,
-                "latency_high": latency.high, "success": rate.value, "low": rate.low, "high": rate.high,
-                "n": rate.n, "interval": rate.interval,
-            })  # fmt: skip
+            rows.append(
+                {
+                    "condition": condition,
+                    "latency_ms": latency.value,
+                    "latency_low": latency.low,
+                    "latency_high": latency.high,
+                    "success": rate.value,
+                    "low": rate.low,
+                    "high": rate.high,
+                    "n": rate.n,
+                    "interval": rate.interval,
+                }
+            )
     return rows
 
 
@@ -173,13 +232,22 @@ def statuses(run: Run) -> Table:
     count = Counter((role, order.get(a.status, -1), a.status, a.verdict) for role, a in roles)
     of = Counter(role for role, _ in roles)
     return [
-        {"role": role, "status": status, "verdict": verdict, "count": n, "share": n / of[role], "n": of[role]}
+        {
+            "role": role,
+            "status": status,
+            "verdict": verdict,
+            "count": n,
+            "share": n / of[role],
+            "n": of[role],
+        }
         for (role, _, status, verdict), n in sorted(count.items())
     ]
 
 
 def reliability(run: Run) -> Table:
-    """Return how often the likeliest action was the one optimal action, by how probable fusion held it."""
+    """Return how often the likeliest action was the one optimal action,
+    by how probable fusion held it.
+    """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
     for condition, judged in zip(run.conditions, judged_by_condition, strict=True):
@@ -189,10 +257,16 @@ def reliability(run: Run) -> Table:
         for place in np.unique(bins):
             here = bins == place
             share = rate_interval(judged.right[here], judged.episode[here])
-            rows.append({
-                "condition": condition, "certainty": round(float(judged.sure[here].mean()), 4),
-                "share": share.value, "low": share.low, "high": share.high, "n": share.n,
-            })  # fmt: skip
+            rows.append(
+                {
+                    "condition": condition,
+                    "certainty": round(float(judged.sure[here].mean()), 4),
+                    "share": share.value,
+                    "low": share.low,
+                    "high": share.high,
+                    "n": share.n,
+                }
+            )
     return rows
 
 
@@ -203,17 +277,26 @@ def errors(run: Run) -> Table:
     return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
 
 
-def _shares(run: Run, bins: Ints, value: Floats, hits: Floats, name: str) -> Iterator[dict[str, Any]]:
-    conditions, episodes = run.decisions.codes("condition", run.conditions), run.decisions.whole("episode")
+def _shares(
+    run: Run, bins: Ints, value: Floats, hits: Floats, name: str
+) -> Iterator[dict[str, Any]]:
+    conditions, episodes = (
+        run.decisions.codes("condition", run.conditions),
+        run.decisions.whole("episode"),
+    )
     for n, condition in enumerate(run.conditions):
         for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
             here = (conditions == n) & (bins == place) & ~np.isnan(hits)
             if here.any():
                 share = rate_interval(hits[here], episodes[here])
                 yield {
-                    "condition": condition, name: round(float(value[here].mean()), 4), "share": share.value,
-                    "low": share.low, "high": share.high, "n": share.n,
-                }  # fmt: skip
+                    "condition": condition,
+                    name: round(float(value[here].mean()), 4),
+                    "share": share.value,
+                    "low": share.low,
+                    "high": share.high,
+                    "n": share.n,
+                }
 
 
 def entropies(run: Run) -> Table:
@@ -232,7 +315,11 @@ def tokens(run: Run) -> Table:
     for answer in run.answers:
         if answer.prompt_tokens is not None:
             by_role.setdefault(role_word(answer.role), []).append(answer.prompt_tokens)
-    return [{"role": role, **bar} for role, of in by_role.items() for bar in _histogram(of, TOKENS, "tokens")]
+    return [
+        {"role": role, **bar}
+        for role, of in by_role.items()
+        for bar in _histogram(of, TOKENS, "tokens")
+    ]
 
 
 def replies(run: Run) -> Table:
@@ -251,23 +338,31 @@ def replies(run: Run) -> Table:
         total = sum(count.values())
         rows += [
             {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}
-            for reply, n in count.items() if n
-        ]  # fmt: skip
+            for reply, n in count.items()
+            if n
+        ]
     return rows
 
 
 def energies(run: Run) -> Table:
-    """What a decision takes in joules, by who takes it, with the total's interval; where all is known."""
+    """What a decision takes in joules, by who takes it, with the total's interval;
+    where all is known.
+    """
     rows = []
     for condition in run.conditions:
-        total, helpers, radio = (run.score(condition, n) for n in ("energy_j", "helpers_j", "radio_mj"))
+        total, helpers, radio = (
+            run.score(condition, n) for n in ("energy_j", "helpers_j", "radio_mj")
+        )
         if total and helpers and radio:
             sent, thought = (radio.value or 0.0) / 1000, helpers.value or 0.0
             joules = ((total.value or 0.0) - thought - sent, thought, sent)
             of_total = {
-                "total_j": total.value, "low": total.low, "high": total.high, "n": total.n,
+                "total_j": total.value,
+                "low": total.low,
+                "high": total.high,
+                "n": total.n,
                 "interval": total.interval,
-            }  # fmt: skip
+            }
             rows += [
                 {"condition": condition, "part": part, "joules": of_part, **of_total}
                 for part, of_part in zip(charts.ENERGIES, joules, strict=True)
@@ -279,7 +374,9 @@ def arrivals(run: Run) -> Table:
     """Return when replies that are not lost arrive, in ms from the start of the decision."""
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
-    by_condition = {name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)}
+    by_condition = {
+        name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)
+    }
     return [
         {"condition": condition, **bar}
         for condition, of in by_condition.items()
@@ -289,7 +386,9 @@ def arrivals(run: Run) -> Table:
 
 
 def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Table:
-    """Return bars of one width with their lower end, from the first that is not empty to the last."""
+    """Return bars of one width with their lower end,
+    from the first that is not empty to the last.
+    """
     # A value on a bin's edge belongs to the bin above it, whatever rounding makes of the quotient.
     bins = np.floor(np.asarray(values, dtype=float) / width + 1e-9).astype(int)
     first = int(bins.min())

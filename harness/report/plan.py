@@ -1,4 +1,6 @@
-"""Plan a study of success: how many layouts find a difference, by what pilots show or by a stated rate."""
+"""Plan a study of success: how many layouts find a difference,
+by what pilots show or by a stated rate.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -43,7 +45,8 @@ class Planned:
     condition: str  # its name; empty for a stated rate
     layouts: Estimate  # how many find it; the interval is over other pilots of as many layouts
     finds: float  # the difference that as many layouts find as are asked about; NaN if none up to 1
-    cost: Cost | None  # of so many layouts under all conditions of the pilots; None for a stated rate
+    # of so many layouts under all conditions of the pilots; None for a stated rate
+    cost: Cost | None
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,9 @@ class Plan:
     layouts: int | None  # those of which `finds` is
 
 
-def from_rate(rate: float, correlation: float, detect: float, power: float, layouts: int | None) -> Plan:
+def from_rate(
+    rate: float, correlation: float, detect: float, power: float, layouts: int | None
+) -> Plan:
     """Plan by two successes near a rate whose outcomes correlate over layouts; one channel seed."""
     variance = 2 * rate * (1 - rate) * (1 - correlation)
     spread = Spread(np.ones(1), np.array([variance]))
@@ -68,10 +73,11 @@ def from_rate(rate: float, correlation: float, detect: float, power: float, layo
 
 
 def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: int | None) -> Plan:
-    """Plan by what one run shows of each condition's gain over the baseline, or two of their difference.
+    """Plan by what one run shows of each condition's gain over the baseline,
+    or two of their difference.
 
-    Raises UserError for runs that cannot be compared, one without the baseline or with no other condition, or
-    pilots of fewer than two layouts of a kind.
+    Raises UserError for runs that cannot be compared, one without the baseline or with no other
+    condition, or pilots of fewer than two layouts of a kind.
     """
     sides = _difference(*pilots) if len(pilots) > 1 else _gains(pilots[0])
     success, n = sides.success, sides.success.dangerous.size
@@ -83,7 +89,8 @@ def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: in
         if np.isinf(needed[0]):
             kinds = " with a danger, and without" * (success.metric != SUCCESS)
             raise UserError(
-                f"{sides.names}: {amount(n, 'layout')} cannot show how far layouts differ; give pilots of "
+                f"{sides.names}: {amount(n, 'layout')} cannot show how far layouts differ; give "
+                "pilots of "
                 f"two or more{kinds}"
             )
         finds = float(spread.difference(layouts or n, power)[0])
@@ -107,10 +114,13 @@ def _gains(path: Path) -> _Sides:
     run = read(path)
     if BASELINE not in run.conditions or len(run.conditions) < 2:
         raise UserError(
-            f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no gain; "
+            f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no "
+            "gain; "
             "give a second run, of another model or prompt, or a run with both"
         )
-    by_condition = dict(zip(run.conditions, of_ends(METRICS[SUCCESS], run.grid, run.episodes), strict=True))
+    by_condition = dict(
+        zip(run.conditions, of_ends(METRICS[SUCCESS], run.grid, run.episodes), strict=True)
+    )
     alone = by_condition.pop(BASELINE)
     success = Success.of(run.episodes[: len(run.grid.episodes)], lead_of(run))
     values = {name: (alone, b) for name, b in by_condition.items()}
@@ -120,7 +130,9 @@ def _gains(path: Path) -> _Sides:
 def _difference(a: Path, b: Path) -> _Sides:
     both = pair(a, b)
     first = both.conditions[0], both.seeds[0]
-    success = Success.of([both.a.ends[*first, e] for e in both.episodes], lead_of(both.a.run, both.b.run))
+    success = Success.of(
+        [both.a.ends[*first, e] for e in both.episodes], lead_of(both.a.run, both.b.run)
+    )
     values = {
         name: (both.values(both.a, SUCCESS, name).T, both.values(both.b, SUCCESS, name).T)
         for name in both.conditions
@@ -133,9 +145,10 @@ def _cost(runs: Sequence[Run]) -> Cost:
     """Return what the answers of one layout take, in all of the runs."""
     costs = list(map(_cost_of, runs))
     return Cost(
-        sum(each.requests for each in costs), _sum(each.tokens for each in costs),
+        sum(each.requests for each in costs),
+        _sum(each.tokens for each in costs),
         _sum(each.minutes for each in costs),
-    )  # fmt: skip
+    )
 
 
 def _cost_of(run: Run) -> Cost:
@@ -158,13 +171,20 @@ def _sum(values: Iterable[float | None]) -> float | None:
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
     """Return a plan as plain values: differences from 0 to 1, what is not known as None."""
     return {
-        "difference": plan.difference, "basis": plan.basis, "detect": detect, "power": power,
+        "difference": plan.difference,
+        "basis": plan.basis,
+        "detect": detect,
+        "power": power,
         "finds_with": plan.layouts,
         "conditions": [
             {
-                "condition": row.condition or None, "layouts": row.layouts, "finds": known(row.finds),
-                **(vars(row.cost) if row.cost else dict.fromkeys(("requests", "tokens", "minutes"))),
+                "condition": row.condition or None,
+                "layouts": row.layouts,
+                "finds": known(row.finds),
+                **(
+                    vars(row.cost) if row.cost else dict.fromkeys(("requests", "tokens", "minutes"))
+                ),
             }
             for row in plan.rows
         ],
-    }  # fmt: skip
+    }

@@ -1,4 +1,6 @@
-"""What a model is held against and needs none: reference drivers, and an ego that looks at nothing."""
+"""What a model is held against and needs none:
+reference drivers, and an ego that looks at nothing.
+"""
 
 from collections.abc import Iterable, Mapping
 
@@ -21,7 +23,10 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
         values = {SUCCESS: success, **by_danger(success, dataset.dangerous)}
-        rates = {name: halved(name, lambda each: rate_interval(values[each])) for name in known_in(values)}
+        rates = {
+            name: halved(name, lambda each: rate_interval(values[each]))
+            for name in known_in(values)
+        }
         return {name: Score.of(reference, name, rate, "episodes") for name, rate in rates.items()}
 
     return {name: scores(name, success) for name, success in dataset.reference_success().items()}
@@ -49,7 +54,8 @@ def meaning(name: str, exact: bool = True) -> str:
     return {
         OPEN_LOOP: "open-loop: always the same sequence of actions, the best in tune layouts",
         CONSTANT: "constant: always the action that did best in the scenario's tune layouts",
-        UNIFORM: f"uniform: every action equally likely, {exactly if exact else 'drawn in its run'}",
+        UNIFORM: f"uniform: every action equally likely, "
+        f"{exactly if exact else 'drawn in its run'}",
     }[name]
 
 
@@ -63,5 +69,8 @@ def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) 
         for name, cell in ((name, shown(score)) for name, score in best_first)
     ]
     n = next(iter(references.values())).n
-    text = f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = {n}."
+    text = (
+        f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = "
+        f"{n}."
+    )
     return " ".join([text, *(f"{meaning(name, exact)}." for name in BESIDE if name in references)])

@@ -1,7 +1,8 @@
-"""What extensions say of single decision points, which a run's page says where it lists and shows these.
+"""What extensions say of single decision points,
+which a run's page says where it lists and shows these.
 
-An extension adds such remarks by `adds={"remarks": {"name": "module:OBJECT"}}`. They are no section of the
-page: each is about one decision point, or leads to some.
+An extension adds such remarks by `adds={"remarks": {"name": "module:OBJECT"}}`. They are no section
+of the page: each is about one decision point, or leads to some.
 """
 
 import json
@@ -16,9 +17,10 @@ from harness.report.runs import Runs
 from harness.report.templating import visible
 from harness.runs.folder import Run
 
-# By decision point, what was left out of a prompt or the fusion, and what that changed. Of each: its `item`;
-# of whom: `role`, `viewer`, `condition`, `seed` or null; the likeliest `action` with it; and, null without
-# an answer, that `instead`, the `change` of the probability of `action`, the `shift` of the distribution.
+# By decision point, what was left out of a prompt or the fusion, and what that changed. Of each:
+# its `item`; of whom: `role`, `viewer`, `condition`, `seed` or null; the likeliest `action` with
+# it; and, null without an answer, that `instead`, the `change` of the probability of `action`, the
+# `shift` of the distribution.
 LeftOut = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
@@ -27,11 +29,15 @@ class Remarks(Protocol):
     """What says something of decision points."""
 
     def sentences(self, runs: Runs) -> Iterable[Markup]:
-        """Return what stands above the list; `<a data-scene=… data-run=…>` leads to a decision point."""
+        """Return what stands above the list;
+        `<a data-scene=… data-run=…>` leads to a decision point.
+        """
         ...
 
     def left_out(self, run: Run) -> LeftOut:
-        """Return what is drawn beside the answers of decision points: what they became without one thing."""
+        """Return what is drawn beside the answers of decision points:
+        what they became without one thing.
+        """
         ...
 
 
@@ -39,14 +45,17 @@ REMARKS: Plugins[Remarks] = Plugins("swarmdrive.remarks", Remarks, {})
 
 
 def sentences(runs: Runs) -> list[Markup]:
-    """Return what extensions say above the list. Of one that fails, a sentence says so in its place.
+    """Return what extensions say above the list.
+    Of one that fails, a sentence says so in its place.
 
     Raises UserError if a file of a run is broken.
     """
     said: list[Markup] = []
     for name in REMARKS:
         try:
-            said += REMARKS.ask(name, lambda remarks: [escape(each) for each in remarks.sentences(runs)])
+            said += REMARKS.ask(
+                name, lambda remarks: [escape(each) for each in remarks.sentences(runs)]
+            )
         except Failed as error:
             said.append(escape(visible(str(error))))
     return said
@@ -60,7 +69,9 @@ def left_out(run: Run) -> LeftOut:
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:
         with suppress(Failed):
-            for scene, some in REMARKS.ask(name, lambda remarks: _plain(remarks.left_out(run))).items():
+            for scene, some in REMARKS.ask(
+                name, lambda remarks: _plain(remarks.left_out(run))
+            ).items():
                 joined.setdefault(scene, []).extend(some)
     return joined
 

@@ -62,12 +62,12 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
 
     Args:
         paths: their folders.
-        dataset: one that was read already, which is read again where it is not that of the runs; or the
-            folder that theirs is in.
+        dataset: one that was read already, which is read again where it is not that of the runs; or
+            the folder that theirs is in.
 
     Raises:
-        UserError: a folder is no run or contradicts itself, its dataset is gone or has changed, or two are
-            not of the same scenes.
+        UserError: a folder is no run or contradicts itself,
+            its dataset is gone or has changed, or two are not of the same scenes.
     """
     runs = [read(path) for path in dict.fromkeys(paths)]
     if not isinstance(dataset, Dataset):  # else they were just made
@@ -112,7 +112,9 @@ def _shown(run: Run) -> str:
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:
     variants = [run.manifest.variant for run in runs]
     parts = [
-        (f"{v.model} · {v.prompt}", v.answer, run.path.name) if not v.helpers else (str(v), run.path.name)
+        (f"{v.model} · {v.prompt}", v.answer, run.path.name)
+        if not v.helpers
+        else (str(v), run.path.name)
         for v, run in zip(variants, runs, strict=True)
     ]
     for many in (1, 2, 3):

@@ -1,7 +1,7 @@
 """The sections that extensions add to a run's page.
 
-An extension adds one by `adds={"sections": {"name": "module:function"}}`. The function takes a finished run
-and returns a `Section`, or None where it has nothing to say of that run.
+An extension adds one by `adds={"sections": {"name": "module:function"}}`. The function takes a
+finished run and returns a `Section`, or None where it has nothing to say of that run.
 """
 
 from collections.abc import Callable

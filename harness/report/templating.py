@@ -19,7 +19,9 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @cache
 def environment(*more: Path) -> Environment:
-    """Return the report's templates, and those of other folders: everything is escaped and made `visible`."""
+    """Return the report's templates, and those of other folders:
+    everything is escaped and made `visible`.
+    """
     templates = Environment(
         loader=FileSystemLoader([*more, TEMPLATES]),
         autoescape=True,
@@ -30,14 +32,22 @@ def environment(*more: Path) -> Environment:
     templates.globals["palette"] = Markup(colours.variables())
     templates.filters |= {
         "number": lambda value, decimals: Unit(decimals=decimals).number(value),
-        "facts": words.facts, "shown": words.shown, "cell": words.cell, "p_value": words.p_value,
-        "mapping": _mapping, "columns": _table, "nameless": text, "visible": visible,
-    }  # fmt: skip
+        "facts": words.facts,
+        "shown": words.shown,
+        "cell": words.cell,
+        "p_value": words.p_value,
+        "mapping": _mapping,
+        "columns": _table,
+        "nameless": text,
+        "visible": visible,
+    }
     return templates
 
 
 def visible(value: Any) -> Any:
-    """Text with every character that shows nothing, or turns the line around, spelt out. None is a dash."""
+    """Text with every character that shows nothing, or turns the line around, spelt out.
+    None is a dash.
+    """
     if value is None or isinstance(value, Undefined):
         return "–"
     if isinstance(value, bool):

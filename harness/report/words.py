@@ -21,8 +21,9 @@ from harness.runs.records import Score
 from harness.runs.success import half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun, plays
 
-# Layouts from which on a corrected figure is shown beside the plain one, whatever both are: intervals of so
-# many hold the truth in 94 % of studies or more, plain and balanced (`benchmarks/difficulty.py`).
+# Layouts from which on a corrected figure is shown beside the plain one, whatever both are:
+# intervals of so many hold the truth in 94 % of studies or more, plain and balanced
+# (`benchmarks/difficulty.py`).
 SHOWN_FROM = 40
 
 
@@ -45,7 +46,9 @@ def cell(score: Score | None) -> Markup:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """Return the result in one short sentence: the best condition, and the one without V2V beside it."""
+    """Return the result in one short sentence:
+    the best condition, and the one without V2V beside it.
+    """
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
     if not best:
@@ -59,7 +62,9 @@ def headline(run: Run | SuiteRun) -> str:
         what = "clears {} of the episodes" if lead == SUCCESS else "has {} balanced success"
         text = f"Under {best}, {model} {what.format(value)}{families}"
         if halves := entry(lead).halves:
-            text += ": {} with a danger, {} without".format(*(_shown(run, best, half) for half in halves))
+            text += ": {} with a danger, {} without".format(
+                *(_shown(run, best, half) for half in halves)
+            )
         return text + (f", and no other condition{of} does better." if several else ".")
     pairs, p = plays(_runs(run), lead).pairs(best, base), p_values(run, base)
     corrected = dict(zip(p, holm(list(p.values())), strict=True))
@@ -70,8 +75,10 @@ def headline(run: Run | SuiteRun) -> str:
     shares = [_shown(run, best, half) for half in entry(lead).halves]
     changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
     return (
-        f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} against "
-        f"{base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of both is {value}, "
+        f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} "
+        "against "
+        f"{base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of both is "
+        f"{value}, "
         f"{clear}."
     )
 
@@ -82,7 +89,9 @@ def shown_change(change: Estimate) -> str:
 
 
 def judged(change: Estimate, p: float) -> str:
-    """Write a difference of success, and say that it is clear, or what is excluded where it is not."""
+    """Write a difference of success, and say that it is clear,
+    or what is excluded where it is not.
+    """
     text = shown_change(change)
     if math.isnan(change.low):
         return f"{text}, too few episodes for an interval"
@@ -91,7 +100,8 @@ def judged(change: Estimate, p: float) -> str:
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
-    """Return the best condition, and the one that it is held against: the one without V2V, or the worst.
+    """Return the best condition, and the one that it is held against:
+    the one without V2V, or the worst.
 
     Empty where there is none.
     """
@@ -99,13 +109,19 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
     scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
     radios = {c["name"] for c in run.manifest.conditions if c.get("profile") is not None}
     best = best_of(scores, radios, doubted(*_runs(run)))
-    alone = [c["name"] for c in run.manifest.conditions if c.get("profile") is None and c["name"] in scores]
+    alone = [
+        c["name"]
+        for c in run.manifest.conditions
+        if c.get("profile") is None and c["name"] in scores
+    ]
     base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
     return best, "" if base == best else base
 
 
 def figures(run: Run) -> list[dict[str, str]]:
-    """Return the few numbers of a run that are read first, each with what it is and its interval."""
+    """Return the few numbers of a run that are read first,
+    each with what it is and its interval.
+    """
     best, base = compared(run)
     lead = lead_of(run)
     better, gained = adjusted(run, best, lead) or (None, "")
@@ -114,7 +130,9 @@ def figures(run: Run) -> list[dict[str, str]]:
         (f"adjusted for difficulty, {gained}", better),
         *(
             (what, run.score(best, half))
-            for what, half in zip(("with a danger", "without a danger"), entry(lead).halves, strict=False)
+            for what, half in zip(
+                ("with a danger", "without a danger"), entry(lead).halves, strict=False
+            )
         ),
         (f"gain over {base}", run.score(best, GAINS[lead]) if base == BASELINE else None),
         (f"unsafe episodes under {best}", run.score(best, "unsafe_rate")),
@@ -132,7 +150,8 @@ def as_good_as(plain: Estimate, corrected: Estimate) -> str:
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
     """Return success corrected by the layouts' difficulty, and what that is as good as.
 
-    None of fewer layouts than `SHOWN_FROM`, and where an interval of every look leads, which this one is not.
+    None of fewer layouts than `SHOWN_FROM`, and where an interval of every look leads,
+    which this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -144,13 +163,18 @@ def adjusted_lines(run: Run) -> Iterator[str]:
     """Yield it of all conditions in which there is one, plain and balanced, as lines."""
     for metric, words in IN_WORDS.items():
         each = {name: figure for name in run.conditions if (figure := adjusted(run, name, metric))}
-        cells = (f"{printable(name)} {written(score)}, {gained}" for name, (score, gained) in each.items())
+        cells = (
+            f"{printable(name)} {written(score)}, {gained}"
+            for name, (score, gained) in each.items()
+        )
         if each:
             yield f"{words} % adjusted for difficulty: {'; '.join(cells)}"
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Return p of each other condition's gain over `base`, in what leads; of a suite the mean gain's."""
+    """Return p of each other condition's gain over `base`, in what leads;
+    of a suite the mean gain's.
+    """
     played = plays(_runs(run), lead_of(run))
     found = {c: p_of_mean(played.pairs(c, base)) for c in run.conditions if c != base}
     return {condition: 1.0 if p is None else p for condition, p in found.items()}

@@ -26,7 +26,8 @@ class Answered:
 class Answers:
     """Answers in the order of their file, which are decoded each time they are read.
 
-    So a run of a million decisions takes the memory of its file, a tenth of what its answers would take.
+    So a run of a million decisions takes the memory of its file,
+    a tenth of what its answers would take.
 
     Attributes:
         by_scene: the answers of each decision point.
@@ -35,7 +36,8 @@ class Answers:
     def __init__(self, lines: bytes, actions: int) -> None:
         """Check the lines of a run with so many actions. Raises ValueError for a broken one."""
         self._lines, self._count, self._actions = lines, 0, actions
-        self._spans: list[tuple[int, int]] = []  # of lines that stand together and are of one decision point
+        # of lines that stand together and are of one decision point
+        self._spans: list[tuple[int, int]] = []
         of_scene: dict[str, list[int]] = {}  # places in `_spans`
         keys: set[str] = set()
         scene, start = None, 0
@@ -52,7 +54,11 @@ class Answers:
                     raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:
                     scene = answer.scene
-                    keys = {sibling.key for place in of_scene.get(scene, ()) for sibling in self._span(place)}
+                    keys = {
+                        sibling.key
+                        for place in of_scene.get(scene, ())
+                        for sibling in self._span(place)
+                    }
                     of_scene.setdefault(scene, []).append(len(self._spans))
                     self._spans.append((start, stop))
                 if answer.key in keys:

@@ -1,4 +1,6 @@
-"""Hold the tables of a run against each other: each follows from others, and a file can state any number."""
+"""Hold the tables of a run against each other:
+each follows from others, and a file can state any number.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,11 +25,15 @@ from harness.runs.summary import Figures, counted
 _COLUMNS = ("value", "low", "high", "n", "n_excluded")  # the numbers of a figure
 # What runs by rules of version 1 may lack, though it follows from what they have
 LATER = {
-    BALANCED, *METRICS.built_in[BALANCED].halves, GAINS[BALANCED],
-    "optimal_action_rate", "optimal_brier", "optimal_nll_nats",
+    BALANCED,
+    *METRICS.built_in[BALANCED].halves,
+    GAINS[BALANCED],
+    "optimal_action_rate",
+    "optimal_brier",
+    "optimal_nll_nats",
     *(name for name, metric in METRICS.built_in.items() if metric.pooled),
     *(name for name in METRICS.built_in if name.startswith("success_dangerous_rate_")),
-}  # fmt: skip
+}
 Key = tuple[str, str, str]
 CLOSE = 1e-6  # how near numbers stay that were only written and read again
 
@@ -54,7 +60,9 @@ def contradictions(run: Run) -> Iterator[str]:
     """
     version = run.manifest.versions.get("figures", "1")
     if version not in map(str, range(1, FIGURES + 1)):
-        yield f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
+        yield (
+            f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
+        )
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
@@ -85,7 +93,9 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
 
 
 def _scores(run: Run) -> Iterator[Score]:
-    """Yield the figures that follow from a run's decisions, episodes, layouts and answers, by its rules."""
+    """Yield the figures that follow from a run's decisions, episodes, layouts and answers,
+    by its rules.
+    """
     answers = [answer for answer in run.answers if answer.scene in run.decisions.scenes]
     with np.errstate(all="ignore"):  # a file can state any number
         figures = Figures.of(run.world, run.grid, run.decisions, run.episodes, answers)
@@ -126,7 +136,9 @@ def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
 
 
 def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
-    """Yield which figures of the harness a run lacks, under their earlier kind of interval as well."""
+    """Yield which figures of the harness a run lacks,
+    under their earlier kind of interval as well.
+    """
     stated = {_key(run, score) for score in run.scores}
     for score in computed:
         if score.metric in METRICS.built_in and _key(run, score) not in stated:
@@ -134,7 +146,9 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
 
 
 def unchecked(run: Run) -> Iterator[str]:
-    """Yield, in sentences, which figures of a run are held against nothing, and which it may lack."""
+    """Yield, in sentences, which figures of a run are held against nothing,
+    and which it may lack.
+    """
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
     held = {key for key in figures if key[1] in METRICS.built_in and (current(run) or key in here)}
@@ -155,13 +169,17 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _key(run: Run, score: Score) -> Key:
-    """Return what a figure is known by; of a gain in a run by older rules, whichever interval it has."""
+    """Return what a figure is known by;
+    of a gain in a run by older rules, whichever interval it has.
+    """
     gain = score.metric in GAINS.values() and score.interval == pinned.KIND
     return (score.condition, score.metric, PAIRED) if gain and not current(run) else score.key
 
 
 def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:
-    """Yield which numbers of a figure are others than those computed; `whose` these are, in words."""
+    """Yield which numbers of a figure are others than those computed;
+    `whose` these are, in words.
+    """
     for what in columns:
         a, b = getattr(stated, what), getattr(other, what)
         if not close(a, b):
@@ -169,7 +187,9 @@ def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) 
 
 
 def _narrow(score: Score) -> bool:
-    """Return whether a figure's interval has no width but that of rounding, which version 1 left out."""
+    """Return whether a figure's interval has no width but that of rounding,
+    which version 1 left out.
+    """
     return score.low is not None and score.high is not None and score.high - score.low < SAME
 
 
@@ -184,13 +204,20 @@ def _of_episodes(run: Run) -> Iterator[str]:
     computed = counted(run.grid, run.decisions, run.episodes)
     for name, wrong in differing(run.episodes, computed):
         yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than decisions.parquet"
-    wrong = sum(a.success != b for a, b in zip(run.episodes, _ends(run), strict=True) if b is not None)
+    wrong = sum(
+        a.success != b for a, b in zip(run.episodes, _ends(run), strict=True) if b is not None
+    )
     if wrong:
-        yield f"episodes.csv has another success in {amount(wrong, 'row')} than the last decision leaves"
+        yield (
+            f"episodes.csv has another success in {amount(wrong, 'row')} than the last decision "
+            "leaves"
+        )
 
 
 def differing(stated: Sequence[Episode], computed: Sequence[Episode]) -> Iterator[tuple[str, int]]:
-    """Yield the columns in which the rows of two tables of the same episodes differ, and in how many."""
+    """Yield the columns in which the rows of two tables of the same episodes differ,
+    and in how many.
+    """
     for name in Episode.__struct_fields__:
         pairs = zip(stated, computed, strict=True)
         wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
@@ -199,7 +226,8 @@ def differing(stated: Sequence[Episode], computed: Sequence[Episode]) -> Iterato
 
 
 def _ends(run: Run) -> Sequence[bool | None]:
-    """Return whether success is still possible after each episode's last action; None where it is unknown.
+    """Return whether success is still possible after each episode's last action;
+    None where it is unknown.
 
     After it nothing is decided any more. Only the trees of frozen scenes know.
     """

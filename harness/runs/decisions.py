@@ -1,4 +1,6 @@
-"""The table of decisions, `decisions.parquet`: one row for each decision point, condition and seed."""
+"""The table of decisions, `decisions.parquet`:
+one row for each decision point, condition and seed.
+"""
 
 import os
 import re
@@ -22,50 +24,128 @@ from harness.runs.records import Decision, Message
 if TYPE_CHECKING:
     import pandas as pd
 
-LABEL, WHOLE, FLAG, NUMBER = pa.dictionary(pa.int32(), pa.string()), pa.int64(), pa.bool_(), pa.float64()
+LABEL, WHOLE, FLAG, NUMBER = (
+    pa.dictionary(pa.int32(), pa.string()),
+    pa.int64(),
+    pa.bool_(),
+    pa.float64(),
+)
 # Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
 COLUMNS = {
-    "scene": LABEL, "episode": WHOLE, "step": WHOLE, "danger": LABEL, "condition": LABEL, "seed": WHOLE,
-    "action": LABEL, "messages": WHOLE, "requests": WHOLE, "request_bits": NUMBER, "reply_bits": NUMBER,
-    "airtime_ms": NUMBER, "busy_ratio": NUMBER, "inference_j": NUMBER, "helpers_j": NUMBER,
-    "radio_mj": NUMBER, "waiting_j": NUMBER, "own_failed": FLAG, "triggered": FLAG, "entropy_nats": NUMBER,
-    "normalised_entropy": NUMBER, "own_weight": NUMBER, "latency_ms": NUMBER, "deadline_missed": FLAG,
-    "fusion_ms": NUMBER, "fusion_failed": FLAG, "effective_loss": NUMBER, "observed_loss": NUMBER,
-    "value": FLAG, "safe": FLAG, "regret": FLAG, "delay_s": NUMBER, "off_lag": FLAG, "acts_at_s": NUMBER,
-    "acted": FLAG, "miss": FLAG, "false_alarm": FLAG, "ttc_s": NUMBER, "pet_s": NUMBER, "short_ttc": FLAG,
-    "short_pet": FLAG, "agent": LABEL, "broke_word": FLAG,
-}  # fmt: skip
+    "scene": LABEL,
+    "episode": WHOLE,
+    "step": WHOLE,
+    "danger": LABEL,
+    "condition": LABEL,
+    "seed": WHOLE,
+    "action": LABEL,
+    "messages": WHOLE,
+    "requests": WHOLE,
+    "request_bits": NUMBER,
+    "reply_bits": NUMBER,
+    "airtime_ms": NUMBER,
+    "busy_ratio": NUMBER,
+    "inference_j": NUMBER,
+    "helpers_j": NUMBER,
+    "radio_mj": NUMBER,
+    "waiting_j": NUMBER,
+    "own_failed": FLAG,
+    "triggered": FLAG,
+    "entropy_nats": NUMBER,
+    "normalised_entropy": NUMBER,
+    "own_weight": NUMBER,
+    "latency_ms": NUMBER,
+    "deadline_missed": FLAG,
+    "fusion_ms": NUMBER,
+    "fusion_failed": FLAG,
+    "effective_loss": NUMBER,
+    "observed_loss": NUMBER,
+    "value": FLAG,
+    "safe": FLAG,
+    "regret": FLAG,
+    "delay_s": NUMBER,
+    "off_lag": FLAG,
+    "acts_at_s": NUMBER,
+    "acted": FLAG,
+    "miss": FLAG,
+    "false_alarm": FLAG,
+    "ttc_s": NUMBER,
+    "pet_s": NUMBER,
+    "short_ttc": FLAG,
+    "short_pet": FLAG,
+    "agent": LABEL,
+    "broke_word": FLAG,
+}
 # A file has no such column if all its values are unknown.
 OPTIONAL = (
-    "busy_ratio", "inference_j", "helpers_j", "radio_mj", "waiting_j", "miss", "false_alarm", "ttc_s",
-    "pet_s", "short_ttc", "short_pet", "agent", "broke_word",
-)  # fmt: skip
+    "busy_ratio",
+    "inference_j",
+    "helpers_j",
+    "radio_mj",
+    "waiting_j",
+    "miss",
+    "false_alarm",
+    "ttc_s",
+    "pet_s",
+    "short_ttc",
+    "short_pet",
+    "agent",
+    "broke_word",
+)
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # One column for each action: the policy, and the outcome of the action.
 OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
 # One column for each message, numbered from 1: the helper asked, and what became of its reply.
 OF_MESSAGES = {
-    "helper": LABEL, "delivered": FLAG, "on_time": FLAG, "arrival_ms": NUMBER, "weight": NUMBER,
-    "trust": NUMBER, "attacker": FLAG,
-}  # fmt: skip
+    "helper": LABEL,
+    "delivered": FLAG,
+    "on_time": FLAG,
+    "arrival_ms": NUMBER,
+    "weight": NUMBER,
+    "trust": NUMBER,
+    "attacker": FLAG,
+}
 DECIMALS = {  # enough for every figure, and few enough to be the same on every machine
-    "entropy_nats": 6, "normalised_entropy": 6, "own_weight": 6, "latency_ms": 3, "fusion_ms": 3, "fused": 6,
-    "airtime_ms": 6, "busy_ratio": 6, "inference_j": 6, "helpers_j": 6, "radio_mj": 6, "waiting_j": 6,
-    "arrival_ms": 3, "weight": 6, "trust": 6,
-}  # fmt: skip
+    "entropy_nats": 6,
+    "normalised_entropy": 6,
+    "own_weight": 6,
+    "latency_ms": 3,
+    "fusion_ms": 3,
+    "fused": 6,
+    "airtime_ms": 6,
+    "busy_ratio": 6,
+    "inference_j": 6,
+    "helpers_j": 6,
+    "radio_mj": 6,
+    "waiting_j": 6,
+    "arrival_ms": 3,
+    "weight": 6,
+    "trust": 6,
+}
 
-CELL, SLACK = 256, 1 << 26  # bytes of a cell at most, before compression, and of what all files have
+# bytes of a cell at most, before compression, and of what all files have
+CELL, SLACK = 256, 1 << 26
 ROWS = 2048  # how many rows become mappings at a time
 ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1 GB in memory
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
     """Return the names and types of the columns, in the order of the file."""
-    return pa.schema([
-        *COLUMNS.items(),
-        *((f"{name}_{action}", kind) for name, kind in OF_ACTIONS.items() for action in actions),
-        *((f"{name}_{n}", kind) for n in range(1, helpers + 1) for name, kind in OF_MESSAGES.items()),
-    ])  # fmt: skip
+    return pa.schema(
+        [
+            *COLUMNS.items(),
+            *(
+                (f"{name}_{action}", kind)
+                for name, kind in OF_ACTIONS.items()
+                for action in actions
+            ),
+            *(
+                (f"{name}_{n}", kind)
+                for n in range(1, helpers + 1)
+                for name, kind in OF_MESSAGES.items()
+            ),
+        ]
+    )
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
@@ -98,7 +178,9 @@ class Decisions:
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
-        """Make decisions from arrays and `Labels` (n,) by name; a column that is not given is unknown."""
+        """Make decisions from arrays and `Labels` (n,) by name;
+        a column that is not given is unknown.
+        """
         n = len(columns["seed"])
         fields = schema(actions, helpers)
         arrays = {
@@ -112,7 +194,9 @@ class Decisions:
         """Concatenate decisions that have the same actions."""
         actions, helpers = parts[0].actions, max(part.helpers for part in parts)
         tables = pa.concat_tables([part.table for part in parts], promote_options="default")
-        return cls(tables.select(schema(actions, helpers).names).unify_dictionaries(), actions, helpers)
+        return cls(
+            tables.select(schema(actions, helpers).names).unify_dictionaries(), actions, helpers
+        )
 
     def __len__(self) -> int:
         return len(self.table)
@@ -140,12 +224,16 @@ class Decisions:
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
-        """Return the columns of numbers or flags of messages, (n, H); NaN where nobody was asked."""
+        """Return the columns of numbers or flags of messages, (n, H);
+        NaN where nobody was asked.
+        """
         columns = [self[f"{name}_{place}"] for place in range(1, self.helpers + 1)]
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Return each label's index in `names`, (n,); -1 without a label. Raises ValueError for any other."""
+        """Return each label's index in `names`, (n,); -1 without a label.
+        Raises ValueError for any other.
+        """
         column = self.table[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}
         labels = column.dictionary.to_pylist()
@@ -204,7 +292,10 @@ class Decisions:
     def infinite(self) -> str | None:
         """Return the name of a column with an infinite number, or None."""
         for column in self.table.schema:
-            if column.type == NUMBER and np.isinf(_values(self.table[column.name], np.nan, np.float64)).any():
+            if (
+                column.type == NUMBER
+                and np.isinf(_values(self.table[column.name], np.nan, np.float64)).any()
+            ):
                 return str(column.name)
         return None
 
@@ -226,10 +317,14 @@ class Decisions:
             for column in self.table.column_names
             if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
         }
-        return self.replace(**{column: self[column].round(digits) for column, digits in decimals.items()})
+        return self.replace(
+            **{column: self[column].round(digits) for column, digits in decimals.items()}
+        )
 
     def write(self, path: Path) -> None:
-        """Write a Parquet file. Equal rows give equal bytes: names are numbered in the order of the rows."""
+        """Write a Parquet file. Equal rows give equal bytes:
+        names are numbered in the order of the rows.
+        """
         with replacing(path) as part:
             self._write(part)
 
@@ -246,18 +341,23 @@ class Decisions:
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
         """Read a Parquet file.
 
-        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most` rows or
-        more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
+        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most`
+        rows or more bytes than its rows can need: a file of a few bytes may hold a thousand million
+        rows.
         """
         with arrow_file(path) as file:  # read_table would make columns of folder names
             source = pq.ParquetFile(file)
             if most is not None and source.metadata.num_rows > most:
-                raise ValueError(f"{source.metadata.num_rows} rows; {most} is the most for its episodes")
+                raise ValueError(
+                    f"{source.metadata.num_rows} rows; {most} is the most for its episodes"
+                )
             there = source.schema_arrow.names
             helpers = _helpers(there)
             expected = schema(actions, helpers)
             missing = [name for name in expected.names if name not in there]
-            if lacking := [name for name in missing if re.sub(r"_\d+$", "", name) not in formats.COLUMNS]:
+            if lacking := [
+                name for name in missing if re.sub(r"_\d+$", "", name) not in formats.COLUMNS
+            ]:
                 raise ValueError(f"it lacks {', '.join(lacking)}")
             wanted = [name for name in expected.names if name in there]
             if (
@@ -271,13 +371,19 @@ class Decisions:
         for name in NEVER_UNKNOWN:
             if table[name].null_count:
                 raise ValueError(f"{name} is unknown in some rows")
-        return cls(table.select(expected.names).cast(expected).unify_dictionaries(), tuple(actions), helpers)
+        return cls(
+            table.select(expected.names).cast(expected).unify_dictionaries(),
+            tuple(actions),
+            helpers,
+        )
 
     def frame(self) -> "pd.DataFrame":
         """Return a pandas table: names are categories, and flags may be unknown."""
         import pandas as pd
 
-        return cast("pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get))
+        return cast(
+            "pd.DataFrame", self.table.to_pandas(types_mapper={FLAG: pd.BooleanDtype()}.get)
+        )
 
 
 @dataclass(frozen=True)
@@ -301,7 +407,9 @@ def _bytes(described: pq.FileMetaData, names: Collection[str]) -> int:
     """Return the bytes that some columns of a Parquet file take without compression, as it says."""
     groups = (described.row_group(n) for n in range(described.num_row_groups))
     columns = (group.column(n) for group in groups for n in range(group.num_columns))
-    return sum(column.total_uncompressed_size for column in columns if column.path_in_schema in names)
+    return sum(
+        column.total_uncompressed_size for column in columns if column.path_in_schema in names
+    )
 
 
 def _helpers(columns: Iterable[str]) -> int:
@@ -309,9 +417,14 @@ def _helpers(columns: Iterable[str]) -> int:
 
 
 def _write(
-    target: Path | BytesIO, parts: Iterable[Decisions], columns: pa.Schema, left_out: Collection[str]
+    target: Path | BytesIO,
+    parts: Iterable[Decisions],
+    columns: pa.Schema,
+    left_out: Collection[str],
 ) -> None:
-    """Write decisions as one Parquet file with these columns but some; whole parts share a row group."""
+    """Write decisions as one Parquet file with these columns but some;
+    whole parts share a row group.
+    """
     kinds = pa.schema([column for column in columns if column.name not in left_out])
     with pq.ParquetWriter(target, kinds, compression="zstd") as writer:
         group = [_empty(kinds)]
@@ -325,7 +438,9 @@ def _write(
 
 
 def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
-    """Return tables as one, of the first one's columns; names are numbered in the order of the rows."""
+    """Return tables as one, of the first one's columns;
+    names are numbered in the order of the rows.
+    """
     kinds = tables[0].schema
     table = pa.concat_tables(tables, promote_options="default").select(kinds.names).combine_chunks()
     columns = [
@@ -338,8 +453,8 @@ def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
 def arrow_file(path: Path) -> pa.BufferReader:
     """Open a file for Arrow, which gets its content in memory of its own.
 
-    Arrow's threads let go of a file after the call that read it. Of an object of Python, bytes as well, they
-    need the interpreter for that, and abort the process if it has begun to end.
+    Arrow's threads let go of a file after the call that read it. Of an object of Python, bytes as
+    well, they need the interpreter for that, and abort the process if it has begun to end.
     """
     with opened(path, "rows") as file:
         content = pa.allocate_buffer(os.fstat(file.fileno()).st_size)
@@ -347,7 +462,8 @@ def arrow_file(path: Path) -> pa.BufferReader:
     return pa.BufferReader(content.slice(0, size))
 
 
-# pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids that.
+# pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids
+# that.
 
 
 def _empty(kinds: pa.Schema) -> pa.Table:
@@ -360,7 +476,9 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
         codes = _of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
         texts = [name.encode() for name in values.names]
         ends = np.cumsum([0] + [len(text) for text in texts], dtype=np.int32)
-        names = pa.StringArray.from_buffers(len(texts), pa.py_buffer(ends), pa.py_buffer(b"".join(texts)))
+        names = pa.StringArray.from_buffers(
+            len(texts), pa.py_buffer(ends), pa.py_buffer(b"".join(texts))
+        )
         return pa.DictionaryArray.from_arrays(codes, names)
     if kind == WHOLE:
         return _of_buffer(values.astype(np.int64), None, kind)
@@ -370,7 +488,9 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
 
 def _of_buffer(values: Any, valid: Any, kind: pa.DataType) -> pa.Array:
     mask = None if valid is None else pa.py_buffer(np.packbits(valid, bitorder="little"))
-    return pa.Array.from_buffers(kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))])
+    return pa.Array.from_buffers(
+        kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))]
+    )
 
 
 def _kept(values: Floats) -> Floats:
@@ -387,5 +507,7 @@ def _values(column: Any, unknown: float | int, kind: type) -> Any:
     if not array.null_count:
         return values
     end = array.offset + len(array)
-    valid = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[array.offset :]
+    valid = np.unpackbits(np.frombuffer(mask, np.uint8), count=end, bitorder="little")[
+        array.offset :
+    ]
     return np.where(valid, values, unknown)

@@ -1,6 +1,8 @@
-"""Device profiles (`devices/*.toml`, shipped and a project's), and the time and energy of an answer on one.
+"""Device profiles (`devices/*.toml`, shipped and a project's),
+and the time and energy of an answer on one.
 
-A file has one row for each model. A number without a source is left out, and results from it are not known.
+A file has one row for each model. A number without a source is left out,
+and results from it are not known.
 """
 
 import re
@@ -24,14 +26,17 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
 class Speed(Struct, frozen=True):
-    """How fast a computer answers one request with a model, and the energy of a token; None if unknown."""
+    """How fast a computer answers one request with a model, and the energy of a token;
+    None if unknown.
+    """
 
     model: str  # the model of the row in the device profile
     prefill_tokens_per_s: Rate | None  # prompt tokens read in a second
     decode_tokens_per_s: Rate | None  # output tokens written in a second
     joules_per_prompt_token: Rate | None = None  # energy to read one token
     joules_per_output_token: Rate | None = None  # energy to write one token
-    answer_s: Rate | None = None  # seconds of an answer of any length, as makers of decision models state it
+    # seconds of an answer of any length, as makers of decision models state it
+    answer_s: Rate | None = None
 
 
 class Constant(Struct, frozen=True):
@@ -46,7 +51,8 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
     """The rates of a device with one model; None where no source states them."""
 
     model: str  # the model's name; that of a card, if there is one
-    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]  # billions of weights
+    # billions of weights
+    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]
     precision: str  # number format of the weights
     batch_size: Count  # requests that went through the device together when it was timed
     prefill_tokens_per_s: Constant | None = None  # prompt tokens read in a second
@@ -55,8 +61,8 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
     joules_per_prompt_token: Constant | None = None
     # energy to write one token, the device's idle draw included
     joules_per_output_token: Constant | None = None
-    # one answer of a decision model, in ms; it stands in place of rates, since nobody says how long the
-    # question was
+    # one answer of a decision model, in ms; it stands in place of rates, since nobody says how long
+    # the question was
     answer_ms: Constant | None = None
     memory_gb: Constant | None = None  # memory that the model takes, in 10^9 bytes
 
@@ -68,18 +74,20 @@ class Device(Struct, frozen=True, kw_only=True):
     description: str  # one sentence for lists
     power_mode: str  # the power mode in which it was timed
     rows: tuple[DeviceRow, ...]  # one row for each model
-    # how a model without a row is timed: `weights` scales the nearest row inversely to the number of
-    # weights; None refuses the model
+    # how a model without a row is timed: `weights` scales the nearest row inversely to the number
+    # of weights; None refuses the model
     scaling: Literal["weights"] | None = None
     # its draw while it infers; a row without joules per token gets them from this
     load_watts: Constant | None = None
     idle_watts: Constant | None = None  # its draw while it waits
     transmit_dbm: Constant | None = None  # radiated power of its radio, if the channel states none
-    amplifier_efficiency: Constant | None = None  # the share of the radio amplifier's draw that is radiated
-    # least time on air of a message under a channel that states bits and bandwidth alone; None counts
-    # only these
+    # the share of the radio amplifier's draw that is radiated
+    amplifier_efficiency: Constant | None = None
+    # least time on air of a message under a channel that states bits and bandwidth alone; None
+    # counts only these
     frame_ms: Constant | None = None
-    memory_gb: Constant | None = None  # the computer's memory, shared by its CPU and GPU where it has one
+    # the computer's memory, shared by its CPU and GPU where it has one
+    memory_gb: Constant | None = None
 
     def __post_init__(self) -> None:
         names = [row.model for row in self.rows]
@@ -87,7 +95,9 @@ class Device(Struct, frozen=True, kw_only=True):
             raise ValueError("rows: give one or more, of different models")
         for row in self.rows:
             if row.answer_ms and (row.prefill_tokens_per_s or row.decode_tokens_per_s):
-                raise ValueError(f"row of {printable(row.model)}: give answer_ms or rates, not both")
+                raise ValueError(
+                    f"row of {printable(row.model)}: give answer_ms or rates, not both"
+                )
 
 
 def names() -> list[str]:
@@ -121,8 +131,8 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 def find_row(device: Device, model: str) -> DeviceRow:
     """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
 
-    A model is the name of a row, of a card, or a size such as `3b`, in billions of weights. Raises UserError
-    if the profile has no row for it.
+    A model is the name of a row, of a card, or a size such as `3b`, in billions of weights.
+    Raises UserError if the profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:
@@ -137,7 +147,9 @@ def find_row(device: Device, model: str) -> DeviceRow:
 
 
 def _scaled(device: Device, billions: float) -> DeviceRow:
-    """Scale the row with the nearest number of weights, by ratio; rates go down as the weights go up."""
+    """Scale the row with the nearest number of weights, by ratio;
+    rates go down as the weights go up.
+    """
     rated = [row for row in device.rows if not row.answer_ms]
     near = min(rated, key=lambda row: max(row.billions, billions) / min(row.billions, billions))
     ratio = billions / near.billions
@@ -154,7 +166,9 @@ def _scaled(device: Device, billions: float) -> DeviceRow:
 
 
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
-    """Yield the rates and joules of a row by name; joules that it lacks are derived from `load_watts`."""
+    """Yield the rates and joules of a row by name;
+    joules that it lacks are derived from `load_watts`.
+    """
     for name in RATES:
         yield name, getattr(row, name)
     for name, rate in JOULES.items():
@@ -174,7 +188,9 @@ def speed(device: Device, row: DeviceRow) -> Speed:
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the seconds of one answer: prompt and output tokens, each over its rate; NaN if unknown."""
+    """Return the seconds of one answer: prompt and output tokens, each over its rate;
+    NaN if unknown.
+    """
     if speed.answer_s is not None:
         return speed.answer_s
     rates = _or_nan(speed.prefill_tokens_per_s), _or_nan(speed.decode_tokens_per_s)
@@ -182,7 +198,9 @@ def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
 
 
 def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the joules of one answer, with those of the idle device in that time; NaN if unknown."""
+    """Return the joules of one answer, with those of the idle device in that time;
+    NaN if unknown.
+    """
     per_token = _or_nan(speed.joules_per_prompt_token), _or_nan(speed.joules_per_output_token)
     return prompt_tokens * per_token[0] + output_tokens * per_token[1]
 

@@ -1,7 +1,7 @@
 """Correct success for the layouts' difficulty, which their trees know before any model is asked.
 
-What two drivers and even actions do in all layouts of a dataset says how hard those are in which a model was
-asked. `harness/core/covariate.py` has the rule.
+What two drivers and even actions do in all layouts of a dataset says how hard those are in which a
+model was asked. `harness/core/covariate.py` has the rule.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -54,8 +54,12 @@ class Pool:
             np.array([places[episode] for episode in episodes]),
         )
 
-    def difference(self, success: Success, a: Floats, b: Floats, level: float = LEVEL) -> Estimate | None:
-        """Return success a - b, both (S, E), paired by episode and corrected; None if it cannot be."""
+    def difference(
+        self, success: Success, a: Floats, b: Floats, level: float = LEVEL
+    ) -> Estimate | None:
+        """Return success a - b, both (S, E), paired by episode and corrected;
+        None if it cannot be.
+        """
 
         def plain(part: Bools) -> Estimate:
             return metrics.difference(SUCCESS, [(a[:, part].T, b[:, part].T)], level)
@@ -71,9 +75,16 @@ class Pool:
         return self._corrected(success, plain, known_mean(values, 0), 0.0, LEVEL)
 
     def _corrected(
-        self, success: Success, plain: Callable[[Bools], Estimate], values: Floats, least: float, level: float
+        self,
+        success: Success,
+        plain: Callable[[Bools], Estimate],
+        values: Floats,
+        least: float,
+        level: float,
     ) -> Estimate | None:
-        """Correct each half of its own where success is balanced; one that cannot be stays as it is."""
+        """Correct each half of its own where success is balanced;
+        one that cannot be stays as it is.
+        """
         parts, known = success.parts, self.known[self.answered]
         pools = [self.known]
         if len(parts) > 1:
@@ -89,8 +100,12 @@ class Pool:
         return mean_of(chosen) if len(chosen) > 1 else chosen[0]
 
 
-def adjusted_scores(grid: Grid, episodes: Sequence[Episode], layouts: Sequence[Layout]) -> Iterator[Score]:
-    """Yield the scores of success, and of gains in it, corrected; the episodes are in the grid's order."""
+def adjusted_scores(
+    grid: Grid, episodes: Sequence[Episode], layouts: Sequence[Layout]
+) -> Iterator[Score]:
+    """Yield the scores of success, and of gains in it, corrected;
+    the episodes are in the grid's order.
+    """
     success, values = by_condition(grid, episodes)
     pool = Pool.of(layouts, grid.episodes)
     for by in success.ways:

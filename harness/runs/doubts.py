@@ -1,7 +1,7 @@
 """The conditions of a run that a warning is about.
 
-Read from plain values of `run.json` and `summary.csv`, so that pages, which hold a whole run, and lists,
-which read no more than these, agree.
+Read from plain values of `run.json` and `summary.csv`, so that pages,
+which hold a whole run, and lists, which read no more than these, agree.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,9 @@ Channel = tuple[Mapping[str, Any], Mapping[str, Sequence[float]]]  # its paramet
 def doubted(
     conditions: Conditions, channels: Mapping[str, Channel], off_lag: Mapping[str, float | None]
 ) -> set[str]:
-    """Return the conditions that a warning is about: controls, another lag, a radio beyond its source."""
+    """Return the conditions that a warning is about:
+    controls, another lag, a radio beyond its source.
+    """
     names = {name for control in CONTROLS for name in controls(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
 
@@ -31,12 +33,16 @@ def controls(conditions: Conditions, control: str) -> list[str]:
 
 
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
-    """Return the conditions most of whose decisions act in another frame than the dataset assumes."""
+    """Return the conditions most of whose decisions act in another frame than the dataset
+    assumes.
+    """
     return [name for name, share in off_lag.items() if (share or 0.0) >= MOST_OFF_LAG]
 
 
 def beyond(conditions: Conditions, channels: Mapping[str, Channel]) -> Iterator[tuple[str, str]]:
-    """Yield conditions whose radio has settings that its model's source never held against anything."""
+    """Yield conditions whose radio has settings that its model's source never held against
+    anything.
+    """
     for condition in conditions:
         if channel := channels.get(condition.get("profile") or ""):
             parameters, limits = channel

@@ -1,4 +1,6 @@
-"""Export a run's tables as text files; a file is written in pieces, and appears only once it is complete."""
+"""Export a run's tables as text files;
+a file is written in pieces, and appears only once it is complete.
+"""
 
 import csv
 from collections.abc import Iterable, Sequence
@@ -22,7 +24,8 @@ AT_ONCE = 10_000  # decisions in a piece
 
 
 def decisions_csv(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`; unknown is empty.
+    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`;
+    unknown is empty.
 
     A text that a spreadsheet would take for a formula has an apostrophe before it.
     """
@@ -33,16 +36,24 @@ def decisions_csv(decisions: Decisions, path: Path) -> Path:
     with replacing(path) as part, pacsv.CSVWriter(part, plain) as writer:
         for piece in decisions.table.to_batches(AT_ONCE):
             table = pa.Table.from_batches([piece]).cast(plain)
-            writer.write_table(pa.table([_neutral(column) for column in table.columns], schema=plain))
+            writer.write_table(
+                pa.table([_neutral(column) for column in table.columns], schema=plain)
+            )
     return path
 
 
 def _neutral(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    return pa.chunked_array([map(neutral, column.to_pylist())]) if pa.types.is_string(column.type) else column
+    return (
+        pa.chunked_array([map(neutral, column.to_pylist())])
+        if pa.types.is_string(column.type)
+        else column
+    )
 
 
 def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as JSON Lines: one a line, with the columns of `decisions.parquet`; unknown is null."""
+    """Write decisions as JSON Lines: one a line, with the columns of `decisions.parquet`;
+    unknown is null.
+    """
     encoder = msgspec.json.Encoder()
     with replacing(path) as part, part.open("wb") as file:
         for piece in decisions.table.to_batches(AT_ONCE):
@@ -53,7 +64,8 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 def junit(run: Run, path: Path) -> Path:
     """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails.
 
-    An episode with a question that got no answer is an error, unless it was a message that may be lost.
+    An episode with a question that got no answer is an error,
+    unless it was a message that may be lost.
     """
     errors = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}
@@ -61,7 +73,11 @@ def junit(run: Run, path: Path) -> Path:
         episodes.setdefault((outcome.condition, outcome.episode), []).append(outcome)
     cases = []
     for (condition, episode), by_seed in episodes.items():
-        failed = [f"{outcome.failure} with seed {outcome.seed}" for outcome in by_seed if not outcome.success]
+        failed = [
+            f"{outcome.failure} with seed {outcome.seed}"
+            for outcome in by_seed
+            if not outcome.success
+        ]
         group = f"{run.source} · {run.manifest.variant} · {condition}"
         failure = f"{len(failed)} of {len(by_seed)} seeds: {', '.join(failed)}"
         words = errors.get((condition, episode))
@@ -81,21 +97,26 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
     for answer in answers:
         for row in decisions.scenes.get(answer.scene, ()):
             if answer.role != "merge" or decisions["fusion_failed"][row] == 1.0:
-                errors.setdefault((run.conditions[conditions[row]], int(numbers[row])), answer.error or "")
+                errors.setdefault(
+                    (run.conditions[conditions[row]], int(numbers[row])), answer.error or ""
+                )
     return errors
 
 
 def junit_of_none(run: Path, error: str) -> str:
-    """Return JUnit's XML of a run that did not finish, since its model could not be asked: one error."""
+    """Return JUnit's XML of a run that did not finish,
+    since its model could not be asked: one error.
+    """
     name = run.absolute().name
     return test_suite(f"harness {name}", [Case(name, "the model answers", error=error)])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
-    """Write answers as CSV: one a line, the fields of `answers.jsonl`, a column an action for the intent.
+    """Write answers as CSV: one a line, the fields of `answers.jsonl`,
+    a column an action for the intent.
 
-    What an engine says of an error has the names of files without their folders. A text that a spreadsheet
-    would take for a formula has an apostrophe before it.
+    What an engine says of an error has the names of files without their folders. A text that a
+    spreadsheet would take for a formula has an apostrophe before it.
     """
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]
@@ -105,11 +126,15 @@ def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -
         for answer in answers:
             values = {
                 **{name: answer.cell(name) for name in plain},
-                "heard": "+".join(answer.heard), "repairs": " ".join(answer.repairs),
-                "detail": text(answer.detail), "error": answer.error and text(answer.error),
+                "heard": "+".join(answer.heard),
+                "repairs": " ".join(answer.repairs),
+                "detail": text(answer.detail),
+                "error": answer.error and text(answer.error),
                 "extension": _json(answer.cell("extension")),
-            }  # fmt: skip
-            file.write(_line([*values.values(), *(answer.intent or unknown), _json(answer.message)]))
+            }
+            file.write(
+                _line([*values.values(), *(answer.intent or unknown), _json(answer.message)])
+            )
     return path
 
 

@@ -1,7 +1,7 @@
 """Formats of other programs that extensions add to `harness run export`, each an option of its own.
 
-An extension adds one by `adds={"exports": {"name": "module:OBJECT"}}`; `--name FILE` writes it. Its attribute
-`options`, if it has one, is a table of further options by name.
+An extension adds one by `adds={"exports": {"name": "module:OBJECT"}}`; `--name FILE` writes it. Its
+attribute `options`, if it has one, is a table of further options by name.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,7 +21,8 @@ class Option:
 
     kind: type  # what is typed: `bool` for a switch, or `float`
     help: str
-    refusal: Callable[[Any, str], str | None]  # why a value is refused beside the option that names a file
+    # why a value is refused beside the option that names a file
+    refusal: Callable[[Any, str], str | None]
 
 
 @runtime_checkable
@@ -30,7 +31,8 @@ class Export(Protocol):
 
     help: str  # of the option
     doing: str  # what is said while it writes
-    needs: tuple[str, ...]  # modules of extras without which it cannot write: `harness.core.extras.OPTIONAL`
+    # modules of extras without which it cannot write: `harness.core.extras.OPTIONAL`
+    needs: tuple[str, ...]
 
     def write(self, run: Run, file: Path, dataset: Path | None, **options: Any) -> Path:
         """Write a file and return it; `dataset` is the folder of the run's, if it is stated.
@@ -46,12 +48,20 @@ class Exports(Plugins[Export]):
     def _load(self, name: str) -> Export:
         format = super()._load(name)
         options: object = getattr(format, "options", MappingProxyType({}))
-        texts = (format.help, format.doing, *(format.needs if isinstance(format.needs, tuple) else (None,)))
-        named = isinstance(options, Mapping) and all(isinstance(each, Option) for each in options.values())
+        texts = (
+            format.help,
+            format.doing,
+            *(format.needs if isinstance(format.needs, tuple) else (None,)),
+        )
+        named = isinstance(options, Mapping) and all(
+            isinstance(each, Option) for each in options.values()
+        )
         if not (named and all(isinstance(text, str) for text in texts)):
             raise UserError(
-                f"plug-in {printable(name)!r} ({self.group}) has a help, doing or needs that is no text, or "
-                "options that are no table of Option; repair or uninstall the package that registers it"
+                f"plug-in {printable(name)!r} ({self.group}) has a help, doing or needs that is no "
+                "text, or "
+                "options that are no table of Option; repair or uninstall the package that "
+                "registers it"
             )
         return format
 

@@ -1,7 +1,8 @@
 """Read a run's folder; one reader serves every world, and `writer.py` is the one writer.
 
 `answers.jsonl` has one answer a line, `decisions.parquet` one decision a row. `episodes.csv` and
-`summary.csv` follow from both. `run.json` records the run's settings and origin, and is written last.
+`summary.csv` follow from both. `run.json` records the run's settings and origin, and is written
+last.
 """
 
 import csv
@@ -72,7 +73,11 @@ class Run:
     def source(self) -> str:
         """The dataset or scenario of the episodes, in words for people."""
         world = self.manifest.world
-        return world.name if isinstance(world, FrozenScenes) else f"{world.title} (driven in closed loop)"
+        return (
+            world.name
+            if isinstance(world, FrozenScenes)
+            else f"{world.title} (driven in closed loop)"
+        )
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
@@ -120,21 +125,30 @@ class Run:
         return {layout: place for place, layout in enumerate(self.grid.episodes)}
 
     def of_scenes(self, ids: Collection[str]) -> "Run":
-        """Return the run with only its decisions and answers in some scenes, and the episodes of these."""
+        """Return the run with only its decisions and answers in some scenes,
+        and the episodes of these.
+        """
         rows = [row for scene in ids for row in self.decisions.scenes.get(scene, ())]
         decisions = self.decisions.take(rows)
         layouts = tuple(dict.fromkeys(decisions.whole("episode").tolist()))
         grid = replace(self.grid, episodes=layouts)
         part = replace(self)
-        part.__dict__.update({  # as if it had read them from its files
-            "decisions": decisions,
-            "_placed": (grid, tuple(grid.ordered([e for n in layouts for e in self.episodes_of(n)]))),
-            "answers_by_scene": {scene: self.answers_by_scene.get(scene, []) for scene in ids},
-        })  # fmt: skip
+        part.__dict__.update(
+            {  # as if it had read them from its files
+                "decisions": decisions,
+                "_placed": (
+                    grid,
+                    tuple(grid.ordered([e for n in layouts for e in self.episodes_of(n)])),
+                ),
+                "answers_by_scene": {scene: self.answers_by_scene.get(scene, []) for scene in ids},
+            }
+        )
         return part
 
     def agent(self, answer: Answer) -> dict[str, Any]:
-        """Return the agent of an answer: its model, prompt, answer mode and thinking (`Manifest.agent`)."""
+        """Return the agent of an answer:
+        its model, prompt, answer mode and thinking (`Manifest.agent`).
+        """
         place = self._viewer_place(answer)
         if place not in self._agents:
             self._agents[place] = self.manifest.agent(place)
@@ -149,12 +163,16 @@ class Run:
         return self.manifest.latency.speed(self._viewer_place(answer))
 
     def seconds(self, answer: Answer) -> float | None:
-        """Return the seconds that an answer of its agent takes, a repair turn included; None if unknown."""
+        """Return the seconds that an answer of its agent takes, a repair turn included;
+        None if unknown.
+        """
         usual_s = self.manifest.latency.seconds(self._viewer_place(answer))
         return None if usual_s is None else usual_s * answer.turns + answer.slow_s
 
     def _viewer_place(self, answer: Answer) -> int:
-        """Return the place of an answer's viewer, the ego at 0; also 0 if one agent answers for all."""
+        """Return the place of an answer's viewer, the ego at 0;
+        also 0 if one agent answers for all.
+        """
         if not self.manifest.helpers:
             return 0
         if answer.agent is not msgspec.UNSET:
@@ -174,17 +192,22 @@ class Run:
     def _layouts(self, file: Path) -> tuple[Layout, ...]:
         layouts = records_of(file, Layout)
         dangers = {layout.episode: layout.danger for layout in layouts}
-        if len(dangers) < len(layouts) or any(dangers.get(e.episode) != e.danger for e in self.episodes):
+        if len(dangers) < len(layouts) or any(
+            dangers.get(e.episode) != e.danger for e in self.episodes
+        ):
             raise ValueError("an episode is there twice, or it lacks one of the run's")
         return layouts
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's score in one condition; of several intervals, one that holds at every look.
+        """Return a metric's score in one condition;
+        of several intervals, one that holds at every look.
 
         Else it is the one over episodes.
         """
         candidates = [
-            s for s in self.scores if (s.condition, s.metric) == (condition, metric) and s.value is not None
+            s
+            for s in self.scores
+            if (s.condition, s.metric) == (condition, metric) and s.value is not None
         ]
         order = {ANY_TIME: 0, PAIRED: 1, "episodes": 2}
         return min(candidates, key=lambda s: order.get(s.interval, 3), default=None)
@@ -200,7 +223,9 @@ class Run:
             or e.layout_seed != world.first_seed + e.episode
             for e in episodes
         ):
-            raise ValueError(f"a layout that is none of run.json's, whose first seed is {world.first_seed}")
+            raise ValueError(
+                f"a layout that is none of run.json's, whose first seed is {world.first_seed}"
+            )
         grid = Grid(self.conditions, self.manifest.seeds, numbers)
         return grid, tuple(grid.ordered(episodes))
 
@@ -212,7 +237,9 @@ class Run:
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
         agent = np.unique(np.array(decisions.labels("agent"), dtype=str), return_inverse=True)[1]
-        keys = np.sort((places * len(steps) + step) * (1 + agent.max(initial=0)) + agent, kind="stable")
+        keys = np.sort(
+            (places * len(steps) + step) * (1 + agent.max(initial=0)) + agent, kind="stable"
+        )
         if (keys[1:] == keys[:-1]).any():
             raise ValueError("a decision is there twice")
         counts = np.bincount(places, minlength=len(self.episodes))
@@ -221,7 +248,9 @@ class Run:
         return decisions
 
     def read_file(self, name: str, reader: Callable[[Path], T]) -> T:
-        """Return what a file of the run's folder holds. Raises UserError if the reader calls it broken."""
+        """Return what a file of the run's folder holds.
+        Raises UserError if the reader calls it broken.
+        """
         try:
             return whole(self.path / name, reader)
         except UserError as error:
@@ -248,9 +277,11 @@ def read(path: Path) -> Run:
         raise UserError(
             f"{printable(path)} is a suite; give the folder of one of its runs"
             if (path / SUITE).is_file()
-            else f"{printable(path)} is no finished run, since its model could not be asked: {reason}"
+            else f"{printable(path)} is no finished run, since its model could not be asked: "
+            f"{reason}"
             if (reason := work.unanswered(path))
-            else f"{printable(path)} is a file; a run is a folder, made by `harness eval` or `harness drive`"
+            else f"{printable(path)} is a file; a run is a folder, made by `harness eval` or "
+            "`harness drive`"
             if path.is_file()
             else f"{printable(path)} is no finished run: it has no run.json; "
             "give a folder made by `harness eval` or `harness drive`"
@@ -261,7 +292,9 @@ def read(path: Path) -> Run:
 
 
 def most_rows(episodes: Sequence[Episode]) -> int:
-    """Return how many decisions a file may hold, so that one with a few too many is still read and named."""
+    """Return how many decisions a file may hold,
+    so that one with a few too many is still read and named.
+    """
     return 2 * MOST_DECISIONS * sum(episode.agents or 1 for episode in episodes)
 
 
@@ -279,11 +312,16 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
             lines,
             parse_options=parsed,
             convert_options=pacsv.ConvertOptions(
-                column_types={name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()},
-                include_columns=list(hints), include_missing_columns=True, null_values=[""],
-                true_values=["True"], false_values=["False"],
+                column_types={
+                    name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()
+                },
+                include_columns=list(hints),
+                include_missing_columns=True,
+                null_values=[""],
+                true_values=["True"],
+                false_values=["False"],
             ),
-        )  # fmt: skip
+        )
     columns = {}
     for field, name, column in zip(kind.__struct_fields__, hints, table.columns, strict=True):
         values = column.to_pylist()
@@ -311,4 +349,6 @@ def whole(file: Path, reader: Callable[[Path], T]) -> T:
             return reader(file)
     except _BROKEN as error:
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{printable(file)} is broken ({printable(reason)}); make the run again") from None
+        raise UserError(
+            f"{printable(file)} is broken ({printable(reason)}); make the run again"
+        ) from None

@@ -1,8 +1,9 @@
 """What the runs of earlier versions lack, and how it is read: the one place that knows of them.
 
-A format's number goes up only when an earlier harness would misread a run. Otherwise files grow: whoever
-adds a setting or a column adds an entry here, which says what a run without it did; whoever renames one maps
-the old name. `tests/test_records.py` reads kept runs of earlier commits and fails without the entry.
+A format's number goes up only when an earlier harness would misread a run. Otherwise files grow:
+whoever adds a setting or a column adds an entry here, which says what a run without it did; whoever
+renames one maps the old name. `tests/test_records.py` reads kept runs of earlier commits and fails
+without the entry.
 """
 
 import re
@@ -20,14 +21,21 @@ FORMAT = f"swarmdrive-run/{NUMBER}"
 READ_BY = {"swarmdrive-run/1": "0.1", "swarmdrive-drive/1": "0.1"}
 
 
-# Settings that run.json states beside the table `settings`, too, by their key there: readers of its first
-# versions have no table. A new setting is not one of them.
+# Settings that run.json states beside the table `settings`, too, by their key there: readers of its
+# first versions have no table. A new setting is not one of them.
 BESIDE: Mapping[str, str] = {
-    "ask": "ask", "ties": "ties", "batch_size": "batch_size", "dtype": "dtype", "temperature": "temperature",
-    "sampling_seed": "sampling_seed", "latency_source": "latency", "device_model": "device_model",
-}  # fmt: skip
+    "ask": "ask",
+    "ties": "ties",
+    "batch_size": "batch_size",
+    "dtype": "dtype",
+    "temperature": "temperature",
+    "sampling_seed": "sampling_seed",
+    "latency_source": "latency",
+    "device_model": "device_model",
+}
 
-# Settings that a user types in several ways, by a name, a path or a URL: a name is held to what it names.
+# Settings that a user types in several ways, by a name, a path or a URL: a name is held to what it
+# names.
 TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
 
 
@@ -41,12 +49,20 @@ class Added(NamedTuple):
 
 # Of run.json beside its settings.
 MANIFEST: Mapping[str, Added] = {
-    "channels": Added("2026-11-23", {}, "channel profiles became files; older runs used those that ship"),
+    "channels": Added(
+        "2026-11-23", {}, "channel profiles became files; older runs used those that ship"
+    ),
     "networks": Added("2026-11-23", {}, "a cloud behind a measured network"),
     "schedules": Added("2026-11-23", {}, "learnt schedules, by the digest of their file"),
-    "kept": Added("2026-11-29", {}, "what settings of extensions name; see `upgraded` for `calibrations`"),
-    "helpers": Added("2026-11-23", (), "agents of their own for helpers; the ego's answered for all"),
-    "device_profile": Added("2026-11-23", None, "on-board computers that time answers by their tokens"),
+    "kept": Added(
+        "2026-11-29", {}, "what settings of extensions name; see `upgraded` for `calibrations`"
+    ),
+    "helpers": Added(
+        "2026-11-23", (), "agents of their own for helpers; the ego's answered for all"
+    ),
+    "device_profile": Added(
+        "2026-11-23", None, "on-board computers that time answers by their tokens"
+    ),
 }
 # Of its settings that open nothing; the command alone stated servers and a device.
 SETTINGS: Mapping[str, Added] = {
@@ -54,14 +70,18 @@ SETTINGS: Mapping[str, Added] = {
     "sampling_seed": Added("2026-11-23", 0, "sampling"),
     "device_model": Added("2026-11-23", None, "the row of such a computer"),
     "ask": Added("2026-11-26", "all", "asking only helpers whose answer counts; all were asked"),
-    "ties": Added("2026-11-26", "first", "drawing between the likeliest actions; the first was taken"),
+    "ties": Added(
+        "2026-11-26", "first", "drawing between the likeliest actions; the first was taken"
+    ),
     "extensions": Added("2026-11-29", {}, "settings of extensions; there were none"),
 }
 # Of the ego's agent, in run.json itself, and of each of `helpers`.
 AGENT: Mapping[str, Added] = {
     "thinking": Added("2026-11-23", False, "helpers that think"),
     "image": Added("2026-11-23", "own", "pictures in prompts, and controls of them"),
-    "letters": Added("2026-11-26", "raw", "read-outs over several orders of letters; there was one"),
+    "letters": Added(
+        "2026-11-26", "raw", "read-outs over several orders of letters; there was one"
+    ),
     "sums": Added("2026-11-26", "refuse", "dividing a sum that is off 1; such an answer failed"),
     "flip": Added("2026-11-26", False, "asking with the list of actions reversed"),
 }
@@ -76,7 +96,9 @@ CONDITION: Mapping[str, Added] = {
     "threshold": Added("2026-11-23", None, "a schedule's threshold"),
     "round_trip": Added("2026-11-23", "", "a cloud behind a measured network"),
     "round_trip_s": Added("2026-11-23", None, "a cloud behind a constant round trip"),
-    "edge": Added("2026-11-23", "none", "roadside units with a place; see `_condition` for `roadside_edge`"),
+    "edge": Added(
+        "2026-11-23", "none", "roadside units with a place; see `_condition` for `roadside_edge`"
+    ),
     "edge_delay_s": Added("2026-11-23", 0.0, "roadside units with a place"),
     "edge_x_m": Added("2026-11-23", 0.0, "roadside units with a place"),
     "edge_y_m": Added("2026-11-23", 0.0, "roadside units with a place"),
@@ -95,7 +117,9 @@ VERSIONS: Mapping[str, Added] = {
 }
 # Of the record that a run begins with; `lifecycle.RunStart` has the same defaults.
 START: Mapping[str, Added] = {
-    "command": Added("2026-11-23", (), "the command that repeats a run; the one that resumes it is stated"),
+    "command": Added(
+        "2026-11-23", (), "the command that repeats a run; the one that resumes it is stated"
+    ),
     "versions": Added("2026-11-23", {}, "versions of packages; those that resume it are stated"),
 }
 # Of a line of answers.jsonl; `records.Answer` has the same defaults.
@@ -104,11 +128,15 @@ ANSWER: Mapping[str, Added] = {
     "token_s": Added("2026-11-23", None, "time per output token"),
     "first": Added("2026-11-23", UNSET, "repair turns; also unset without one"),
     "image_sha256": Added("2026-11-23", UNSET, "pictures in prompts; also unset without one"),
-    "agent": Added("2026-11-26", UNSET, "asking only helpers whose answer counts; the order of answers said"),
+    "agent": Added(
+        "2026-11-26", UNSET, "asking only helpers whose answer counts; the order of answers said"
+    ),
     "letter_share": Added("2026-11-26", UNSET, "read-outs over several orders of letters"),
     "follows_letter": Added("2026-11-26", UNSET, "read-outs over several orders of letters"),
     "flipped": Added("2026-11-26", UNSET, "asking with the list of actions reversed"),
-    "faults": Added("2026-11-26", UNSET, "all faults of an answer; older ones have the status alone"),
+    "faults": Added(
+        "2026-11-26", UNSET, "all faults of an answer; older ones have the status alone"
+    ),
     "extension": Added("2026-11-26", UNSET, "what a prompt asks for beside the decision"),
 }
 # Columns of decisions.parquet, those of messages without their number; a missing one is null.
@@ -117,11 +145,17 @@ COLUMNS: Mapping[str, Added] = {
     "attacker": Added("2026-11-23", None, "attacks"),
     **dict.fromkeys(("inference_j", "helpers_j", "radio_mj", "waiting_j"),
                     Added("2026-11-23", None, "energy; also missing without a device profile")),
-    "busy_ratio": Added("2026-11-23", None, "load of the channel; also missing where it is not known"),
+    "busy_ratio": Added("2026-11-23", None, 
+        "load of the channel; also "
+        "missing where it is not known"),
     **dict.fromkeys(("miss", "false_alarm"),
-                    Added("2026-11-27", None, "misses and false alarms; also missing in closed loop")),
+                    Added("2026-11-27", None, 
+                        "misses and false alarms; also "
+                        "missing in closed loop")),
     **dict.fromkeys(("ttc_s", "pet_s", "short_ttc", "short_pet"),
-                    Added("2026-11-27", None, "conflicts in time; also missing on trees of older datasets")),
+                    Added("2026-11-27", None, 
+                        "conflicts in time; also missing "
+                        "on trees of older datasets")),
     "agent": Added("2026-11-27", None, "swarms; also missing where only egos decide"),
     "broke_word": Added("2026-11-27", None, "plans; also missing where none is sent"),
 }  # fmt: skip
@@ -129,8 +163,11 @@ COLUMNS: Mapping[str, Added] = {
 EPISODE: Mapping[str, Added] = {
     **dict.fromkeys(
         ("outcome", "time_lost_s", "miss", "false_alarm"),
-        Added("2026-11-27", None,
-              "the price of caution; also empty in closed loop, and `outcome` under limits 1"),
+        Added(
+            "2026-11-27",
+            None,
+            "the price of caution; also empty in closed loop, and `outcome` under limits 1",
+        ),
     ),
     **dict.fromkeys(
         ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet"),
@@ -144,19 +181,22 @@ EPISODE: Mapping[str, Added] = {
         ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way"),
         Added("2026-11-27", None, "swarms; also missing where only egos decide"),
     ),
-    "journeys": Added("2026-11-27", None, "how each agent ended; also missing where only egos decide"),
-}  # fmt: skip
+    "journeys": Added(
+        "2026-11-27", None, "how each agent ended; also missing where only egos decide"
+    ),
+}
 
 # Columns that are missing where no episode has a value.
 SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys")
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of run.json, or the settings that a run began with, as this version states them.
+    """Return the content of run.json, or the settings that a run began with,
+    as this version states them.
 
-    What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is named
-    without the settings that were typed after its name, which are among its parameters. 2026-11-29: `kept`
-    has the table `calibrations`, which stood beside it.
+    What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is
+    named without the settings that were typed after its name, which are among its parameters.
+    2026-11-29: `kept` has the table `calibrations`, which stood beside it.
     """
     if isinstance(calibrations := stated.get("calibrations"), dict) and "kept" not in stated:
         stated = {**stated, "kept": {"calibrations": calibrations} if calibrations else {}}
@@ -166,7 +206,9 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
         settings["identity"] = identity(model)
     for name, upgrade in (("helpers", _agent), ("conditions", _condition)):
         if isinstance(tables := settings.get(name), list | tuple):
-            settings[name] = [upgrade(table) if isinstance(table, dict) else table for table in tables]
+            settings[name] = [
+                upgrade(table) if isinstance(table, dict) else table for table in tables
+            ]
     match settings.get("world"):
         case {"scenario": {"name": str(name)}}:
             from harness.world import scenarios  # imports NumPy, which listing runs does not need
@@ -179,12 +221,14 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _table(stated: Mapping[str, Any]) -> Any:
-    """Return the table of settings; of an older run, which has none, it is made of what stands beside it.
+    """Return the table of settings; of an older run, which has none,
+    it is made of what stands beside it.
 
     Raises ValueError if it says otherwise than what stands beside it.
     """
     beside = {name: stated[key] for key, name in BESIDE.items() if key in stated}
-    with suppress(KeyError, TypeError, AttributeError, IndexError):  # which the reader finds, and names
+    # which the reader finds, and names
+    with suppress(KeyError, TypeError, AttributeError, IndexError):
         beside |= _opened(stated)
     table = stated.get("settings", beside)
     if not isinstance(table, Mapping):
@@ -202,7 +246,9 @@ def _table(stated: Mapping[str, Any]) -> Any:
 
 
 def _may_be(typed: Any, names: Any) -> bool:
-    """Return whether what a user typed may open what has these names; a server's or a replayed one may."""
+    """Return whether what a user typed may open what has these names;
+    a server's or a replayed one may.
+    """
     if not (isinstance(typed, str) and isinstance(names, str)):
         return typed is None or names is None
     if "://" in typed or typed.startswith("replay:"):
@@ -223,7 +269,9 @@ def _is_called(text: str, name: str) -> bool:
 
 def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that opened what a run states, each as it is called there."""
-    seeds, device, world, helpers = (stated[name] for name in ("seeds", "device_profile", "world", "helpers"))
+    seeds, device, world, helpers = (
+        stated[name] for name in ("seeds", "device_profile", "world", "helpers")
+    )
     scenes = {"kind": world["kind"], "dataset": world.get("path"), **world.get("selection", {})}
     if "scenario" in world:
         scenes |= {"scenario": world["scenario"]["name"], "first_seed": world["first_seed"]}
@@ -239,8 +287,10 @@ def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
             "model": ",".join(helper["model"]["name"] for helper in helpers),
             "prompt": helpers[0]["prompt"]["version"],
             "answer": helpers[0]["answer"],
-        } if helpers else {},
-    }  # fmt: skip
+        }
+        if helpers
+        else {},
+    }
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,12 +312,18 @@ def versions(stated: Mapping[str, str]) -> dict[str, str]:
 def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the identity of a run's models with their answer versions.
 
-    2026-11-26: `answers` replaced what engines without weights said of their version. All older answers are
-    of version 1.
+    2026-11-26: `answers` replaced what engines without weights said of their version.
+    All older answers are of version 1.
     """
-    kept = {name: value for name, value in stated.items() if name not in ("proxy_model_version", "harness")}
+    kept = {
+        name: value
+        for name, value in stated.items()
+        if name not in ("proxy_model_version", "harness")
+    }
     if isinstance(helpers := stated.get("helpers"), list):
-        kept["helpers"] = [identity(helper) if isinstance(helper, dict) else helper for helper in helpers]
+        kept["helpers"] = [
+            identity(helper) if isinstance(helper, dict) else helper for helper in helpers
+        ]
     return {"answers": 1, **kept}
 
 
@@ -303,7 +359,11 @@ def checked(version: object, file: object) -> None:
     newer = re.fullmatch(r"swarmdrive-run/(\d{1,6})", str(version), re.ASCII)
     raise UserError(
         f"{printable(file)} has format {printable(version)!r}, not {FORMAT!r}; "
-        + (f"harness {old} reads it: run again, or install that version" if old
-           else "a newer harness made it: install that" if newer and int(newer[1]) > NUMBER
-           else "give a folder made by `harness eval` or `harness drive`")
-    )  # fmt: skip
+        + (
+            f"harness {old} reads it: run again, or install that version"
+            if old
+            else "a newer harness made it: install that"
+            if newer and int(newer[1]) > NUMBER
+            else "give a folder made by `harness eval` or `harness drive`"
+        )
+    )

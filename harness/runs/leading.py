@@ -1,4 +1,5 @@
-"""The metric by which runs are read, and the condition: success balanced over danger and none, or plain.
+"""The metric by which runs are read, and the condition:
+success balanced over danger and none, or plain.
 
 It is balanced where layouts are of both kinds, as a run's rows of `BALANCED` say.
 """
@@ -11,7 +12,8 @@ if TYPE_CHECKING:
 
 SUCCESS, BALANCED = "success_rate", "balanced_success_rate"
 ANY_TIME = "any time"  # the kind of an interval over episodes that holds at every look
-PAIRED = "paired episodes"  # the kind of an interval of differences, all of whose parts are taken together
+# the kind of an interval of differences, all of whose parts are taken together
+PAIRED = "paired episodes"
 IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 
@@ -23,12 +25,16 @@ class Scored(Protocol):
 
 
 def leading(*names: Container[str]) -> str:
-    """Return the metric by which what has metrics of these names is read, or several such together."""
+    """Return the metric by which what has metrics of these names is read,
+    or several such together.
+    """
     return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
 
 def lead_of(*runs: Scored) -> str:
-    """Return the metric by which runs are read together: balanced success where all of them state it."""
+    """Return the metric by which runs are read together:
+    balanced success where all of them state it.
+    """
     stated = []
     for run in runs:
         stated.append({score.metric for score in run.scores if score.value is not None})
@@ -36,7 +42,8 @@ def lead_of(*runs: Scored) -> str:
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
-    """Return the condition with the most success; the first of several, and empty where there is none.
+    """Return the condition with the most success;
+    the first of several, and empty where there is none.
 
     A condition in doubt does not count where one with a radio is left.
     """

@@ -20,7 +20,8 @@ from harness.runs import formats
 from harness.runs.doubts import OFF_LAG, doubted
 from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, leading
 
-DEPTH = 2  # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
+# how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
+DEPTH = 2
 KINDS = {"frozen": "eval", "closed-loop": "drive"}  # by world
 FAILED = "failed_rate_ego"
 UNREAD = 0.5  # share of failed answers from which a run's headline mentions them
@@ -33,13 +34,14 @@ class Listed:
     """One run or study."""
 
     name: str  # its folder, relative to the folder that is listed
-    kind: str  # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
+    # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
+    kind: str
     state: Literal["finished", "unfinished", "broken"]  # `finished`, `unfinished` or `broken`
-    # when it began. For a suite, when the last of its runs began; for a study or a broken run, when it
-    # was last written.
+    # when it began. For a suite, when the last of its runs began; for a study or a broken run, when
+    # it was last written.
     date: datetime
-    # for an unfinished run, how to continue it; for a broken one, the file at fault, and the version of
-    # the harness if the file has an older format
+    # for an unfinished run, how to continue it; for a broken one, the file at fault, and the
+    # version of the harness if the file has an older format
     why: str | None = None
     model: str | None = None  # name of its card; the sources of a sweep
     prompt: str | None = None  # the prompt version; those of all families for a suite
@@ -60,7 +62,8 @@ def runs(folder: Path) -> list[Listed]:
     """
     if not os.path.isdir(folder):
         raise UserError(
-            f"{printable(folder)} is no folder; give one that holds runs, or make a run with `harness eval`"
+            f"{printable(folder)} is no folder; give one that holds runs, or make a run with "
+            "`harness eval`"
         )
     root = os.path.realpath(folder)
     return sorted(_entries(root, root, 0), key=lambda entry: (-entry.date.timestamp(), entry.name))
@@ -109,7 +112,9 @@ def _entry(path: str, root: str) -> Listed | None:
         try:
             config = _json(path, WORK, CONFIG)
             kind = KINDS[config["settings"]["world"]["kind"]]
-            entry = Listed("", kind, "unfinished", _date(config["created"]), "the same command continues it")
+            entry = Listed(
+                "", kind, "unfinished", _date(config["created"]), "the same command continues it"
+            )
             return _with_config(entry, {**config["settings"], "tags": config["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
@@ -134,12 +139,16 @@ def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
     try:
         config = _json(path, "run.json")
         if config["format"] in formats.READ_BY:
-            return replace(listed, why=f"run.json: format of harness {formats.READ_BY[config['format']]}")
+            return replace(
+                listed, why=f"run.json: format of harness {formats.READ_BY[config['format']]}"
+            )
         if config["format"] != formats.FORMAT:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         listed = replace(_with_config(listed, config), why="summary.csv")
-        return _with_success(listed, rows := _rows(path), [(config, rows)]) if has_summary else listed
+        return (
+            _with_success(listed, rows := _rows(path), [(config, rows)]) if has_summary else listed
+        )
     except _BROKEN:
         return listed
 
@@ -154,10 +163,13 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
         if not 0 < len(parts) == len(names):
             return listed
         listed = replace(
-            parts[0], kind="suite", state="broken", why="summary.csv",
+            parts[0],
+            kind="suite",
+            state="broken",
+            why="summary.csv",
             date=max(entry.date for entry in parts),
             prompt=" and ".join(dict.fromkeys(str(entry.prompt) for entry in parts)),
-        )  # fmt: skip
+        )
         if not has_summary:
             return listed
         folders = [os.path.join(path, name) for name in names]
@@ -174,10 +186,15 @@ def own_name(name: str) -> bool:
 
 def _rows(path: str) -> Rows:
     """Return what a list has of a summary: a folder may hold a thousand of a thousand rows."""
-    with opened(os.path.join(path, "summary.csv"), "rows") as data, TextIOWrapper(data, "utf-8-sig") as file:
+    with (
+        opened(os.path.join(path, "summary.csv"), "rows") as data,
+        TextIOWrapper(data, "utf-8-sig") as file,
+    ):
         markers = [f",{metric}," for metric in (BALANCED, SUCCESS, FAILED, OFF_LAG)]
         head, *lines = [
-            line for n, line in enumerate(file) if n == 0 or any(metric in line for metric in markers)
+            line
+            for n, line in enumerate(file)
+            if n == 0 or any(metric in line for metric in markers)
         ]
     return list(csv.DictReader([head, *lines]))
 
@@ -204,22 +221,35 @@ def _means(summaries: Sequence[Rows]) -> Rows:
     return means
 
 
-def _with_success(listed: Listed, rows: Rows, runs: Sequence[tuple[dict[str, Any], Rows]]) -> Listed:
-    """Return an entry as finished, with the best condition of a summary; `runs` are those it is of."""
+def _with_success(
+    listed: Listed, rows: Rows, runs: Sequence[tuple[dict[str, Any], Rows]]
+) -> Listed:
+    """Return an entry as finished, with the best condition of a summary;
+    `runs` are those it is of.
+    """
     metric = leading({row["metric"] for row in rows})
     kinds = {row["interval"] for row in rows if row["metric"] == metric}
     kind = ANY_TIME if ANY_TIME in kinds else "episodes"
     leads = [row for row in rows if (row["metric"], row["interval"]) == (metric, kind)]
     radios = {c["name"] for c in runs[0][0]["conditions"] if c.get("profile") is not None}
     warned = {name for run in runs for name in _doubted(*run)}
-    best = best_of({row["condition"]: _number(row["value"]) or 0.0 for row in leads}, radios, warned)
+    best = best_of(
+        {row["condition"]: _number(row["value"]) or 0.0 for row in leads}, radios, warned
+    )
     [lead] = [row for row in leads if row["condition"] == best]
     value, low, high = (_share(lead[key]) for key in ("value", "ci_low", "ci_high"))
     unread = next((_number(row["value"]) for row in rows if row["metric"] == FAILED), None)
     return replace(
-        listed, state="finished", why=None, condition=best, success=value, low=low,
-        high=high, unread=unread, metric=metric,
-    )  # fmt: skip
+        listed,
+        state="finished",
+        why=None,
+        condition=best,
+        success=value,
+        low=low,
+        high=high,
+        unread=unread,
+        metric=metric,
+    )
 
 
 def _doubted(config: dict[str, Any], rows: Rows) -> set[str]:
@@ -233,7 +263,9 @@ def _doubted(config: dict[str, Any], rows: Rows) -> set[str]:
 def _with_config(entry: Listed, config: dict[str, Any]) -> Listed:
     return replace(
         entry,
-        model=" + ".join(str(agent["model"]["name"]) for agent in (config, *config.get("helpers", ()))),
+        model=" + ".join(
+            str(agent["model"]["name"]) for agent in (config, *config.get("helpers", ()))
+        ),
         prompt=str(config["prompt"]["version"]),
         answer=str(config["answer"]),
         tags=tuple(map(str, config["tags"])),

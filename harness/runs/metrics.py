@@ -1,4 +1,5 @@
-"""The registry of metrics: all that is known of each, and their values from decisions, episodes or answers.
+"""The registry of metrics: all that is known of each, and their values from decisions,
+episodes or answers.
 
 A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 """
@@ -47,11 +48,18 @@ LATENCY, GAIN = "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
 # What is corrected by the layouts' difficulty, by what it corrects
 ADJUSTED = {name: f"adjusted_{name}" for name in (*GAINS, *GAINS.values())}
-ONE_OPTIMAL = "decisions_one_optimal"  # how many decisions the figures of exactly one optimal action are of
+# how many decisions the figures of exactly one optimal action are of
+ONE_OPTIMAL = "decisions_one_optimal"
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
 ROLES: tuple[Role, ...] = get_args(Role)
-MS, SECONDS, METRES, JOULES, NATS = Unit("ms"), Unit("s", 2), Unit("m"), Unit("J", 2), Unit("nats", 3)
+MS, SECONDS, METRES, JOULES, NATS = (
+    Unit("ms"),
+    Unit("s", 2),
+    Unit("m"),
+    Unit("J", 2),
+    Unit("nats", 3),
+)
 COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 
@@ -77,21 +85,24 @@ class Metric:
     label: str = ""  # its name for people; by default the name with spaces
     # returns its values for decisions (n,), whose mean is the episode's
     decisions: Callable[[Any], Floats] | None = None
-    episodes: Callable[[Episode], Any] | None = None  # returns an episode's value; None where unknown
+    # returns an episode's value; None where unknown
+    episodes: Callable[[Episode], Any] | None = None
     # returns its values for the answers (n,) of one role; NaN where unknown
     answers: Callable[[Answers], Floats] | None = None
     role: Role | None = None  # whose answers
     percentile: int | None = None  # the percent of all decisions whose latency is at most so long
-    pooled: reliability.Figure | None = None  # returns its value for all decisions, which has no mean
+    # returns its value for all decisions, which has no mean
+    pooled: reliability.Figure | None = None
     total: bool = False  # whether an episode has the sum over its decisions instead of the mean
     world: World | None = None  # the world in which it is known; None for every world
     optional: bool = False  # whether a run in which it is nowhere known has no row of it
     half: bool = False  # whether it is of the episodes with a danger alone, or of those without
     # two metrics of a half of the episodes each, whose mean it is
     halves: tuple[str, ...] = ()
-    corrects: str = ""  # the metric that it corrects by the layouts' difficulty, where two runs are compared
-    # whether another has taken its place: tables and, where it is still computed, comparisons keep it, and
-    # pages leave it out
+    # the metric that it corrects by the layouts' difficulty, where two runs are compared
+    corrects: str = ""
+    # whether another has taken its place: tables and, where it is still computed, comparisons keep
+    # it, and pages leave it out
     superseded: bool = False
 
     def __post_init__(self) -> None:
@@ -100,8 +111,17 @@ class Metric:
 
     @property
     def compared(self) -> bool:
-        """Whether two runs are compared in it, as in any that is known of an episode or of all decisions."""
-        ways = self.decisions, self.episodes, self.percentile, self.pooled, self.halves, self.corrects
+        """Whether two runs are compared in it,
+        as in any that is known of an episode or of all decisions.
+        """
+        ways = (
+            self.decisions,
+            self.episodes,
+            self.percentile,
+            self.pooled,
+            self.halves,
+            self.corrects,
+        )
         return any(ways)
 
 
@@ -113,17 +133,25 @@ class Metrics(Plugins[Metric]):
         functions = [each for each in (metric.decisions, metric.episodes) if each]
         if metric.name != name or not name.isidentifier() or len(functions) != 1 or metric.primary:
             raise UserError(
-                f"plug-in {printable(name)!r} ({self.group}) is the metric {printable(metric.name)!r} with "
-                f"{len(functions)} functions{', a primary one' * metric.primary}; give it the name of its "
-                "entry point, of letters, digits and _, and one function, of decisions or of episodes; a "
+                f"plug-in {printable(name)!r} ({self.group}) is the metric "
+                f"{printable(metric.name)!r} with "
+                f"{len(functions)} functions{', a primary one' * metric.primary}; give it the name "
+                "of its "
+                "entry point, of letters, digits and _, and one function, of decisions or of "
+                "episodes; a "
                 "package's metric is not primary"
             )
         for field, allowed in _STATED.items():
             stated = getattr(metric, field)
-            if not (isinstance(stated, allowed) if isinstance(allowed, type) else stated in allowed):
-                words = allowed.__name__ if isinstance(allowed, type) else ", ".join(map(str, allowed))
+            if not (
+                isinstance(stated, allowed) if isinstance(allowed, type) else stated in allowed
+            ):
+                words = (
+                    allowed.__name__ if isinstance(allowed, type) else ", ".join(map(str, allowed))
+                )
                 raise UserError(
-                    f"plug-in {printable(name)!r} ({self.group}) has {field} {printable(repr(stated))}; "
+                    f"plug-in {printable(name)!r} ({self.group}) has {field} "
+                    f"{printable(repr(stated))}; "
                     f"allowed: {words}; repair or uninstall the package that registers it"
                 )
         return metric
@@ -131,13 +159,22 @@ class Metrics(Plugins[Metric]):
 
 # What a metric states beside its functions: each one's type, or the values that are allowed.
 _STATED: Mapping[str, Any] = {
-    "meaning": str, "label": str, "unit": Unit, "better": get_args(Better), "interval": ("rate", "mean"),
-    "most": float, "world": (None, *get_args(World)),
-}  # fmt: skip
+    "meaning": str,
+    "label": str,
+    "unit": Unit,
+    "better": get_args(Better),
+    "interval": ("rate", "mean"),
+    "most": float,
+    "world": (None, *get_args(World)),
+}
 
 
 def _rate(
-    name: str, meaning: str, happened: Callable[[Episode], bool | None], better: Better = "lower", **more: Any
+    name: str,
+    meaning: str,
+    happened: Callable[[Episode], bool | None],
+    better: Better = "lower",
+    **more: Any,
 ) -> Metric:
     return Metric(name, meaning, PERCENT, better, "rate", 1.0, episodes=happened, **more)
 
@@ -148,13 +185,23 @@ def _share(name: str, meaning: str, column: str, better: Better = "lower", **mor
 
 
 def _judged(
-    name: str, meaning: str, unit: Unit, better: Better, score: Callable[[Floats, Any], Floats], **more: Any
+    name: str,
+    meaning: str,
+    unit: Unit,
+    better: Better,
+    score: Callable[[Floats, Any], Floats],
+    **more: Any,
 ) -> Metric:
     """Build the metric of a score of fused policies by their optimal actions."""
     return Metric(
-        name, meaning, unit, better, world="frozen",
-        decisions=lambda d: score(d.of_actions("fused"), d.of_actions("safe") == 1.0), **more,
-    )  # fmt: skip
+        name,
+        meaning,
+        unit,
+        better,
+        world="frozen",
+        decisions=lambda d: score(d.of_actions("fused"), d.of_actions("safe") == 1.0),
+        **more,
+    )
 
 
 def _halves(
@@ -183,8 +230,12 @@ def _witnessed(count: int) -> Callable[[Episode], bool | None]:
 
 
 def _seen_by(count: int) -> Callable[[Episode], bool | None]:
-    """Build the function of success where so many helpers see the danger, which sends nothing itself."""
-    return lambda e: e.success if e.danger != "none" and e.witnesses == count and not e.danger_radio else None
+    """Build the function of success where so many helpers see the danger,
+    which sends nothing itself.
+    """
+    return lambda e: (
+        e.success if e.danger != "none" and e.witnesses == count and not e.danger_radio else None
+    )
 
 
 def _column(name: str) -> Callable[[Columns], Floats]:
@@ -211,7 +262,9 @@ def _divided(answers: Answers) -> Floats:
 
 
 def _valid(turns: int) -> Callable[[Answers], Floats]:
-    """Build the function of the answers that are valid after so many turns, where any needed two."""
+    """Build the function of the answers that are valid after so many turns,
+    where any needed two.
+    """
 
     def values(answers: Answers) -> Floats:
         if all(answer.turns == 1 for answer in answers):
@@ -230,35 +283,72 @@ def _of_answers() -> Iterator[Metric]:
     """Yield the metrics of each role's answers, in the order of a summary's rows."""
     rates: tuple[tuple[tuple[str, str, Better, Callable[[Answers], Floats]], ...], ...] = (
         (
-            ("strict_rate", "share of answers that fit the schema as they are", "higher", _verdict("strict")),
-            ("recovered_rate", "share of answers that were read after repairs", "neither",
-             _verdict("recovered")),
+            (
+                "strict_rate",
+                "share of answers that fit the schema as they are",
+                "higher",
+                _verdict("strict"),
+            ),
+            (
+                "recovered_rate",
+                "share of answers that were read after repairs",
+                "neither",
+                _verdict("recovered"),
+            ),
             ("failed_rate", "share of answers that could not be read", "lower", _verdict("failed")),
-            ("divided_rate", "share of answers whose numbers were divided by their sum", "lower", _divided),
-            ("flip_rate", "share of read-outs whose likeliest action changes with the order of the list",
-             "lower", _stated("flipped")),
+            (
+                "divided_rate",
+                "share of answers whose numbers were divided by their sum",
+                "lower",
+                _divided,
+            ),
+            (
+                "flip_rate",
+                "share of read-outs whose likeliest action changes with the order of the list",
+                "lower",
+                _stated("flipped"),
+            ),
         ),
         (
-            ("valid_at_first_rate", "share of answers that could be read without a repair turn", "higher",
-             _valid(1)),
-            ("valid_after_repair_rate", "share of answers that could be read after the repair turn", "higher",
-             _valid(2)),
+            (
+                "valid_at_first_rate",
+                "share of answers that could be read without a repair turn",
+                "higher",
+                _valid(1),
+            ),
+            (
+                "valid_after_repair_rate",
+                "share of answers that could be read after the repair turn",
+                "higher",
+                _valid(2),
+            ),
         ),
-    )  # fmt: skip
+    )
     for group in rates:
         for role in ROLES:
             for name, meaning, better, values in group:
                 yield Metric(
-                    f"{name}_{role}", meaning, PERCENT, better, "rate", 1.0, label=_label(name, role),
-                    answers=values, role=role,
-                )  # fmt: skip
+                    f"{name}_{role}",
+                    meaning,
+                    PERCENT,
+                    better,
+                    "rate",
+                    1.0,
+                    label=_label(name, role),
+                    answers=values,
+                    role=role,
+                )
     lengths: tuple[tuple[str, str, Unit, Better, float], ...] = (
         ("prompt_tokens", "tokens of a prompt", COUNT, "lower", math.inf),
         ("completion_tokens", "tokens of an answer", COUNT, "lower", math.inf),
         ("label_mass", "probability of the letters together, in a read-out", SCORE, "higher", 1.0),
-        ("letter_share", "part of a read-out that follows the letter and not the action", SCORE, "lower",
+        ("letter_share", 
+            "part of a read-out that follows "
+            "the letter and not the action", SCORE, "lower",
          1.0),
-        ("follows_letter", "share of read-outs in which one letter is the likeliest in every order", SCORE,
+        ("follows_letter", 
+            "share of read-outs in which one letter "
+            "is the likeliest in every order", SCORE,
          "lower", 1.0),
     )  # fmt: skip
     for role in ROLES:
@@ -266,175 +356,594 @@ def _of_answers() -> Iterator[Metric]:
             values = _stated(name)
             label = _label(name, role)
             yield Metric(
-                f"{name}_{role}", meaning, unit, better, most=most, label=label, answers=values, role=role
+                f"{name}_{role}",
+                meaning,
+                unit,
+                better,
+                most=most,
+                label=label,
+                answers=values,
+                role=role,
             )
 
 
 BUILT_IN = (
-    _rate(SUCCESS, "share of episodes in which the ego clears the intersection within the allowed time",
-          _field("success"), "higher", primary=True),
-    Metric(BALANCED, "mean of the success rates with and without a danger", PERCENT, "higher", "rate", 1.0,
-           halves=("success_dangerous_rate", "success_harmless_rate"), primary=True),
+    _rate(
+        SUCCESS,
+        "share of episodes in which the ego clears the intersection within the allowed time",
+        _field("success"),
+        "higher",
+        primary=True,
+    ),
+    Metric(
+        BALANCED,
+        "mean of the success rates with and without a danger",
+        PERCENT,
+        "higher",
+        "rate",
+        1.0,
+        halves=("success_dangerous_rate", "success_harmless_rate"),
+        primary=True,
+    ),
     *_halves("success", "share of {} that succeed", _field("success"), "higher"),
-    _rate("unsafe_rate", "share of episodes that end in a collision or off the road; where `limits` is 1, by "
-          "time-out, too",
-          lambda e: e.outcome == "unsafe" if e.outcome else not e.success and e.failure != "late",
-          primary=True),
+    _rate(
+        "unsafe_rate",
+        "share of episodes that end in a collision or off the road; where `limits` is 1, by "
+        "time-out, too",
+        lambda e: e.outcome == "unsafe" if e.outcome else not e.success and e.failure != "late",
+        primary=True,
+    ),
     _rate("collision_rate", "share of episodes that end in a collision", _fails("collision")),
-    _rate("at_fault_rate", "share of episodes that end in a collision in which the ego had to give way",
-          lambda e: e.fault == "ego"),
-    _rate("late_rate", "share of episodes that the ego clears, but too long after the full-view driver",
-          _fails("late")),
-    _rate("time_out_rate", "share of episodes in which time runs out before the ego clears the intersection",
-          _fails("time_out")),
-    _rate("stuck_rate", "share of episodes in which the ego never clears, without harm",
-          lambda e: e.outcome == "stuck" if e.outcome else None, optional=True),
-    *_halves("miss", "share of {} in which a decision made harm inevitable, which was not before",
-             _field("miss")),
-    *_halves("false_alarm", "share of {} in which a decision gave success away, and harm could still be "
-             "avoided", _field("false_alarm")),
-    Metric("time_lost_s", "time from the earliest possible clearing until the ego's; only episodes in which "
-           "it clears, late or not", SECONDS, "lower", label="time lost", episodes=_field("time_lost_s"),
-           world="frozen", optional=True),
-    _rate("off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")),
-    _share("regret_rate", "share of decisions that gave success away, of those in which it was still "
-           "possible", "regret", world="frozen"),
-    Metric("delay_s", "time that a safe decision adds to the earliest possible success", SECONDS, "lower",
-           label="delay", decisions=_column("delay_s"), world="frozen"),
-    _share("off_lag_rate", "share of decisions so fast or slow that they would act in another frame than the "
-           "dataset assumes", "off_lag", "neither", world="frozen"),
-    Metric("time_to_clear_s", "time until the ego has cleared the intersection; only episodes in which it "
-           "does, late or not", SECONDS, "lower", label="time to clear",
-           episodes=lambda e: e.time_s if e.failure in ("", "late") else None),
-    *(_rate(f"success_rate_{k}_witness{'' if k == 1 else 'es'}", "success rate in the layouts in which so "
+    _rate(
+        "at_fault_rate",
+        "share of episodes that end in a collision in which the ego had to give way",
+        lambda e: e.fault == "ego",
+    ),
+    _rate(
+        "late_rate",
+        "share of episodes that the ego clears, but too long after the full-view driver",
+        _fails("late"),
+    ),
+    _rate(
+        "time_out_rate",
+        "share of episodes in which time runs out before the ego clears the intersection",
+        _fails("time_out"),
+    ),
+    _rate(
+        "stuck_rate",
+        "share of episodes in which the ego never clears, without harm",
+        lambda e: e.outcome == "stuck" if e.outcome else None,
+        optional=True,
+    ),
+    *_halves(
+        "miss",
+        "share of {} in which a decision made harm inevitable, which was not before",
+        _field("miss"),
+    ),
+    *_halves(
+        "false_alarm",
+        "share of {} in which a decision gave success away, and harm could still be avoided",
+        _field("false_alarm"),
+    ),
+    Metric(
+        "time_lost_s",
+        "time from the earliest possible clearing until the ego's; only episodes in which "
+        "it clears, late or not",
+        SECONDS,
+        "lower",
+        label="time lost",
+        episodes=_field("time_lost_s"),
+        world="frozen",
+        optional=True,
+    ),
+    _rate(
+        "off_road_rate", "share of episodes in which the ego leaves the road", _fails("off_road")
+    ),
+    _share(
+        "regret_rate",
+        "share of decisions that gave success away, of those in which it was still possible",
+        "regret",
+        world="frozen",
+    ),
+    Metric(
+        "delay_s",
+        "time that a safe decision adds to the earliest possible success",
+        SECONDS,
+        "lower",
+        label="delay",
+        decisions=_column("delay_s"),
+        world="frozen",
+    ),
+    _share(
+        "off_lag_rate",
+        "share of decisions so fast or slow that they would act in another frame than the "
+        "dataset assumes",
+        "off_lag",
+        "neither",
+        world="frozen",
+    ),
+    Metric(
+        "time_to_clear_s",
+        "time until the ego has cleared the intersection; only episodes in which it "
+        "does, late or not",
+        SECONDS,
+        "lower",
+        label="time to clear",
+        episodes=lambda e: e.time_s if e.failure in ("", "late") else None,
+    ),
+    *(
+        _rate(
+            f"success_rate_{k}_witness{'' if k == 1 else 'es'}",
+            "success rate in the layouts in which so "
             "many helpers have, or would have, the danger in sight at the first decision",
-            _witnessed(k), "higher", optional=True) for k in range(4)),
-    *(_rate(f"success_dangerous_rate_{k}_witness{'' if k == 1 else 'es'}", "success rate where so many "
-            "helpers have the danger in sight at the first decision, and it has no radio", _seen_by(k),
-            "higher", optional=True, half=True) for k in range(4)),
-    _rate("success_dangerous_rate_with_radio", "success rate where the danger has a radio and tells of "
-          "itself", lambda e: e.success if e.danger_radio else None, "higher", optional=True, half=True),
-    Metric("arrived_rate", "share of an episode's agents that reach their goal; where several decide",
-           PERCENT, "higher", most=1.0, optional=True,
-           episodes=lambda e: (e.arrived or 0) / e.agents if e.agents else None),
-    _rate("met_rate", "share of episodes in which agents collide with each other; where several decide",
-          lambda e: bool(e.met) if e.agents else None, optional=True),
-    Metric("agents_lost_s", "how much later all agents reach their goals than each would alone, in sum; only "
-           "those that do", SECONDS, "lower", label="time lost by all", episodes=_field("agents_lost_s"),
-           optional=True),
-    Metric("most_lost_s", "the same of the agent that loses most", SECONDS, "lower",
-           label="time lost by one", episodes=_field("most_lost_s"), optional=True),
-    _share("broken_word_rate", "share of decisions in which an agent's action is not the likeliest of the "
-           "plan that another got from it", "broke_word", optional=True),
-    Metric("least_gap_m", "smallest distance to another vehicle's outline; 0 in a collision", METRES,
-           "higher", label="least gap", episodes=_field("least_gap_m")),
-    Metric("hard_brakings_per_episode", "number of times that the ego begins to brake harder than 4 m/s²",
-           MEAN_COUNT, "lower", episodes=_field("hard_brakings")),
-    Metric("least_ttc_s", "least time to collision with another vehicle at constant velocities, up to 5 s; "
-           "only episodes in which it is known", SECONDS, "higher", label="least TTC",
-           episodes=_field("least_ttc_s"), optional=True),
-    _rate("short_ttc_rate", "share of episodes with a time to collision below 1.5 s", _field("short_ttc"),
-          label="short TTC rate", optional=True),
-    _share("short_ttc_decision_rate", "share of decisions with a time to collision below 1.5 s before the "
-           "next one", "short_ttc", label="short TTC decision rate", optional=True),
-    Metric("least_pet_s", "least post-encroachment time: from one vehicle's leaving a place to the other's "
-           "arrival, the ego one of them, up to 5 s; only episodes in which it is known", SECONDS, "higher",
-           label="least PET", episodes=_field("least_pet_s"), optional=True),
-    _rate("short_pet_rate", "share of episodes with a post-encroachment time below 1.5 s",
-          _field("short_pet"), label="short PET rate", optional=True),
-    Metric("other_crashes_per_episode", "number of vehicles that crash without the ego", MEAN_COUNT, "lower",
-           episodes=_field("other_crashes")),
-    Metric("decisions_per_episode", "number of decisions begun", MEAN_COUNT, "neither",
-           episodes=_field("decisions")),
-    Metric("skipped_per_episode", "number of decisions not begun because the one before was still open",
-           MEAN_COUNT, "lower", episodes=_field("skipped"), world="closed-loop"),
-    Metric("never_acted_per_episode", "number of decisions that were not ready when the episode ended",
-           MEAN_COUNT, "lower", episodes=_field("never_acted"), world="closed-loop"),
-    Metric("messages_per_episode", "number of scheduled replies; requests do not count", COUNT, "lower",
-           decisions=_column("messages"), total=True),
-    Metric("requests_per_episode", "number of broadcast requests; one request asks several helpers", COUNT,
-           "lower", decisions=_column("requests"), total=True),
-    Metric("bits_per_episode", "bits of all requests and scheduled replies", Unit("bit", 0), "lower",
-           decisions=lambda d: d["request_bits"] + d["reply_bits"], total=True),
-    Metric("airtime_ms", "total time on air of an episode's requests and scheduled replies", MS, "lower",
-           label="airtime", decisions=_column("airtime_ms"), total=True),
-    Metric("busy_ratio", "share of the time that the radio's channel is busy with background traffic",
-           PERCENT, "lower", most=1.0, decisions=_column("busy_ratio"), optional=True),
-    Metric("energy_j", "energy of a decision: inference of the ego, of the helpers that infer and of a "
-           "fusion call, and their radios; known only with a device profile", JOULES, "lower", label="energy",
-           decisions=lambda d: d["inference_j"] + d["radio_mj"] / 1000, optional=True),
-    Metric("helpers_j", "energy of a decision: the part of the helpers' inference", JOULES, "lower",
-           label="helpers", decisions=_column("helpers_j"), optional=True),
-    Metric("radio_mj", "energy of a decision: the part of the radios", Unit("mJ", 3), "lower", label="radio",
-           decisions=_column("radio_mj"), optional=True),
-    Metric("waiting_j", "energy that the ego's computer draws while it waits for messages; not part of "
-           "energy_j", JOULES, "lower", label="waiting", decisions=_column("waiting_j"), optional=True),
-    Metric(LATENCY, "time from the start of a decision to the end of the exchange and of fusion, with all "
-           "inference", MS, "lower", primary=True, label="latency proxy", decisions=_column("latency_ms")),
-    _share("deadline_miss_rate", "share of decisions that took longer than the decision window",
-           "deadline_missed"),
-    _share("trigger_rate", "share of decisions in which the ego asked helpers", "triggered", "neither"),
+            _witnessed(k),
+            "higher",
+            optional=True,
+        )
+        for k in range(4)
+    ),
+    *(
+        _rate(
+            f"success_dangerous_rate_{k}_witness{'' if k == 1 else 'es'}",
+            "success rate where so many "
+            "helpers have the danger in sight at the first decision, and it has no radio",
+            _seen_by(k),
+            "higher",
+            optional=True,
+            half=True,
+        )
+        for k in range(4)
+    ),
+    _rate(
+        "success_dangerous_rate_with_radio",
+        "success rate where the danger has a radio and tells of itself",
+        lambda e: e.success if e.danger_radio else None,
+        "higher",
+        optional=True,
+        half=True,
+    ),
+    Metric(
+        "arrived_rate",
+        "share of an episode's agents that reach their goal; where several decide",
+        PERCENT,
+        "higher",
+        most=1.0,
+        optional=True,
+        episodes=lambda e: (e.arrived or 0) / e.agents if e.agents else None,
+    ),
+    _rate(
+        "met_rate",
+        "share of episodes in which agents collide with each other; where several decide",
+        lambda e: bool(e.met) if e.agents else None,
+        optional=True,
+    ),
+    Metric(
+        "agents_lost_s",
+        "how much later all agents reach their goals than each would alone, in sum; only "
+        "those that do",
+        SECONDS,
+        "lower",
+        label="time lost by all",
+        episodes=_field("agents_lost_s"),
+        optional=True,
+    ),
+    Metric(
+        "most_lost_s",
+        "the same of the agent that loses most",
+        SECONDS,
+        "lower",
+        label="time lost by one",
+        episodes=_field("most_lost_s"),
+        optional=True,
+    ),
+    _share(
+        "broken_word_rate",
+        "share of decisions in which an agent's action is not the likeliest of the "
+        "plan that another got from it",
+        "broke_word",
+        optional=True,
+    ),
+    Metric(
+        "least_gap_m",
+        "smallest distance to another vehicle's outline; 0 in a collision",
+        METRES,
+        "higher",
+        label="least gap",
+        episodes=_field("least_gap_m"),
+    ),
+    Metric(
+        "hard_brakings_per_episode",
+        "number of times that the ego begins to brake harder than 4 m/s²",
+        MEAN_COUNT,
+        "lower",
+        episodes=_field("hard_brakings"),
+    ),
+    Metric(
+        "least_ttc_s",
+        "least time to collision with another vehicle at constant velocities, up to 5 s; "
+        "only episodes in which it is known",
+        SECONDS,
+        "higher",
+        label="least TTC",
+        episodes=_field("least_ttc_s"),
+        optional=True,
+    ),
+    _rate(
+        "short_ttc_rate",
+        "share of episodes with a time to collision below 1.5 s",
+        _field("short_ttc"),
+        label="short TTC rate",
+        optional=True,
+    ),
+    _share(
+        "short_ttc_decision_rate",
+        "share of decisions with a time to collision below 1.5 s before the next one",
+        "short_ttc",
+        label="short TTC decision rate",
+        optional=True,
+    ),
+    Metric(
+        "least_pet_s",
+        "least post-encroachment time: from one vehicle's leaving a place to the other's "
+        "arrival, the ego one of them, up to 5 s; only episodes in which it is known",
+        SECONDS,
+        "higher",
+        label="least PET",
+        episodes=_field("least_pet_s"),
+        optional=True,
+    ),
+    _rate(
+        "short_pet_rate",
+        "share of episodes with a post-encroachment time below 1.5 s",
+        _field("short_pet"),
+        label="short PET rate",
+        optional=True,
+    ),
+    Metric(
+        "other_crashes_per_episode",
+        "number of vehicles that crash without the ego",
+        MEAN_COUNT,
+        "lower",
+        episodes=_field("other_crashes"),
+    ),
+    Metric(
+        "decisions_per_episode",
+        "number of decisions begun",
+        MEAN_COUNT,
+        "neither",
+        episodes=_field("decisions"),
+    ),
+    Metric(
+        "skipped_per_episode",
+        "number of decisions not begun because the one before was still open",
+        MEAN_COUNT,
+        "lower",
+        episodes=_field("skipped"),
+        world="closed-loop",
+    ),
+    Metric(
+        "never_acted_per_episode",
+        "number of decisions that were not ready when the episode ended",
+        MEAN_COUNT,
+        "lower",
+        episodes=_field("never_acted"),
+        world="closed-loop",
+    ),
+    Metric(
+        "messages_per_episode",
+        "number of scheduled replies; requests do not count",
+        COUNT,
+        "lower",
+        decisions=_column("messages"),
+        total=True,
+    ),
+    Metric(
+        "requests_per_episode",
+        "number of broadcast requests; one request asks several helpers",
+        COUNT,
+        "lower",
+        decisions=_column("requests"),
+        total=True,
+    ),
+    Metric(
+        "bits_per_episode",
+        "bits of all requests and scheduled replies",
+        Unit("bit", 0),
+        "lower",
+        decisions=lambda d: d["request_bits"] + d["reply_bits"],
+        total=True,
+    ),
+    Metric(
+        "airtime_ms",
+        "total time on air of an episode's requests and scheduled replies",
+        MS,
+        "lower",
+        label="airtime",
+        decisions=_column("airtime_ms"),
+        total=True,
+    ),
+    Metric(
+        "busy_ratio",
+        "share of the time that the radio's channel is busy with background traffic",
+        PERCENT,
+        "lower",
+        most=1.0,
+        decisions=_column("busy_ratio"),
+        optional=True,
+    ),
+    Metric(
+        "energy_j",
+        "energy of a decision: inference of the ego, of the helpers that infer and of a "
+        "fusion call, and their radios; known only with a device profile",
+        JOULES,
+        "lower",
+        label="energy",
+        decisions=lambda d: d["inference_j"] + d["radio_mj"] / 1000,
+        optional=True,
+    ),
+    Metric(
+        "helpers_j",
+        "energy of a decision: the part of the helpers' inference",
+        JOULES,
+        "lower",
+        label="helpers",
+        decisions=_column("helpers_j"),
+        optional=True,
+    ),
+    Metric(
+        "radio_mj",
+        "energy of a decision: the part of the radios",
+        Unit("mJ", 3),
+        "lower",
+        label="radio",
+        decisions=_column("radio_mj"),
+        optional=True,
+    ),
+    Metric(
+        "waiting_j",
+        "energy that the ego's computer draws while it waits for messages; not part of energy_j",
+        JOULES,
+        "lower",
+        label="waiting",
+        decisions=_column("waiting_j"),
+        optional=True,
+    ),
+    Metric(
+        LATENCY,
+        "time from the start of a decision to the end of the exchange and of fusion, with all "
+        "inference",
+        MS,
+        "lower",
+        primary=True,
+        label="latency proxy",
+        decisions=_column("latency_ms"),
+    ),
+    _share(
+        "deadline_miss_rate",
+        "share of decisions that took longer than the decision window",
+        "deadline_missed",
+    ),
+    _share(
+        "trigger_rate", "share of decisions in which the ego asked helpers", "triggered", "neither"
+    ),
     # A computed probability and no share of events, so that its interval is a mean's.
-    Metric("effective_loss", "packet loss: probability that one transmission was lost", PERCENT, "neither",
-           most=1.0, decisions=_column("effective_loss")),
-    _share("observed_reply_loss", "share of scheduled replies that did not arrive; the request or the reply "
-           "was lost", "observed_loss"),
-    Metric("entropy_nats", "entropy of the ego's own intent", NATS, "neither", label="entropy",
-           decisions=_column("entropy_nats")),
-    Metric("normalised_entropy", "entropy of the ego's own intent from 0 (sure) to 1 (undecided)", SCORE,
-           "neither", decisions=_column("normalised_entropy")),
-    _judged("optimal_action_rate", "share of decisions whose likeliest action is optimal; only those in "
-            "which success was still possible", PERCENT, "higher", reliability.right, interval="rate",
-            most=1.0),
-    _judged("optimal_brier", "Brier score of the optimal actions, taken as one event; 0 best, 2 worst", SCORE,
-            "lower", reliability.brier, most=2.0, label="Brier"),
-    _judged("optimal_nll_nats", f"negative log-likelihood of the optimal actions together, whose probability "
-            f"counts as {reliability.LEAST_P} at least", NATS, "lower", reliability.likelihood_nats,
-            label="NLL"),
-    Metric(ONE_OPTIMAL, "number of decisions, of all seeds, in which exactly one action is optimal",
-           Unit(decimals=0), "neither", world="frozen", pooled=reliability.decisions),
-    Metric("calibration_error_one_optimal", "expected calibration error of the likeliest action, in "
-           f"{reliability.BINS} bins of equal mass, over all decisions in which exactly one action is "
-           f"optimal; not known below {reliability.LEAST} of them", PERCENT, "lower", most=1.0, label="ECE",
-           world="frozen", pooled=reliability.calibration_error),
-    Metric("coverage_at_5_risk_one_optimal", "greatest share, the surest first, of the decisions in which "
-           "exactly one action is optimal, of which 5 % at most are not right; not known below "
-           f"{reliability.LEAST} of them", PERCENT, "higher", most=1.0, label="coverage at 5 % risk",
-           world="frozen", pooled=reliability.coverage),
-    Metric("calibration_error", "expected calibration error over all decisions, also those in which several "
-           "actions are optimal; in older runs", PERCENT, "lower", most=1.0, world="frozen", superseded=True),
-    Metric("coverage_at_5_risk", "coverage at 5 % risk over all decisions, also those in which several "
-           "actions are optimal; in older runs", PERCENT, "higher", most=1.0, world="frozen",
-           superseded=True),
-    Metric("brier", "distance of the fused policy from the uniform one over the safe actions; 0 best, 2 "
-           "worst", SCORE, "lower", world="frozen", superseded=True,
-           decisions=lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0))),
-    Metric("negative_log_likelihood", "optimal_nll_nats with a least probability of 0.0001", SCORE, "lower",
-           world="frozen", superseded=True,
-           decisions=lambda d: negative_log_likelihood(d.of_actions("fused"), d.of_actions("safe") == 1.0)),
-    _share("fallback_rate", "share of decisions in which the ego's own answer could not be read",
-           "own_failed"),
-    Metric("fusion_ms", "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
-           "ego-prompt calls the model again", MS, "lower", label="fusion", decisions=_column("fusion_ms")),
-    _share("merge_failed_rate", "share of answers to fusion calls that could not be read; the ego then kept "
-           "its own intent", "fusion_failed", label="fusion failed rate"),
-    Metric("message_count", "number of scheduled replies in the whole run; requests do not count", COUNT,
-           "lower"),
-    *(Metric(f"latency_p{p}_ms", f"{p} % of all decisions are at most this slow", MS, "lower",
-             label=f"latency p{p}", percentile=p) for p in PERCENTILES),
-    Metric(GAIN, "success rate less that of the condition without V2V, in the same episodes", POINTS,
-           "higher", "rate", 1.0),
-    Metric(GAINS[BALANCED], "balanced success rate less that of the condition without V2V, in the same "
-           "episodes", POINTS, "higher", "rate", 1.0),
-    *(Metric(ADJUSTED[name], f"{IN_WORDS[name]}, corrected by what references that ask no model do in these "
-             "layouts and in others of the dataset", PERCENT, "higher", "rate", 1.0, corrects=name,
-             world="frozen", optional=True) for name in GAINS),
-    *(Metric(ADJUSTED[gain], f"{IN_WORDS[name]} less that of the condition without V2V, corrected likewise",
-             POINTS, "higher", "rate", 1.0) for name, gain in GAINS.items()),
+    Metric(
+        "effective_loss",
+        "packet loss: probability that one transmission was lost",
+        PERCENT,
+        "neither",
+        most=1.0,
+        decisions=_column("effective_loss"),
+    ),
+    _share(
+        "observed_reply_loss",
+        "share of scheduled replies that did not arrive; the request or the reply was lost",
+        "observed_loss",
+    ),
+    Metric(
+        "entropy_nats",
+        "entropy of the ego's own intent",
+        NATS,
+        "neither",
+        label="entropy",
+        decisions=_column("entropy_nats"),
+    ),
+    Metric(
+        "normalised_entropy",
+        "entropy of the ego's own intent from 0 (sure) to 1 (undecided)",
+        SCORE,
+        "neither",
+        decisions=_column("normalised_entropy"),
+    ),
+    _judged(
+        "optimal_action_rate",
+        "share of decisions whose likeliest action is optimal; only those in "
+        "which success was still possible",
+        PERCENT,
+        "higher",
+        reliability.right,
+        interval="rate",
+        most=1.0,
+    ),
+    _judged(
+        "optimal_brier",
+        "Brier score of the optimal actions, taken as one event; 0 best, 2 worst",
+        SCORE,
+        "lower",
+        reliability.brier,
+        most=2.0,
+        label="Brier",
+    ),
+    _judged(
+        "optimal_nll_nats",
+        "negative log-likelihood of the optimal actions together, whose probability "
+        f"counts as {reliability.LEAST_P} at least",
+        NATS,
+        "lower",
+        reliability.likelihood_nats,
+        label="NLL",
+    ),
+    Metric(
+        ONE_OPTIMAL,
+        "number of decisions, of all seeds, in which exactly one action is optimal",
+        Unit(decimals=0),
+        "neither",
+        world="frozen",
+        pooled=reliability.decisions,
+    ),
+    Metric(
+        "calibration_error_one_optimal",
+        "expected calibration error of the likeliest action, in "
+        f"{reliability.BINS} bins of equal mass, over all decisions in which exactly one action is "
+        f"optimal; not known below {reliability.LEAST} of them",
+        PERCENT,
+        "lower",
+        most=1.0,
+        label="ECE",
+        world="frozen",
+        pooled=reliability.calibration_error,
+    ),
+    Metric(
+        "coverage_at_5_risk_one_optimal",
+        "greatest share, the surest first, of the decisions in which "
+        "exactly one action is optimal, of which 5 % at most are not right; not known below "
+        f"{reliability.LEAST} of them",
+        PERCENT,
+        "higher",
+        most=1.0,
+        label="coverage at 5 % risk",
+        world="frozen",
+        pooled=reliability.coverage,
+    ),
+    Metric(
+        "calibration_error",
+        "expected calibration error over all decisions, also those in which several "
+        "actions are optimal; in older runs",
+        PERCENT,
+        "lower",
+        most=1.0,
+        world="frozen",
+        superseded=True,
+    ),
+    Metric(
+        "coverage_at_5_risk",
+        "coverage at 5 % risk over all decisions, also those in which several "
+        "actions are optimal; in older runs",
+        PERCENT,
+        "higher",
+        most=1.0,
+        world="frozen",
+        superseded=True,
+    ),
+    Metric(
+        "brier",
+        "distance of the fused policy from the uniform one over the safe actions; 0 best, 2 worst",
+        SCORE,
+        "lower",
+        world="frozen",
+        superseded=True,
+        decisions=lambda d: brier(d.of_actions("fused"), safe_target(d.of_actions("safe") == 1.0)),
+    ),
+    Metric(
+        "negative_log_likelihood",
+        "optimal_nll_nats with a least probability of 0.0001",
+        SCORE,
+        "lower",
+        world="frozen",
+        superseded=True,
+        decisions=lambda d: negative_log_likelihood(
+            d.of_actions("fused"), d.of_actions("safe") == 1.0
+        ),
+    ),
+    _share(
+        "fallback_rate",
+        "share of decisions in which the ego's own answer could not be read",
+        "own_failed",
+    ),
+    Metric(
+        "fusion_ms",
+        "part of the latency that fusion takes: 0 for a rule, which is arithmetic; "
+        "ego-prompt calls the model again",
+        MS,
+        "lower",
+        label="fusion",
+        decisions=_column("fusion_ms"),
+    ),
+    _share(
+        "merge_failed_rate",
+        "share of answers to fusion calls that could not be read; the ego then kept its own intent",
+        "fusion_failed",
+        label="fusion failed rate",
+    ),
+    Metric(
+        "message_count",
+        "number of scheduled replies in the whole run; requests do not count",
+        COUNT,
+        "lower",
+    ),
+    *(
+        Metric(
+            f"latency_p{p}_ms",
+            f"{p} % of all decisions are at most this slow",
+            MS,
+            "lower",
+            label=f"latency p{p}",
+            percentile=p,
+        )
+        for p in PERCENTILES
+    ),
+    Metric(
+        GAIN,
+        "success rate less that of the condition without V2V, in the same episodes",
+        POINTS,
+        "higher",
+        "rate",
+        1.0,
+    ),
+    Metric(
+        GAINS[BALANCED],
+        "balanced success rate less that of the condition without V2V, in the same episodes",
+        POINTS,
+        "higher",
+        "rate",
+        1.0,
+    ),
+    *(
+        Metric(
+            ADJUSTED[name],
+            f"{IN_WORDS[name]}, corrected by what references that ask no model do in these "
+            "layouts and in others of the dataset",
+            PERCENT,
+            "higher",
+            "rate",
+            1.0,
+            corrects=name,
+            world="frozen",
+            optional=True,
+        )
+        for name in GAINS
+    ),
+    *(
+        Metric(
+            ADJUSTED[gain],
+            f"{IN_WORDS[name]} less that of the condition without V2V, corrected likewise",
+            POINTS,
+            "higher",
+            "rate",
+            1.0,
+        )
+        for name, gain in GAINS.items()
+    ),
     *_of_answers(),
-    Metric("agreement_rate", "share of episodes that end alike, frozen and in closed loop", PERCENT,
-           "higher", "rate", 1.0),
-)  # fmt: skip
+    Metric(
+        "agreement_rate",
+        "share of episodes that end alike, frozen and in closed loop",
+        PERCENT,
+        "higher",
+        "rate",
+        1.0,
+    ),
+)
 METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric in BUILT_IN})
 
 
@@ -449,7 +958,9 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
 @lru_cache(1024)
 def entry(name: str) -> Metric:
-    """Return a metric; of a name that is not registered, as an older run may have it, a plain one."""
+    """Return a metric; of a name that is not registered, as an older run may have it,
+    a plain one.
+    """
     try:
         return METRICS[name]
     except (KeyError, UserError):
@@ -469,7 +980,9 @@ class Grid:
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """Return the flat index of each decision's cell, (n,). Raises ValueError for one outside the grid."""
+        """Return the flat index of each decision's cell, (n,).
+        Raises ValueError for one outside the grid.
+        """
         condition = decisions.codes("condition", self.conditions)
         seed, episode = (
             _position(decisions.whole(name), names)
@@ -478,7 +991,9 @@ class Grid:
         return np.ravel_multi_index((condition, seed, episode), self.shape)
 
     def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
-        """Return the episodes in the order of the cells. Raises ValueError unless each is there once."""
+        """Return the episodes in the order of the cells.
+        Raises ValueError unless each is there once.
+        """
         by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
         cells = [*product(self.conditions, self.seeds, self.episodes)]
         if len(by_cell) != len(episodes) or set(by_cell) != set(cells):
@@ -489,7 +1004,9 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Return each metric's values by episode, (C, S, E); the episodes are in the order of the grid."""
+    """Return each metric's values by episode, (C, S, E);
+    the episodes are in the order of the grid.
+    """
     places = grid.places(decisions)
 
     def values(metric: Metric) -> Floats:
@@ -501,7 +1018,9 @@ def by_episode(
 
 
 def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
-    """Return a metric of how episodes ended, (C, S, E); the episodes are in the order of the grid."""
+    """Return a metric of how episodes ended, (C, S, E);
+    the episodes are in the order of the grid.
+    """
     function = metric.episodes
     assert function
 
@@ -513,7 +1032,9 @@ def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
-    """Return a metric of n episodes, (n,), from decisions; `places` has the episode's index of each."""
+    """Return a metric of n episodes, (n,), from decisions;
+    `places` has the episode's index of each.
+    """
     function = metric.decisions
     assert function
     values = _values(metric, lambda: np.asarray(function(decisions), dtype=float), len(places))
@@ -524,7 +1045,9 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
 
 
 def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
-    """Return a metric's values, (n,). Those of a package that fails are unknown, and a line says so."""
+    """Return a metric's values, (n,). Those of a package that fails are unknown,
+    and a line says so.
+    """
     if metric is METRICS.built_in.get(metric.name):
         return values()
     what = f"metric {printable(metric.name)} of a package"
@@ -537,7 +1060,8 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
             raise ValueError(f"it has values beyond 0 to {metric.most:g}")
     except Exception as error:  # a stranger's code
         shown = one_line(error).removeprefix(f"{what} ") or type(error).__name__
-        say_once(f"{what}: {shown}; its figure is unknown")  # though figures are computed part by part
+        # though figures are computed part by part
+        say_once(f"{what}: {shown}; its figure is unknown")
         return np.full(n, np.nan)
     return found
 
@@ -579,8 +1103,8 @@ def over_episodes(name: str, values: Floats) -> Estimate:
 def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float = LEVEL) -> Estimate:
     """Return the interval over episodes of the difference a - b of a metric.
 
-    `pairs` are a and b, (E, S) each: one of the metric's own values, or one of each of its halves, in which
-    the episodes of the other are NaN.
+    `pairs` are a and b, (E, S) each: one of the metric's own values,
+    or one of each of its halves, in which the episodes of the other are NaN.
     """
     if entry(name).interval != "rate":
         ((a, b),) = pairs
@@ -594,15 +1118,17 @@ def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float =
 def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
     """Return a metric's estimate, from that of each of its halves where it has them.
 
-    Halves have no episode in common, so that the intervals are independent. They have all seeds in common:
-    of `shared` units n is that of each half, and of others the sum.
+    Halves have no episode in common, so that the intervals are independent. They have all seeds in
+    common: of `shared` units n is that of each half, and of others the sum.
     """
     halves = entry(name).halves
     if not halves:
         return estimate(name)
     first, second = map(estimate, halves)
     mean = mean_of([first, second])
-    n, n_excluded = (first.n, first.n_excluded) if shared else (mean.n, (mean.n_excluded - mean.n) // 2)
+    n, n_excluded = (
+        (first.n, first.n_excluded) if shared else (mean.n, (mean.n_excluded - mean.n) // 2)
+    )
     return replace(mean, n=n, n_excluded=max(n_excluded, 0))
 
 
@@ -615,15 +1141,16 @@ def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
 def known_in(values: Mapping[str, Floats]) -> list[str]:
     """Return the metrics that a run states whose values by episode are these, in their order.
 
-    Those by danger are stated only if episodes are of both kinds: a run whose scenes do not know their
-    dangers has none.
+    Those by danger are stated only if episodes are of both kinds:
+    a run whose scenes do not know their dangers has none.
     """
     known = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
     both = known.issuperset(entry(BALANCED).halves)
     return [
-        m.name for m in METRICS.values()
+        m.name
+        for m in METRICS.values()
         if (m.name in known or m.halves) and (both or not (m.half or m.halves))
-    ]  # fmt: skip
+    ]
 
 
 def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
@@ -640,7 +1167,9 @@ def in_range(name: str, e: Estimate) -> Estimate:
 def percentiles(latency_ms: Floats) -> Floats:
     """Return the `PERCENTILES` of the known latencies among (n,); NaN if none is known."""
     measured = latency_ms[~np.isnan(latency_ms)]
-    return np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
+    return (
+        np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
+    )
 
 
 def written(score: Score) -> str:

@@ -1,8 +1,9 @@
 """Compute intervals of latency percentiles, and of their differences between two runs.
 
-A percentile is taken over all decisions or answers of a run; it is not a mean of percentiles of episodes. Its
-interval is a percentile bootstrap (Efron and Tibshirani 1993, chapter 13): whole episodes are resampled, the
-same ones in two runs, and the ends are percentiles of the resampled percentile, or of its difference B - A.
+A percentile is taken over all decisions or answers of a run; it is not a mean of percentiles of
+episodes. Its interval is a percentile bootstrap (Efron and Tibshirani 1993, chapter 13): whole
+episodes are resampled, the same ones in two runs, and the ends are percentiles of the resampled
+percentile, or of its difference B - A.
 """
 
 import math
@@ -23,10 +24,11 @@ Decided = tuple[Ints, Floats]  # the episode's index and the value of each decis
 def differences(
     a: Sequence[Decided], b: Sequence[Decided], episodes: int
 ) -> Iterator[tuple[int, float, float, Estimate]]:
-    """Yield for each of `PERCENTILES`: the percent, A's value, B's value, and B - A with its interval.
+    """Yield for each of `PERCENTILES`:
+    the percent, A's value, B's value, and B - A with its interval.
 
-    A run's percentile is the mean over its seeds. In a seed, an episode without values in either run is left
-    out.
+    A run's percentile is the mean over its seeds.
+    In a seed, an episode without values in either run is left out.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
@@ -42,7 +44,9 @@ def differences(
 
 
 def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """Return the 95 % interval of each of `PERCENTILES` of values (n,), over episodes; NaN if unbounded."""
+    """Return the 95 % interval of each of `PERCENTILES` of values (n,), over episodes;
+    NaN if unbounded.
+    """
     names, index = np.unique(episodes, return_inverse=True)
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)
     resampled_percentiles = _percentiles((index, values), weights)
@@ -53,7 +57,9 @@ def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float,
 
 
 def _ends(resamples: Floats, episodes: int) -> tuple[float, float]:
-    """Return the ends of the middle 95 % of resamples; NaN for a single episode or if both ends are equal."""
+    """Return the ends of the middle 95 % of resamples;
+    NaN for a single episode or if both ends are equal.
+    """
     sampled = resamples[1:][~np.isnan(resamples[1:])]
     low, high = np.percentile(sampled, (2.5, 97.5)) if episodes > 1 else (math.nan, math.nan)
     return (math.nan, math.nan) if low == high else (float(low), float(high))
@@ -68,7 +74,9 @@ def _common(a: Decided, b: Decided) -> tuple[Decided, Decided]:
 
 
 def _percentiles(decided: Decided, weights: Ints) -> Floats:
-    """Return `PERCENTILES` of weighted decisions, (P, R); weights (R, E) count each episode in a resample."""
+    """Return `PERCENTILES` of weighted decisions, (P, R);
+    weights (R, E) count each episode in a resample.
+    """
     parts = math.ceil(len(weights) * max(len(decided[0]), 1) / AT_ONCE)
     return np.hstack([_weighted(decided, part) for part in np.array_split(weights, parts)])
 
@@ -89,7 +97,9 @@ def _weighted(decided: Decided, weights: Ints) -> Floats:
 
     def smallest(k: Ints) -> Floats:
         """Return the k-th smallest value of each resample, from 0."""
-        picked: Floats = values[order][np.searchsorted(ascending, k + lift, side="right") - row * size]
+        picked: Floats = values[order][
+            np.searchsorted(ascending, k + lift, side="right") - row * size
+        ]
         return picked
 
     position = np.array(PERCENTILES)[:, None] / 100 * last

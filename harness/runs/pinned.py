@@ -1,7 +1,7 @@
 """Differences of success as older runs state them, and as what is pinned to these computes them.
 
-Each half of each family has an interval of its own (`rate_difference`), and these are combined. Taken
-together, the same differences have a narrower one: `success.mean_difference`.
+Each half of each family has an interval of its own (`rate_difference`), and these are combined.
+Taken together, the same differences have a narrower one: `success.mean_difference`.
 """
 
 from harness.core.statistics import Estimate, mean_of, rate_difference

@@ -43,19 +43,23 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """One answer of a model: a line of `answers.jsonl`; tokens and times include those of a repair turn."""
+    """One answer of a model: a line of `answers.jsonl`;
+    tokens and times include those of a repair turn.
+    """
 
     scene: str  # id of the decision point
     viewer: str  # id of the vehicle that answered
     # keys of the helpers' answers whose messages were in the prompt of a fusion call
     heard: tuple[str, ...] = ()
-    role: Role  # `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing
+    # `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing
+    role: Role
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
     finish_reason: str  # `stop`, `length`, `refusal` or `error`
     error: str | None  # the engine's message; None if it answered
     prompt_tokens: int | None  # tokens in; None if the engine has no tokenizer
     completion_tokens: int | None  # tokens out; None if the engine has no tokenizer
-    seconds: float | None  # time of this answer if its request was alone in the engine; None otherwise
+    # time of this answer if its request was alone in the engine; None otherwise
+    seconds: float | None
     batch_size: int  # how many requests went through the engine together
     label_mass: float | None  # probability of all letters together in a read-out; None otherwise
     retries: int  # failed attempts before this one
@@ -70,23 +74,23 @@ class Answer(Struct, frozen=True, kw_only=True):
     mass: float | None  # their sum as written; None if none were written
     message: dict[str, Any] | None  # the rest of a helper's answer; None if there is none
     detail: str  # one sentence for people
-    # time to the first token, prefill included; None if `seconds` is None, if it is unknown, or after a
-    # repair turn
+    # time to the first token, prefill included; None if `seconds` is None, if it is unknown, or
+    # after a repair turn
     first_token_s: float | None = None
     # time of each token after the first; None if `first_token_s` is None or no token follows
     token_s: float | None = None
     first: FirstTurn | UnsetType = UNSET  # the answer before a repair turn; unset without one
     # digest of the pixels of the picture in its prompt; unset without one
     image_sha256: str | UnsetType = UNSET
-    # how much of a read-out over several orders of its letters follows the letter, 0 to 1; unset where
-    # the letters were read once, like the next
+    # how much of a read-out over several orders of its letters follows the letter, 0 to 1; unset
+    # where the letters were read once, like the next
     letter_share: float | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET  # whether one letter is the likeliest in every order
-    # whether the likeliest action changed when the list of actions was reversed; unset where that was
-    # not asked, or got no answer
+    # whether the likeliest action changed when the list of actions was reversed; unset where that
+    # was not asked, or got no answer
     flipped: bool | UnsetType = UNSET
-    # which of several helper models answered, from 1; where several vehicles decide, also 0, the ego's; unset
-    # where the place among all answers says
+    # which of several helper models answered, from 1; where several vehicles decide, also 0, the
+    # ego's; unset where the place among all answers says
     agent: int | UnsetType = UNSET
     # all that is wrong with a failed answer, the status first; unset where that is the only fault
     faults: tuple[str, ...] | UnsetType = UNSET
@@ -119,7 +123,9 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def key(self) -> str:
-        """The answer's name within its decision point: viewer, senders heard, and whether it was blind."""
+        """The answer's name within its decision point:
+        viewer, senders heard, and whether it was blind.
+        """
         return "+".join((self.viewer, *self.heard)) + (BLIND if self.role == "blind" else "")
 
 
@@ -170,8 +176,8 @@ class Times(Struct, frozen=True, omit_defaults=True):
 class Latency(Struct, frozen=True, omit_defaults=True):
     """How long inference takes; it is fixed before a run and decides who is heard in time."""
 
-    # `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer follows
-    # from its own tokens on a declared computer
+    # `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer
+    # follows from its own tokens on a declared computer
     source: Literal["card", "paper", "declared", "measured", "device"]
     basis: str  # where the numbers come from
     # seconds of one inference of the ego; None if the source is `device`, like the next two
@@ -187,20 +193,28 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         has_seconds = None not in (self.ego_s, self.helper_s, self.fusion_s)
-        if has_seconds == (self.source == "device") or bool(self.speeds) != (self.source == "device"):
+        if has_seconds == (self.source == "device") or bool(self.speeds) != (
+            self.source == "device"
+        ):
             raise ValueError("latency has speeds where its source is device, and else seconds")
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
-        """Return the seconds of each helper model, which take turns; empty if the source is `device`."""
+        """Return the seconds of each helper model, which take turns;
+        empty if the source is `device`.
+        """
         return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
 
     def speed(self, place: int) -> Speed:
-        """Return the speed of a scene's viewer at this place, the ego at 0; helpers' agents take turns."""
+        """Return the speed of a scene's viewer at this place, the ego at 0;
+        helpers' agents take turns.
+        """
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
     def seconds(self, place: int) -> Seconds | None:
-        """Return the seconds of an answer of who is at this place, as `speed`; None if its speed says."""
+        """Return the seconds of an answer of who is at this place, as `speed`;
+        None if its speed says.
+        """
         helpers = self.helper_times_s()
         return helpers[(place - 1) % len(helpers)] if place and helpers else self.ego_s
 
@@ -213,8 +227,10 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
     on_time: bool  # whether it arrived within the decision window
     arrival_ms: float | None  # when it arrived, from the start of the decision; None if lost
     weight: float | None  # its weight in the policy; None if a fusion call answered
-    trust: float | None  # how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust
-    attacker: bool | None  # whether the sender attacks under this condition; None in runs older than attacks
+    # how far the consensus rule trusted it, from 0 to 1; None if the rule rates no trust
+    trust: float | None
+    # whether the sender attacks under this condition; None in runs older than attacks
+    attacker: bool | None
 
 
 class Decision(Struct, frozen=True, kw_only=True):
@@ -272,28 +288,34 @@ class Episode(Struct, frozen=True, kw_only=True):
     decisions: int | None = None  # decisions begun
     skipped: int | None = None  # decisions not begun, since one was still open
     never_acted: int | None = None  # decisions that were not ready before the end
-    # how it ended: `success`, `late`, `unsafe` (a collision, or off the road) or `stuck` (never there); None
-    # where `limits` is 1
+    # how it ended: `success`, `late`, `unsafe` (a collision, or off the road) or `stuck` (never
+    # there); None where `limits` is 1
     outcome: str | None = None
     # by how much the ego cleared later than was possible; frozen only, like the next two
     time_lost_s: float | None = None
     miss: bool | None = None  # whether a decision made harm inevitable, which was not before
-    false_alarm: bool | None = None  # whether a decision gave success away, and harm could still be avoided
-    least_ttc_s: float | None = None  # least time to collision with another vehicle; None where none was near
+    # whether a decision gave success away, and harm could still be avoided
+    false_alarm: bool | None = None
+    # least time to collision with another vehicle; None where none was near
+    least_ttc_s: float | None = None
     short_ttc: bool | None = None  # whether it was below 1.5 s; None where it was not measured
     least_pet_s: float | None = None  # least post-encroachment time
     short_pet: bool | None = None  # whether it was below 1.5 s
-    # how many helpers have, or would have, the danger in sight at the first decision; None if not declared
+    # how many helpers have, or would have, the danger in sight at the first decision; None if not
+    # declared
     witnesses: int | None = None
-    danger_radio: bool | None = None  # whether the danger sends beacons; None without one, or undeclared
-    agents: int | None = None  # how many vehicles decided; None if only the ego did, like the next six
+    # whether the danger sends beacons; None without one, or undeclared
+    danger_radio: bool | None = None
+    # how many vehicles decided; None if only the ego did, like the next six
+    agents: int | None = None
     arrived: int | None = None  # how many of them reached their goal
     met: int | None = None  # how many collided with another of them
     # how much later than alone on the road, at their first speed, those who arrived did, in sum
     agents_lost_s: float | None = None
     most_lost_s: float | None = None  # the same of the one who lost most
     gave_way: str | None = None  # id of that one; None if nobody lost time
-    journeys: str | None = None  # how each of them ended: JSON, a list of `harness.world.outcome.End`
+    # how each of them ended: JSON, a list of `harness.world.outcome.End`
+    journeys: str | None = None
 
 
 class Variant(Struct, frozen=True):
@@ -323,8 +345,8 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     high: float | None  # its upper end
     n: int  # number of units
     n_excluded: int  # units without a value
-    # what the units are: `episodes`, `seed means` or `answers`; `any time` for episodes and an interval that
-    # holds at every look
+    # what the units are: `episodes`, `seed means` or `answers`; `any time` for episodes and an
+    # interval that holds at every look
     interval: str
 
     @classmethod
@@ -340,7 +362,9 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
     @property
     def estimate(self) -> Estimate:
-        value, low, high = (float("nan") if x is None else x for x in (self.value, self.low, self.high))
+        value, low, high = (
+            float("nan") if x is None else x for x in (self.value, self.low, self.high)
+        )
         return Estimate(value, low, high, self.n, self.n_excluded)
 
 
@@ -355,8 +379,12 @@ class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
     enough: bool = False  # whether the last look was enough
 
 
-class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True):
-    """The record of a dataset and the episodes walked: all of them without `limit` and `selection`."""
+class FrozenScenes(
+    Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True
+):
+    """The record of a dataset and the episodes walked:
+    all of them without `limit` and `selection`.
+    """
 
     name: str
     sha256: str
@@ -375,11 +403,13 @@ class FrozenScenes(Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=
         return self.sha256
 
 
-class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True):
+class ClosedLoop(
+    Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True
+):
     """The record of a closed-loop world; episode e has layout seed `first_seed` + e.
 
-    `episodes` is how many were driven. If a sample was drawn, `selection` has the number of episodes that it
-    is drawn from, `of`, and the draw.
+    `episodes` is how many were driven. If a sample was drawn, `selection` has the number of
+    episodes that it is drawn from, `of`, and the draw.
     """
 
     scenario: dict[str, Any]
@@ -411,7 +441,9 @@ class ClosedLoop(Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_on
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):
-    """A channel profile at the time of the run: a `harness.radio.profiles.Profile` with all parameters."""
+    """A channel profile at the time of the run:
+    a `harness.radio.profiles.Profile` with all parameters.
+    """
 
     model: str
     description: str
@@ -423,7 +455,9 @@ class ChannelRecord(Struct, frozen=True, kw_only=True):
 
 @cache
 def _condition() -> type[Struct]:
-    """Make the record of a condition's settings as a file states them; one of another version has others."""
+    """Make the record of a condition's settings as a file states them;
+    one of another version has others.
+    """
     types = OperatingPoint.types()
     return defstruct("Condition", [(name, kind | UnsetType, UNSET) for name, kind in types.items()])
 
@@ -447,7 +481,9 @@ class Cost(Struct, frozen=True):
         total: dict[str, Cost] = {}
         for model, cost in (each for run in runs for each in (run.cost or {}).items()):
             old = total.get(model)
-            sums = {name: getattr(cost, name) + (getattr(old, name) if old else 0) for name in _SUMMED}
+            sums = {
+                name: getattr(cost, name) + (getattr(old, name) if old else 0) for name in _SUMMED
+            }
             total[model] = cls(cost.currency, **sums)
         return total
 
@@ -503,12 +539,16 @@ class Manifest(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         for table_name, table, keys in (
-            ("model", self.model, ("name", "engine")), ("prompt", self.prompt, ("version", "sha256")),
+            ("model", self.model, ("name", "engine")),
+            ("prompt", self.prompt, ("version", "sha256")),
             *(("conditions", point, ("name",)) for point in self.conditions),
             *(("helpers", helper, ("answer",)) for helper in self.helpers),
             *(("helpers", helper.get("model", {}), ("name", "engine")) for helper in self.helpers),
-            *(("helpers", helper.get("prompt", {}), ("version", "sha256")) for helper in self.helpers),
-        ):  # fmt: skip
+            *(
+                ("helpers", helper.get("prompt", {}), ("version", "sha256"))
+                for helper in self.helpers
+            ),
+        ):
             if missing := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{table_name}: {missing[0]} is no text")
             if table_name != "conditions" and not _is_name(table[keys[0]]):
@@ -522,7 +562,11 @@ class Manifest(Struct, frozen=True, kw_only=True):
             except UserError as mistake:
                 raise ValueError(str(mistake)) from None
         names = tuple(point["name"] for point in self.conditions)
-        for field_name, values in (("actions", self.actions), ("conditions", names), ("seeds", self.seeds)):
+        for field_name, values in (
+            ("actions", self.actions),
+            ("conditions", names),
+            ("seeds", self.seeds),
+        ):
             if not 0 < len(values) == len(set(values)):
                 raise ValueError(f"{field_name}: none, or one twice")
 
@@ -537,7 +581,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
         )
 
     def agent(self, place: int) -> dict[str, Any]:
-        """Return the agent of a scene's viewer at this place, in the form of `helpers`; the ego is at 0."""
+        """Return the agent of a scene's viewer at this place, in the form of `helpers`;
+        the ego is at 0.
+        """
         if place and self.helpers:
             return self.helpers[(place - 1) % len(self.helpers)]
         names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip")

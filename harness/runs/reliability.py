@@ -1,17 +1,20 @@
 """Judge the probabilities of policies by the actions that turned out optimal.
 
-The worth of an action is exact, from the decision tree: whether success is still possible after it. An action
-is *optimal* if it is of the greatest worth; of several all are. Where nothing can succeed any more all
-actions are alike, and the decision is not judged. A policy is right if its likeliest action is optimal, and
-as sure as that action is probable; of equally likely actions the share that is optimal counts.
+The worth of an action is exact, from the decision tree: whether success is still possible after it.
+An action is *optimal* if it is of the greatest worth; of several all are. Where nothing can succeed
+any more all actions are alike, and the decision is not judged. A policy is right if its likeliest
+action is optimal, and as sure as that action is probable; of equally likely actions the share that
+is optimal counts.
 
-How sure a policy should be of one action is known only where exactly one is optimal. Of several it may take
-any: one that spreads its probability over them makes no mistake, and is less sure than it is right.
+How sure a policy should be of one action is known only where exactly one is optimal. Of several it
+may take any: one that spreads its probability over them makes no mistake, and is less sure than it
+is right.
 
-Each figure is over all decisions with one optimal action, and none is a mean over episodes. Its interval is a
-bootstrap (Efron and Tibshirani 1993, chapter 13) that resamples whole episodes, since decisions of one are
-not independent. The ends are percentiles of the resampled figures, moved by as much as these are off the
-figure on average: a resample is noisier than the sample, which lifts a calibration error.
+Each figure is over all decisions with one optimal action, and none is a mean over episodes. Its
+interval is a bootstrap (Efron and Tibshirani 1993, chapter 13) that resamples whole episodes, since
+decisions of one are not independent. The ends are percentiles of the resampled figures, moved by as
+much as these are off the figure on average: a resample is noisier than the sample, which lifts a
+calibration error.
 """
 
 import math
@@ -27,7 +30,8 @@ from harness.core.statistics import Estimate, resampled
 LEAST_P = 0.005  # least probability of the optimal actions that is counted in a likelihood
 BINS = 15  # of equal mass
 RISK = 0.05  # greatest share of decisions acted on whose action is not optimal
-LEAST = 100  # fewest decisions of a figure: of fewer, even a calibrated policy has an error of many points
+# fewest decisions of a figure: of fewer, even a calibrated policy has an error of many points
+LEAST = 100
 LEAST_EPISODES = 30  # fewest that these are of: other seeds often repeat the decisions of a layout
 RESAMPLES = 399  # of episodes
 SAME = 1e-9  # how near figures are that differ by rounding alone
@@ -35,27 +39,35 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 
 
 def mass(p: Floats, optimal: Bools) -> Floats:
-    """Return the probability of the optimal actions in policies, both `(..., A)`; NaN where none is."""
-    total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)  # rounding may lift it above 1
+    """Return the probability of the optimal actions in policies, both `(..., A)`;
+    NaN where none is.
+    """
+    # rounding may lift it above 1
+    total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)
     return np.where(np.any(optimal, axis=-1), total, np.nan)
 
 
 def brier(p: Floats, optimal: Bools) -> Floats:
-    """Return the Brier score (Brier 1950) of two events, that an optimal action is taken or another.
+    """Return the Brier score (Brier 1950) of two events,
+    that an optimal action is taken or another.
 
-    With the probability m of the optimal actions it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst. It does
-    not matter how m is spread over several optimal actions.
+    With the probability m of the optimal actions it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst.
+    It does not matter how m is spread over several optimal actions.
     """
     return np.asarray(2.0 * (1.0 - mass(p, optimal)) ** 2)
 
 
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
-    """Return -ln of the probability of the optimal actions (Good 1952), at least `LEAST_P`: 5.3 nats."""
+    """Return -ln of the probability of the optimal actions (Good 1952),
+    at least `LEAST_P`: 5.3 nats.
+    """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
 
 def right(p: Floats, optimal: Bools) -> Floats:
-    """Return the share of the likeliest actions that is optimal, `(...)`; NaN where no action is."""
+    """Return the share of the likeliest actions that is optimal, `(...)`;
+    NaN where no action is.
+    """
     likeliest = p == p.max(axis=-1, keepdims=True)
     share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
     return np.where(np.any(optimal, axis=-1) & ~np.isnan(p).any(axis=-1), share, np.nan)
@@ -71,7 +83,9 @@ class Judged:
 
     @classmethod
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
-        """Judge policies `(n, A)`, and leave out the decisions with no optimal action or with several."""
+        """Judge policies `(n, A)`, and leave out the decisions with no optimal action or with
+        several.
+        """
         hits = right(p, optimal)
         known = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
         return cls(p.max(axis=-1)[known], hits[known], episode[known])
@@ -102,9 +116,10 @@ def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the expected calibration error of the likeliest action (Naeini and others 2015), (R,).
 
-    `BINS` bins of equal mass (Nguyen and O'Connor 2015); decisions that are equally sure are in one bin. The
-    error is the mean over decisions of the distance between a bin's share of right policies and how sure they
-    are on average. It is above 0 even for calibrated policies, the more the fewer decisions there are.
+    `BINS` bins of equal mass (Nguyen and O'Connor 2015); decisions that are equally sure are in one
+    bin. The error is the mean over decisions of the distance between a bin's share of right
+    policies and how sure they are on average. It is above 0 even for calibrated policies, the more
+    the fewer decisions there are.
 
     Args:
         count: how many decisions are at each level of how sure they are, from the surest, (R, L).
@@ -120,8 +135,8 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the greatest share of decisions of which at most `RISK` are not right, (R,).
 
     The surest decisions are acted on first, and those that are equally sure together (selective
-    classification: El-Yaniv and Wiener 2010). The bound is chosen on the decisions that it is stated of.
-    `calibration_error` says what the arguments are.
+    classification: El-Yaniv and Wiener 2010). The bound is chosen on the decisions that it is
+    stated of. `calibration_error` says what the arguments are.
     """
     acted, correct = count.cumsum(axis=1), hits.cumsum(axis=1)
     within = acted - correct <= RISK * acted + 1e-9
@@ -131,7 +146,8 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     """Return a figure of decisions in so many episodes, with its interval over these.
 
-    Of fewer than `LEAST` decisions, or `LEAST_EPISODES` episodes with any, only their number is known.
+    Of fewer than `LEAST` decisions, or `LEAST_EPISODES` episodes with any,
+    only their number is known.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -141,8 +157,8 @@ def estimates(
 ) -> list[Estimate]:
     """Return some figures of the same decisions, as `estimate` does each; they share the resamples.
 
-    By the `older` rules, version 1 of the figures, any number of episodes is enough, and a figure whose
-    resamples are all alike has an interval of no width, which rounding may have left out.
+    By the `older` rules, version 1 of the figures, any number of episodes is enough, and a figure
+    whose resamples are all alike has an interval of no width, which rounding may have left out.
     """
     known = [figure for figure in figures if _known(figure, judged, older)]
     values = []
@@ -152,11 +168,13 @@ def estimates(
     return [next(found) if figure in known else _unknown(episodes) for figure in figures]
 
 
-def difference(a: Judged, b: Judged, figure: Figure, episodes: int) -> tuple[float, float, Estimate]:
+def difference(
+    a: Judged, b: Judged, figure: Figure, episodes: int
+) -> tuple[float, float, Estimate]:
     """Return a figure of A's and of B's decisions, and B's less A's, paired by episode.
 
-    Episodes in which either has no decision are left out. Nothing is known if one is left with fewer than
-    `LEAST`, except of their number.
+    Episodes in which either has no decision are left out.
+    Nothing is known if one is left with fewer than `LEAST`, except of their number.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
@@ -182,11 +200,13 @@ def _known(figure: Figure, judged: Judged, older: bool = False) -> bool:
     return len(judged.sure) >= LEAST and len(np.unique(judged.episode)) >= least_episodes
 
 
-def _estimate(values: Sequence[Floats], judged: Judged, episodes: int, older: bool = False) -> Estimate:
+def _estimate(
+    values: Sequence[Floats], judged: Judged, episodes: int, older: bool = False
+) -> Estimate:
     """Return a figure, the first of its values, with the interval of the others, its resamples.
 
-    Where all are alike, what is not seen in n episodes is in at most 3 / n of others (95 %: Hanley and
-    Lippman-Hand 1983).
+    Where all are alike, what is not seen in n episodes is in at most 3 / n of others (95 %: Hanley
+    and Lippman-Hand 1983).
     """
     n = len(np.unique(judged.episode))
     value, *others = np.concatenate(values).tolist()
@@ -197,12 +217,15 @@ def _estimate(values: Sequence[Floats], judged: Judged, episodes: int, older: bo
 
 
 def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Yield what a `Figure` is of, in parts of some resamples; the first is of the decisions as they are."""
+    """Yield what a `Figure` is of, in parts of some resamples;
+    the first is of the decisions as they are.
+    """
     order = np.argsort(-judged.sure, kind="stable")
     sure, hits, episode = judged.sure[order], judged.right[order], judged.episode[order]
     starts = np.flatnonzero(np.diff(sure, prepend=np.inf))
     weights = resampled(generator("reliability", episodes), episodes, RESAMPLES)
-    weights = weights[weights[:, np.unique(episode)].any(axis=1)]  # resamples that have any decision
+    # resamples that have any decision
+    weights = weights[weights[:, np.unique(episode)].any(axis=1)]
     at_once = max(1, AT_ONCE // len(sure))
     parts = np.split(weights.astype(float), range(at_once, len(weights), at_once))
 
@@ -215,7 +238,9 @@ def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Float
 
 
 def _bins(count: Floats | Ints) -> Ints:
-    """Return the bin of each level (R, L): the one of equal mass that the middle of the level is in."""
+    """Return the bin of each level (R, L):
+    the one of equal mass that the middle of the level is in.
+    """
     upto = count.cumsum(axis=1)
     place = BINS * (upto - count / 2) / upto[:, -1:]
     return np.asarray(np.minimum(place.astype(np.int64), BINS - 1))

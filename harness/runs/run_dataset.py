@@ -16,11 +16,12 @@ DEEPEST = 8  # folders of a dataset's stated path that are looked for above a ru
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the dataset of a run on frozen scenes, wherever it lies now, if it has the run's digest.
+    """Return the dataset of a run on frozen scenes, wherever it lies now,
+    if it has the run's digest.
 
-    It is looked for where the run states, at that path seen from each folder above the run's, and by its
-    name; nowhere else if the user names its folder, `given`. Raises UserError if it is not found, has another
-    digest, or is damaged.
+    It is looked for where the run states, at that path seen from each folder above the run's, and
+    by its name; nowhere else if the user names its folder, `given`. Raises UserError if it is not
+    found, has another digest, or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
@@ -32,14 +33,18 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
             folders.append(path)
     repair = "restore it, give its folder to a command that has --dataset, or run again"
     if folders:
-        sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]  # which says what is wrong with it
+        # which says what is wrong with it
+        sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]
         raise UserError(
-            f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made on "
+            f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made "
+            "on "
             f"(sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
         )
     raise UserError(
-        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither at "
-        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by its name; "
+        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither "
+        "at "
+        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by "
+        "its name; "
         f"{repair}"
     )
 
@@ -80,7 +85,9 @@ def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) 
     """
     decided = run.decisions.scenes
     scenes_by_file: dict[str, Iterable[str]] = {
-        "decisions.parquet": decided if some is None else (scene for scene in some if scene in decided),
+        "decisions.parquet": decided
+        if some is None
+        else (scene for scene in some if scene in decided),
         "answers.jsonl": (scene for scene in run.answers_by_scene if scene not in decided),
     }
     for file, scenes in scenes_by_file.items():

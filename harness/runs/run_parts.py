@@ -1,4 +1,6 @@
-"""Write and read the parts of a run that are kept while it goes on, each a folder of some episodes."""
+"""Write and read the parts of a run that are kept while it goes on,
+each a folder of some episodes.
+"""
 
 import os
 import shutil
@@ -21,9 +23,11 @@ _FACTS = msgspec.json.Decoder(AnswerFacts)
 
 
 def part_files(
-    decisions: Decisions, episodes: Sequence[Episode], answers: Iterable[Answer],
+    decisions: Decisions,
+    episodes: Sequence[Episode],
+    answers: Iterable[Answer],
     viewers: Mapping[str, Sequence[str]],
-) -> dict[str, bytes]:  # fmt: skip
+) -> dict[str, bytes]:
     """Return the files of a part of a run, by name; the answers may be in any order.
 
     `viewers` has the ids of each decision point's viewers, the ego first.
@@ -44,11 +48,17 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     os.replace(part, out)
 
 
-def read_part(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
+def read_part(
+    part: Path, actions: Sequence[str]
+) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
     """Read a part that `write_part` wrote. Raises UserError if it is broken."""
-    return whole(part, lambda part: (
-        *_read_tables(part, actions), facts_of(part),
-    ))  # fmt: skip
+    return whole(
+        part,
+        lambda part: (
+            *_read_tables(part, actions),
+            facts_of(part),
+        ),
+    )
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:

@@ -1,6 +1,8 @@
-"""State the settings of an evaluation as a user types them: one record for commands and a run's file.
+"""State the settings of an evaluation as a user types them:
+one record for commands and a run's file.
 
-Each field of `Settings` is an option of `harness eval` or `harness drive`, with its help and its panel there.
+Each field of `Settings` is an option of `harness eval` or `harness drive`,
+with its help and its panel there.
 """
 
 import json
@@ -27,8 +29,8 @@ CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
 
 
-# What of a setting is the same when a stopped run resumes: itself, what it opens (a run states that), or
-# nothing.
+# What of a setting is the same when a stopped run resumes: itself, what it opens (a run states
+# that), or nothing.
 ITSELF, OPENED, NOTHING = "itself", "opened", "nothing"
 
 
@@ -42,9 +44,10 @@ def option(
 ) -> Meta:
     """Describe a setting: its help, its panel (by default the first), the world that alone has it.
 
-    One that is `listed` is a text of several names with commas, and may be typed once for each. `same` says
-    what of it must be the same when a stopped run resumes. `compared` says whether a comparison of two runs
-    tells it, if it must be the same: not what other facts of a run tell, nor what changes no decision.
+    One that is `listed` is a text of several names with commas, and may be typed once for each.
+    `same` says what of it must be the same when a stopped run resumes. `compared` says whether a
+    comparison of two runs tells it, if it must be the same: not what other facts of a run tell, nor
+    what changes no decision.
     """
     said = {"help": text, "panel": panel, "only": only, "listed": listed}
     return Meta(extra={**said, "same": same, "compared": compared})
@@ -56,7 +59,8 @@ class HelperSettings(Struct, frozen=True, kw_only=True):
     model: Annotated[
         str | None,
         option(
-            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. Repeatable. "
+            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
+            "Repeatable. "
             "Default: the ego's model.",
             HELPERS,
             listed=True,
@@ -70,14 +74,16 @@ class HelperSettings(Struct, frozen=True, kw_only=True):
         option("How the helpers answer, as --answer says. Default: like the ego.", HELPERS),
     ] = None
     thinking: Annotated[
-        bool | None, option("Ask the helpers to think before they answer. Default: like the ego.", HELPERS)
+        bool | None,
+        option("Ask the helpers to think before they answer. Default: like the ego.", HELPERS),
     ] = None
 
 
 UntilWidth = Annotated[
     float | None,
     option(
-        "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; it is "
+        "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; "
+        "it is "
         "one that holds at every look.",
         EPISODES,
     ),
@@ -97,23 +103,31 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
 
     dataset: Annotated[
         str,
-        option("Name of a shipped dataset, a dataset's folder, or suite:NAME for several datasets at once."),
+        option(
+            "Name of a shipped dataset, a dataset's folder, or suite:NAME for several datasets at "
+            "once."
+        ),
     ] = DATASET
-    limit: Annotated[int | None, option("Use only this many episodes, from the first. Default: all.")] = None
+    limit: Annotated[
+        int | None, option("Use only this many episodes, from the first. Default: all.")
+    ] = None
     only: Annotated[
         str | None, option("Use only these episodes: 3,10:20 means 3 and 10 to 19.", EPISODES)
     ] = None
     danger: Annotated[
         str | None,
         option(
-            "Use only episodes whose danger comes from this sector, such as left; none means episodes "
+            "Use only episodes whose danger comes from this sector, such as left; none means "
+            "episodes "
             "without a danger.",
             EPISODES,
         ),
     ] = None
     sample: Annotated[
         int | None,
-        option("Draw this many episodes at random from those that --only and --danger leave.", EPISODES),
+        option(
+            "Draw this many episodes at random from those that --only and --danger leave.", EPISODES
+        ),
     ] = None
     sample_seed: Annotated[int, option("Seed of this draw.", EPISODES)] = 0
     until_width: UntilWidth = None
@@ -126,24 +140,33 @@ class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="cl
     scenario: Annotated[
         str | None,
         option(
-            "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: occluded-intersection, "
+            "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: "
+            "occluded-intersection, "
             "with the scenes of occluded-intersection-v3."
         ),
     ] = None
     episodes: Annotated[
         int | None,
-        option("Number of layouts to drive. Default: as many as the scenario's shipped dataset has."),
+        option(
+            "Number of layouts to drive. Default: as many as the scenario's shipped dataset has."
+        ),
     ] = None
     first_seed: Annotated[
         int | None,
         option(
-            "Layout seed of the first episode. Default: that of the scenario's shipped dataset.", EPISODES
+            "Layout seed of the first episode. Default: that of the scenario's shipped dataset.",
+            EPISODES,
         ),
     ] = None
-    sample: Annotated[int | None, option("Draw this many of these episodes at random.", EPISODES)] = None
+    sample: Annotated[
+        int | None, option("Draw this many of these episodes at random.", EPISODES)
+    ] = None
     sample_seed: Annotated[
         int,
-        option("Seed of this draw; with the same seed, eval draws the same episodes of as many.", EPISODES),
+        option(
+            "Seed of this draw; with the same seed, eval draws the same episodes of as many.",
+            EPISODES,
+        ),
     ] = 0
     until_width: UntilWidth = None
     until_decided: UntilDecided = None
@@ -158,8 +181,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     model: Annotated[
         str,
         option(
-            "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf file, a "
-            "hub id, the URL of a server such as http://127.0.0.1:8080/v1, or replay:RUN, which scores the "
+            "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf "
+            "file, a "
+            "hub id, the URL of a server such as http://127.0.0.1:8080/v1, or replay:RUN, which "
+            "scores the "
             "stored answers of a run again.",
             same=OPENED,
         ),
@@ -167,7 +192,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     engine: Annotated[
         str | None,
         option(
-            "Engine to run the model on, such as llama-cpp, if its card names several. Default: its main "
+            "Engine to run the model on, such as llama-cpp, if its card names several. Default: "
+            "its main "
             "one.",
             ENGINE,
             same=OPENED,
@@ -186,7 +212,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     seeds: Annotated[
         str,
         option(
-            "Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each seed.",
+            "Channel seeds: 0:5 means 0 to 4; 3,7,9 is a list. Every episode is scored with each "
+            "seed.",
             same=OPENED,
             compared=False,
         ),
@@ -194,7 +221,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     condition: Annotated[
         tuple[str, ...],
         option(
-            "Condition to score: an operating point such as single-local, v2x or 6g, or one with changed "
+            "Condition to score: an operating point such as single-local, v2x or 6g, or one with "
+            "changed "
             "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points.",
             same=OPENED,
             compared=False,
@@ -203,8 +231,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     control: Annotated[
         tuple[str, ...],
         option(
-            "Beside each condition with a channel, also score a control. shuffled-messages: the ego hears "
-            "the helpers of another layout. no-messages: every message is lost. blind: the helpers see "
+            "Beside each condition with a channel, also score a control. shuffled-messages: the "
+            "ego hears "
+            "the helpers of another layout. no-messages: every message is lost. blind: the helpers "
+            "see "
             "nothing. Repeatable.",
             CONDITIONS,
             "frozen",
@@ -215,8 +245,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     attack: Annotated[
         tuple[str, ...],
         option(
-            "Beside each condition with a channel, also score it under attack: liar:share=1/3 makes a third "
-            "of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` lists them. "
+            "Beside each condition with a channel, also score it under attack: liar:share=1/3 "
+            "makes a third "
+            "of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` "
+            "lists them. "
             "Repeatable.",
             CONDITIONS,
             same=OPENED,
@@ -226,17 +258,22 @@ class Settings(Struct, frozen=True, kw_only=True):
     answer: Annotated[
         str,
         option(
-            "How the model answers. json: free text with a JSON object. constrained: decoding allows only "
-            "what fits the schema. readout: the intent is read from the probabilities of one letter per "
+            "How the model answers. json: free text with a JSON object. constrained: decoding "
+            "allows only "
+            "what fits the schema. readout: the intent is read from the probabilities of one "
+            "letter per "
             "action. decision: the same of a typed question, which decision models answer.",
             same=OPENED,
         ),
     ] = "json"
-    thinking: Annotated[bool, option("Ask the model to think before it answers.", same=OPENED)] = False
+    thinking: Annotated[bool, option("Ask the model to think before it answers.", same=OPENED)] = (
+        False
+    )
     image: Annotated[
         str,
         option(
-            "Which picture an image prompt shows: own (the viewer's), blank, another (another scene's), or "
+            "Which picture an image prompt shows: own (the viewer's), blank, another (another "
+            "scene's), or "
             "none (text only).",
             ANSWERS,
             same=OPENED,
@@ -245,8 +282,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     letters: Annotated[
         str | None,
         option(
-            "How the letters of a readout or decision are read. raw: once. cyclic: averaged over as many "
-            "orders of the list as there are actions, so that none is preferred. Default: the card's, or "
+            "How the letters of a readout or decision are read. raw: once. cyclic: averaged over "
+            "as many "
+            "orders of the list as there are actions, so that none is preferred. Default: the "
+            "card's, or "
             "cyclic.",
             ANSWERS,
             same=OPENED,
@@ -255,7 +294,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     flip: Annotated[
         bool,
         option(
-            "Ask each readout or decision once more with the list of actions reversed, and count how often "
+            "Ask each readout or decision once more with the list of actions reversed, and count "
+            "how often "
             "the likeliest action changes. It changes no decision.",
             ANSWERS,
             same=OPENED,
@@ -264,8 +304,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     sums: Annotated[
         str,
         option(
-            "What becomes of an answer in json whose only fault is that its numbers do not sum to 1. "
-            "refuse: it failed. divide: they are divided by their sum, and the summary counts it as divided.",
+            "What becomes of an answer in json whose only fault is that its numbers do not sum to "
+            "1. "
+            "refuse: it failed. divide: they are divided by their sum, and the summary counts it "
+            "as divided.",
             ANSWERS,
             same=OPENED,
         ),
@@ -273,7 +315,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     batch_size: Annotated[
         int,
         option(
-            "Number of prompts in one batch; with a served model, of requests to each server at once.",
+            "Number of prompts in one batch; with a served model, of requests to each server at "
+            "once.",
             ENGINE,
             compared=False,
         ),
@@ -281,7 +324,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     server: Annotated[
         tuple[str, ...],
         option(
-            "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. Repeat it "
+            "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. "
+            "Repeat it "
             "to spread the requests over several servers.",
             ENGINE,
             same=NOTHING,
@@ -290,7 +334,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     device: Annotated[
         str | None,
         option(
-            "Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU if there "
+            "Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU "
+            "if there "
             "is one.",
             ENGINE,
             same=NOTHING,
@@ -298,7 +343,9 @@ class Settings(Struct, frozen=True, kw_only=True):
     ] = None
     dtype: Annotated[
         str | None,
-        option("Number format of the weights: float32, bfloat16 or auto. Default: the card's.", ENGINE),
+        option(
+            "Number format of the weights: float32, bfloat16 or auto. Default: the card's.", ENGINE
+        ),
     ] = None
     temperature: Annotated[
         float, option("Sampling temperature, 0 to 2; 0 is greedy decoding.", ANSWERS, "frozen")
@@ -309,8 +356,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     latency: Annotated[
         str | None,
         option(
-            "Inference time of one answer: paper (145 ms), card (what the card states), measured (batch 1 on "
-            "this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. Default: card, or "
+            "Inference time of one answer: paper (145 ms), card (what the card states), measured "
+            "(batch 1 on "
+            "this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. "
+            "Default: card, or "
             "paper if the card states none.",
             LATENCY,
         ),
@@ -318,7 +367,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     device_profile: Annotated[
         str | None,
         option(
-            "Computer in every vehicle, such as agx-orin (`harness model device list`). It times each answer "
+            "Computer in every vehicle, such as agx-orin (`harness model device list`). It times "
+            "each answer "
             "by its tokens; use it instead of --latency.",
             LATENCY,
             same=OPENED,
@@ -328,7 +378,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     device_model: Annotated[
         str | None,
         option(
-            "With --device-profile: model whose row of the profile times all answers. Default: the model "
+            "With --device-profile: model whose row of the profile times all answers. Default: the "
+            "model "
             "that gave the answer.",
             LATENCY,
             compared=False,
@@ -337,8 +388,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     ask: Annotated[
         str,
         option(
-            "Which helpers answer. used: those whose answer some condition uses. all: every helper in every "
-            "scene, which gives the same decisions and lets other conditions be scored later without the "
+            "Which helpers answer. used: those whose answer some condition uses. all: every helper "
+            "in every "
+            "scene, which gives the same decisions and lets other conditions be scored later "
+            "without the "
             "model.",
             HELPERS,
             compared=False,
@@ -347,8 +400,10 @@ class Settings(Struct, frozen=True, kw_only=True):
     ties: Annotated[
         str | None,
         option(
-            "Which of equally likely actions the ego takes. drawn: one by chance, with the same draws for "
-            "every condition, prompt and model. first: the most careful. Default: drawn, or as in the run "
+            "Which of equally likely actions the ego takes. drawn: one by chance, with the same "
+            "draws for "
+            "every condition, prompt and model. first: the most careful. Default: drawn, or as in "
+            "the run "
             "that is replayed.",
             CONDITIONS,
         ),
@@ -356,7 +411,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     tag: Annotated[
         tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT, same=NOTHING)
     ] = ()
-    extensions: dict[str, str | int | float | bool] = {}  # what extensions add, by the name of the option
+    # what extensions add, by the name of the option
+    extensions: dict[str, str | int | float | bool] = {}
 
 
 class Option(NamedTuple):
@@ -397,10 +453,22 @@ class Option(NamedTuple):
 
 
 def options(world: type[Struct]) -> list[Option]:
-    """Return the options of the command that walks a world, in the order of the fields; extensions' last."""
+    """Return the options of the command that walks a world, in the order of the fields;
+    extensions' last.
+    """
     core = core_options(world)
     added = [
-        Option((EXTENSIONS, name), name, its.kind, its.default, its.help, "Extensions", False, ITSELF, True)
+        Option(
+            (EXTENSIONS, name),
+            name,
+            its.kind,
+            its.default,
+            its.help,
+            "Extensions",
+            False,
+            ITSELF,
+            True,
+        )
         for name, its in of_extensions().items()
     ]
     return core + added
@@ -413,7 +481,9 @@ def core_options(world: type[Struct]) -> list[Option]:
 
 
 def of_extensions() -> dict[str, Setting]:
-    """Return the settings that extensions add, by name; one of the core's names is left out, with a line."""
+    """Return the settings that extensions add, by name;
+    one of the core's names is left out, with a line.
+    """
     joined = extensions.joined(HELP, "settings")
     return {name: setting for name, setting in joined.items() if name not in HELP}
 
@@ -448,20 +518,25 @@ def kind_of(settings: Settings) -> str:
 
 
 WORLDS: dict[str, type[FrozenSettings] | type[DriveSettings]] = {
-    "frozen": FrozenSettings, "closed-loop": DriveSettings,
-}  # fmt: skip
+    "frozen": FrozenSettings,
+    "closed-loop": DriveSettings,
+}
 HELP = {each.name: each.help for world in WORLDS.values() for each in core_options(world)}
 # The settings that open nothing, and are the same when a stopped run resumes.
 PLAIN = dict.fromkeys(
-    each.name for world in WORLDS.values() for each in core_options(world)
+    each.name
+    for world in WORLDS.values()
+    for each in core_options(world)
     if len(each.path) == 1 and each.same == ITSELF
-)  # fmt: skip
+)
 
 # What a comparison of two runs tells, by the key in `run.toml`; of worlds it tells the scenes.
 COMPARED = dict.fromkeys(
-    each.path[0] for world in WORLDS.values() for each in core_options(world)
+    each.path[0]
+    for world in WORLDS.values()
+    for each in core_options(world)
     if each.compared and each.same != NOTHING and each.path[0] != "world"
-) | {EXTENSIONS: None}  # fmt: skip
+) | {EXTENSIONS: None}
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
@@ -475,8 +550,12 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
 
 
 def deciding(settings: Settings) -> Settings:
-    """Return settings without those that may differ in one run; whoever goes on with it says them."""
-    free = {each.name: each.default for each in options(type(settings.world)) if each.same == NOTHING}
+    """Return settings without those that may differ in one run;
+    whoever goes on with it says them.
+    """
+    free = {
+        each.name: each.default for each in options(type(settings.world)) if each.same == NOTHING
+    }
     return structs.replace(settings, **free)
 
 
@@ -495,9 +574,10 @@ def difference(before: Settings, now: Settings) -> tuple[str, str]:
     if type(before.world) is not type(now.world):
         return "", ""
     differing = [
-        each for each in options(type(now.world))
+        each
+        for each in options(type(now.world))
         if each.of(before) != each.of(now) and each.same != NOTHING
-    ]  # fmt: skip
+    ]
     typed = (
         " ".join(" ".join(each.words(each.of(settings))) or f"no {each.flag}" for each in differing)
         for settings in (before, now)
@@ -526,13 +606,18 @@ def of_words(typed: Sequence[str]) -> Settings:
 
 
 def text_of(settings: Settings) -> str:
-    """Return the text of `run.toml`: every setting that has a value, also where it is the default."""
+    """Return the text of `run.toml`:
+    every setting that has a value, also where it is the default.
+    """
     beside = [word for own in _only_typed(settings).values() for word in own]
     again = _again(settings, Path(FILE), beside)
     lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
     tables: dict[str, list[str]] = {
-        "": [], "helpers": [], "world": [f"kind = {_toml(kind_of(settings))}"], EXTENSIONS: [],
-    }  # fmt: skip
+        "": [],
+        "helpers": [],
+        "world": [f"kind = {_toml(kind_of(settings))}"],
+        EXTENSIONS: [],
+    }
     for each in options(type(settings.world)):
         if (value := each.of(settings)) not in (None, ()):
             *table, key = each.path
@@ -548,7 +633,8 @@ def _again(settings: Settings, file: Path, beside: Sequence[str]) -> str:
 
 
 def _only_typed(settings: Settings) -> dict[str, list[str]]:
-    """Return what a file names and only a user may, as words by option: models that are no cards, servers.
+    """Return what a file names and only a user may, as words by option:
+    models that are no cards, servers.
 
     A replay reads another run's answers and opens none.
     """
@@ -573,15 +659,16 @@ def _toml(value: Any) -> str:
 def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     """Return the settings of a file, or of a run's folder, with what the user typed beside it.
 
-    A file may come from a stranger: it names no model to open and no server to ask. Cards, prompts, devices
-    and datasets are looked up by name; a replay only reads another run's answers. Raises UserError if it
-    cannot be read, is of another command, or names what only a user may.
+    A file may come from a stranger: it names no model to open and no server to ask. Cards, prompts,
+    devices and datasets are looked up by name; a replay only reads another run's answers. Raises
+    UserError if it cannot be read, is of another command, or names what only a user may.
     """
     file = file / FILE if file.is_dir() else file
     where = f"settings {printable(file)}"
     if not file.exists():
         raise UserError(
-            f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, which runs "
+            f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, "
+            "which runs "
             "have since 0.3; for another, type the command in its run.json"
         )
     tables = _placed(toml(file, where), world, where)
@@ -600,7 +687,9 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             if flag == "--server"
             else f"{printable(value)} is none of your cards, and a file opens no other model"
         )
-        raise UserError(f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`")
+        raise UserError(
+            f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`"
+        )
     return settings
 
 
@@ -610,7 +699,8 @@ def _check_extensions(settings: Settings, where: str) -> None:
     for name, value in settings.extensions.items():
         if name not in known:
             raise UserError(
-                f"{where}: {printable(name)} is a setting of an extension that is not installed; install "
+                f"{where}: {printable(name)} is a setting of an extension that is not installed; "
+                "install "
                 "that, or leave the setting out"
             )
         kind = known[name].kind
@@ -619,7 +709,8 @@ def _check_extensions(settings: Settings, where: str) -> None:
 
 
 def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str, Any]:
-    """Return the tables of a file, with the kind of episodes that its command has, if it states none.
+    """Return the tables of a file, with the kind of episodes that its command has,
+    if it states none.
 
     Raises UserError if an option stands outside of its table.
     """
@@ -635,7 +726,8 @@ def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str
 
 
 def _as_driven(settings: Settings, run: Path) -> Settings:
-    """Return settings whose scenario states the scenes that a run has, if it is the run's and does not.
+    """Return settings whose scenario states the scenes that a run has,
+    if it is the run's and does not.
 
     The first runs with such a file name it barely, by a name that has come to mean other scenes.
     """
@@ -653,7 +745,9 @@ def _as_driven(settings: Settings, run: Path) -> Settings:
         return settings
     its = scenarios.stated(name, world.scenario["parameters"])
     scenes = [f"{key}={getattr(its.parameters, key)}" for key in missing if key in its.dials]
-    return changed(settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"})
+    return changed(
+        settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"}
+    )
 
 
 def _is_card(model: str) -> bool:
@@ -666,12 +760,16 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     try:
         # A range is counted before it is made: 0:99999999999 would not fit into memory.
         most = int(start) + MOST_SEEDS + 1 if colon else 0
-        seeds = tuple(range(int(start), min(int(stop), most)) if colon else map(int, text.split(",")))
+        seeds = tuple(
+            range(int(start), min(int(stop), most)) if colon else map(int, text.split(","))
+        )
     except ValueError:
         seeds = ()
     if not colon and len(seeds) == 1 and seeds != (0,):
         n, end = (printable(at, 20) for at in (seeds[0], seeds[0] + 1))
-        raise UserError(f"--seeds {n}: give 0:{n} for seeds from 0 on, or {n}:{end} for seed {n} alone")
+        raise UserError(
+            f"--seeds {n}: give 0:{n} for seeds from 0 on, or {n}:{end} for seed {n} alone"
+        )
     if not 0 < len(seeds) <= MOST_SEEDS:
         raise UserError(
             f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "

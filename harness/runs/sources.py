@@ -1,7 +1,8 @@
 """Keep what a run was made of: the folder `sources` of a run's folder, laid out as a project is.
 
-It has the files of the prompts, the model cards, the channels and so on that the run used, and the schemas of
-its answers. `run.json` has the digests of the prompts, so that a kept prompt can be checked.
+It has the files of the prompts, the model cards, the channels and so on that the run used, and the
+schemas of its answers. `run.json` has the digests of the prompts, so that a kept prompt can be
+checked.
 """
 
 import os
@@ -23,7 +24,8 @@ PROMPTS = "prompts"
 def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
     """Write files, by their path within `sources`, to a run's folder in one step.
 
-    They are first written to its folder of unfinished work, with which goes what a killed process left there.
+    They are first written to its folder of unfinished work,
+    with which goes what a killed process left there.
     """
     if read(out) == files:
         return
@@ -48,7 +50,8 @@ def read(out: Path) -> dict[str, bytes]:
 def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
     """Return a prompt that a run states by `version` and `sha256`, installed or kept by the run.
 
-    None if neither has this digest. What a stranger's run keeps is rendered in the sandbox like any prompt.
+    None if neither has this digest. What a stranger's run keeps is rendered in the sandbox like any
+    prompt.
     """
     version, sha256 = stated["version"], stated["sha256"]
     if prompt := versions.as_it_was(version, sha256):
@@ -62,9 +65,13 @@ def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
 
 
 def lacking(run: Run) -> str | None:
-    """Return, in words, a prompt of the run that is neither here nor kept; None if there is none."""
+    """Return, in words, a prompt of the run that is neither here nor kept;
+    None if there is none.
+    """
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         if prompt_of(run, agent["prompt"]) is None:
             version, sha256 = agent["prompt"]["version"], agent["prompt"]["sha256"]
-            return f"prompt {printable(version, 40)} with sha256 {printable(sha256, 13)} is not here"
+            return (
+                f"prompt {printable(version, 40)} with sha256 {printable(sha256, 13)} is not here"
+            )
     return None

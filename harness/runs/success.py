@@ -14,7 +14,14 @@ from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
 from harness.core.sequences import any_time, any_time_difference
-from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of, paired_difference, resampled
+from harness.core.statistics import (
+    LEVEL,
+    Estimate,
+    known_mean,
+    mean_of,
+    paired_difference,
+    resampled,
+)
 from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
@@ -31,7 +38,9 @@ class Success:
     @classmethod
     def of(cls, episodes: Sequence[Episode], lead: str) -> "Success":
         """Return that of some episodes, one row of each, in runs that are read by `lead`."""
-        return cls(np.array([lead == BALANCED and episode.danger != "none" for episode in episodes]))
+        return cls(
+            np.array([lead == BALANCED and episode.danger != "none" for episode in episodes])
+        )
 
     @property
     def metric(self) -> str:
@@ -55,7 +64,9 @@ class Success:
 
     def mean(self, success: Floats) -> float:
         """Return the mean of success, (S, E)."""
-        return float(np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts]))
+        return float(
+            np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts])
+        )
 
     def estimate(self, success: Floats) -> Estimate:
         """Return the same with its interval over episodes."""
@@ -70,7 +81,9 @@ class Success:
         return any_time([known_mean(success, 0)[part] for part in self.parts])
 
     def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
-        """Return success a - b, both (S, E), paired by episode, with an interval that holds at every look."""
+        """Return success a - b, both (S, E), paired by episode,
+        with an interval that holds at every look.
+        """
         return any_time_difference([known_mean(a - b, 0)[part] for part in self.parts])
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
@@ -78,10 +91,12 @@ class Success:
         return p_of_mean([(self, a, b)])
 
     def most(self, successes: Mapping[str, Floats]) -> list[str]:
-        """Return the name with the most success, (S, E) each, and then those that cannot be told from it.
+        """Return the name with the most success, (S, E) each,
+        and then those that cannot be told from it.
 
-        These are the names whose difference from it, paired by episode, has a p above `LEVEL`, by Holm's
-        method for all pairs, since the first was picked for being the best; or that have no p.
+        These are the names whose difference from it, paired by episode, has a p above `LEVEL`, by
+        Holm's method for all pairs, since the first was picked for being the best; or that have no
+        p.
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
@@ -92,13 +107,17 @@ class Success:
         return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
-        """Return how much success b - a, both (S, E), varies where episodes count so often, (..., E)."""
+        """Return how much success b - a, both (S, E), varies where episodes count so often,
+        (..., E).
+        """
         differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
         return Spread(np.array([part.mean() for part in parts]), np.stack(variances, axis=-1))
 
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
-        """Return how often each episode counts, as in `statistics.resampled`, (1 + times, E), by halves."""
+        """Return how often each episode counts, as in `statistics.resampled`,
+        (1 + times, E), by halves.
+        """
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
         for part in self.parts:
             counts[:, part] = resampled(draws, int(part.sum()), times)
@@ -124,7 +143,9 @@ class Success:
 def by_condition(
     grid: Grid, episodes: Sequence[Episode], lead: str = BALANCED
 ) -> tuple[Success, dict[str, Floats]]:
-    """Return how success of a run's episodes counts, and success (S, E) by condition; in the grid's order."""
+    """Return how success of a run's episodes counts, and success (S, E) by condition;
+    in the grid's order.
+    """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], lead), values
 
@@ -146,7 +167,8 @@ def is_gain(score: Score, conditions: Container[str]) -> bool:
     return known and score.interval == PAIRED and score.metric in GAINS.values()
 
 
-Pairs = Sequence[tuple[Success, Floats, Floats]]  # of each family: how success counts, and both, (S, E)
+# of each family: how success counts, and both, (S, E)
+Pairs = Sequence[tuple[Success, Floats, Floats]]
 
 
 @dataclass(frozen=True)

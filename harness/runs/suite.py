@@ -26,7 +26,9 @@ SUMMARY = "summary.csv"  # the means over families
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of `suite.json`: the suite, and each family's run folder, in the order of tables."""
+    """The content of `suite.json`: the suite, and each family's run folder,
+    in the order of tables.
+    """
 
     format: str
     name: str
@@ -49,7 +51,9 @@ class SuiteRun:
 
     @property
     def manifest(self) -> Manifest:
-        """The first run's manifest with the counts of all runs, without times, which differ by run."""
+        """The first run's manifest with the counts of all runs, without times,
+        which differ by run.
+        """
         manifests = [run.manifest for run in self.runs.values()]
         counts = ("cached_answers", "engine_errors", "retries")
         totals = {}
@@ -57,7 +61,9 @@ class SuiteRun:
             totals[name] = sum(getattr(manifest, name) for manifest in manifests)
         latency = msgspec.structs.replace(manifests[0].latency, sample={})
         cost = Cost.joined(manifests) or msgspec.UNSET
-        return msgspec.structs.replace(manifests[0], latency=latency, answer_times={}, cost=cost, **totals)
+        return msgspec.structs.replace(
+            manifests[0], latency=latency, answer_times={}, cost=cost, **totals
+        )
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -99,7 +105,9 @@ class SuiteRun:
         return plays(self.runs.values(), BALANCED)
 
     def _gain(self, score: Score) -> Score:
-        """Return a gain over the condition without V2V; the layouts of all families are taken together."""
+        """Return a gain over the condition without V2V;
+        the layouts of all families are taken together.
+        """
         plays = self._plays if score.metric == GAINS[BALANCED] else self._plays.plain
         gain = plays.difference(score.condition, BASELINE)
         return Score.of(score.condition, score.metric, gain, PAIRED)
@@ -118,7 +126,9 @@ def plays(runs: Iterable[Run], lead: str) -> Plays[str]:
 def mean(scores: Sequence[Score]) -> Score:
     """Return the mean of one metric's scores over families."""
     first = scores[0]
-    return Score.of(first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval)
+    return Score.of(
+        first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval
+    )
 
 
 def contents_of(path: Path) -> Contents:
@@ -134,8 +144,8 @@ def contents_of(path: Path) -> Contents:
 def read(path: Path) -> SuiteRun:
     """Read a suite's folder.
 
-    Raises UserError if it holds no suite, or a run of it is not finished or has another model, other
-    conditions or seeds.
+    Raises UserError if it holds no suite,
+    or a run of it is not finished or has another model, other conditions or seeds.
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}
@@ -158,5 +168,9 @@ def write(suite: SuiteRun) -> None:
     """Write the means, then `suite.json`, which makes the folder a suite's."""
     write_whole(suite.path / SUMMARY, csv_text(Score, suite.scores, suite.variant))
     families = {family: run.path.name for family, run in suite.runs.items()}
-    contents = Contents(format=FORMAT, name=suite.name, description=suite.description, families=families)
-    write_whole(suite.path / SUITE, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n")
+    contents = Contents(
+        format=FORMAT, name=suite.name, description=suite.description, families=families
+    )
+    write_whole(
+        suite.path / SUITE, msgspec.json.format(msgspec.json.encode(contents), indent=1) + b"\n"
+    )

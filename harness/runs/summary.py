@@ -62,21 +62,29 @@ class Figures:
 
     @classmethod
     def of(
-        cls, world: World, grid: Grid, decisions: Decisions, episodes: Sequence[Episode],
+        cls,
+        world: World,
+        grid: Grid,
+        decisions: Decisions,
+        episodes: Sequence[Episode],
         answers: Iterable[Answer | AnswerFacts],
-    ) -> "Figures":  # fmt: skip
+    ) -> "Figures":
         """Compute the figures; `episodes` are in the order of the grid."""
         cells, latency_ms = grid.places(decisions), decisions["latency_ms"]
         places = cells // len(grid.episodes)
         order = np.argsort(places, kind="stable")
-        starts = np.searchsorted(places[order], np.arange(1, len(grid.conditions) * len(grid.seeds)))
+        starts = np.searchsorted(
+            places[order], np.arange(1, len(grid.conditions) * len(grid.seeds))
+        )
         numbers = decisions.whole("episode")
         episode_of = {scene: int(numbers[rows.start]) for scene, rows in decisions.scenes.items()}
         return cls(
-            grid, by_episode(metrics_of(world), grid, decisions, episodes),
-            np.split(latency_ms[order], starts), judged_of(grid, decisions, cells),
+            grid,
+            by_episode(metrics_of(world), grid, decisions, episodes),
+            np.split(latency_ms[order], starts),
+            judged_of(grid, decisions, cells),
             [(answer, episode_of[answer.scene]) for answer in answers],
-        )  # fmt: skip
+        )
 
     @classmethod
     def joined(cls, parts: Sequence["Figures"]) -> "Figures":
@@ -97,13 +105,17 @@ class Figures:
         )
 
     def scores(self, older: bool = False) -> list[Score]:
-        """Return the scores, those of judged decisions by the `older` rules of `reliability.estimates`."""
+        """Return the scores, those of judged decisions by the `older` rules of
+        `reliability.estimates`.
+        """
         names = known_in(self.values)
         return [
             *of_conditions(self.grid.conditions, self.values, names),
             *of_latencies(self.grid, self.latency_ms),
             *_of_judged(self.grid, self.judged, older),
-            *_gains(self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}),
+            *_gains(
+                self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}
+            ),
             *_of_answers(self.answers),
         ]
 
@@ -111,7 +123,9 @@ class Figures:
 def of_conditions(
     conditions: Sequence[str], values: Mapping[str, Floats], names: Sequence[str]
 ) -> Iterator[Score]:
-    """Yield these metrics' scores in each condition, over seeds and over episodes, from values (C, S, E)."""
+    """Yield these metrics' scores in each condition, over seeds and over episodes,
+    from values (C, S, E).
+    """
     for index, condition in enumerate(conditions):
 
         def scores(name: str, index: int = index, condition: str = condition) -> Iterator[Score]:
@@ -135,11 +149,15 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
     for index, condition in enumerate(grid.conditions):
         own = all_percentiles[index * len(grid.seeds) : (index + 1) * len(grid.seeds)]
         for percent, values in zip(PERCENTILES, own.T, strict=True):
-            yield Score.of(condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means")
+            yield Score.of(
+                condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means"
+            )
 
 
 def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
-    """Return each condition's decisions with exactly one optimal action; `cells` (n,) are `Grid.places`."""
+    """Return each condition's decisions with exactly one optimal action;
+    `cells` (n,) are `Grid.places`.
+    """
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)
     rows = [np.flatnonzero(condition == place) for place in range(len(grid.conditions))]
@@ -159,7 +177,9 @@ def _of_judged(grid: Grid, judged: Sequence[Judged], older: bool) -> Iterator[Sc
 def _gains(
     conditions: Sequence[str], values: Mapping[str, Floats], gains: Mapping[str, str]
 ) -> Iterator[Score]:
-    """Yield each condition's gains over `BASELINE`, by the name of what is gained, from values (C, S, E)."""
+    """Yield each condition's gains over `BASELINE`, by the name of what is gained,
+    from values (C, S, E).
+    """
     if BASELINE not in conditions:
         return
     base = conditions.index(BASELINE)
@@ -193,12 +213,16 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
                 if metric.interval == "rate":
                     estimate = rate_interval(values, episodes)
                 else:
-                    estimate = in_range(metric.name, episode_interval(values[known], episodes[known]))
+                    estimate = in_range(
+                        metric.name, episode_interval(values[known], episodes[known])
+                    )
                 yield Score.of(ALL, metric.name, estimate, "answers")
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
-    """Return the episodes in the order of the grid, with the columns that follow from their decisions."""
+    """Return the episodes in the order of the grid,
+    with the columns that follow from their decisions.
+    """
     ordered, places = grid.ordered(episodes), grid.places(decisions)
     n = len(ordered)
 

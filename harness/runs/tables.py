@@ -1,4 +1,6 @@
-"""Load a run as pandas tables, for notebooks and scripts: `harness.load`. docs/files.md has the columns."""
+"""Load a run as pandas tables, for notebooks and scripts: `harness.load`.
+docs/files.md has the columns.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,10 +22,20 @@ if TYPE_CHECKING:
 
 # Names stay text: a model may be called "null" and a prompt "1".
 TEXT = (
-    "model", "prompt", "answer", "condition", "metric", "interval", "danger", "failure", "partner", "striker",
+    "model",
+    "prompt",
+    "answer",
+    "condition",
+    "metric",
+    "interval",
+    "danger",
+    "failure",
+    "partner",
+    "striker",
     "fault",
-)  # fmt: skip
-MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")  # a helper's answer without its intent
+)
+# a helper's answer without its intent
+MESSAGE = ("risk", "evidence", "recommended_maneuver", "confidence")
 T = TypeVar("T", bound="Tables")
 PLACE = ["scene", "episode", "step", "danger"]
 
@@ -51,7 +63,8 @@ class Tables:
 
     @cached_property
     def agents(self) -> "pd.DataFrame":
-        """One row for each agent of an episode: `journeys` of episodes.csv; none where only the ego decides.
+        """One row for each agent of an episode: `journeys` of episodes.csv;
+        none where only the ego decides.
 
         `gave_way` says whether it is the one that lost most.
         """
@@ -62,10 +75,11 @@ class Tables:
             self.path / "episodes.csv",
             lambda file: [
                 (e.condition, e.seed, e.episode, *structs.astuple(end), end.agent == e.gave_way)
-                for e in self.source.episodes if e.journeys is not None
+                for e in self.source.episodes
+                if e.journeys is not None
                 for end in msgspec.json.decode(e.journeys, type=tuple[End, ...])
             ],
-        )  # fmt: skip
+        )
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property
@@ -75,7 +89,9 @@ class Tables:
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """One row for each answer: answers.jsonl, with the episode and step of its decision point."""
+        """One row for each answer: answers.jsonl,
+        with the episode and step of its decision point.
+        """
         import numpy as np
         import pandas as pd
 
@@ -85,13 +101,17 @@ class Tables:
             if name not in ("heard", "repairs", "intent", "message", "first", "extension"):
                 columns[name] = [answer.cell(name) for answer in answers]
         unknown = (np.nan,) * len(actions)
-        intents = np.array([answer.intent or unknown for answer in answers]).reshape(-1, len(actions))
-        table = pd.DataFrame({
-            **columns,
-            "heard": ["+".join(answer.heard) for answer in answers],
-            "repairs": [" ".join(answer.repairs) for answer in answers],
-            **{f"intent_{action}": intents[:, place] for place, action in enumerate(actions)},
-        })  # fmt: skip
+        intents = np.array([answer.intent or unknown for answer in answers]).reshape(
+            -1, len(actions)
+        )
+        table = pd.DataFrame(
+            {
+                **columns,
+                "heard": ["+".join(answer.heard) for answer in answers],
+                "repairs": [" ".join(answer.repairs) for answer in answers],
+                **{f"intent_{action}": intents[:, place] for place, action in enumerate(actions)},
+            }
+        )
         for key in MESSAGE:
             table[key] = [(answer.message or {}).get(key) for answer in answers]
         table = table.astype(dict.fromkeys(table.columns[table.isna().all()], float))
@@ -117,6 +137,8 @@ class Tables:
 
 
 def tables_of(run: Path, kind: type[T]) -> T:
-    """Load a run from its folder. Raises UserError if it holds no finished run, or one of another version."""
+    """Load a run from its folder. Raises UserError if it holds no finished run,
+    or one of another version.
+    """
     source = read(run)
     return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)

@@ -1,4 +1,6 @@
-"""Questions that got no answer, which is no answer: what they said, and whether a run can do without them."""
+"""Questions that got no answer, which is no answer:
+what they said, and whether a run can do without them.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -47,7 +49,9 @@ class Tally:
         """The roles whose questions without an answer are more than lost messages."""
         lost = sum(self.unanswered[role] for role in HELPERS)
         too_many = lost and lost >= MOST_LOST * sum(self.asked[role] for role in HELPERS)
-        return frozenset(r for r, n in self.unanswered.items() if n and (r not in HELPERS or too_many))
+        return frozenset(
+            r for r, n in self.unanswered.items() if n and (r not in HELPERS or too_many)
+        )
 
     def __str__(self) -> str:
         """In one line: the words of the server or engine, then how many questions got no answer."""
@@ -61,12 +65,18 @@ class Tally:
 
     def counts(self) -> str:
         """Return how many questions got no answer, by role; empty if all did."""
-        counts = [(self.unanswered[r], self.asked[r], who) for r, who in _WHO.items() if self.unanswered[r]]
+        counts = [
+            (self.unanswered[r], self.asked[r], who)
+            for r, who in _WHO.items()
+            if self.unanswered[r]
+        ]
         return ", ".join(f"{n} of {asked} questions to {who}" for n, asked, who in counts)
 
 
 def tally(run: Run) -> Tally:
-    """Count a finished run's questions; none where its manifest has no errors, and no answer is read."""
+    """Count a finished run's questions;
+    none where its manifest has no errors, and no answer is read.
+    """
     return Tally(run.answers if run.manifest.engine_errors else ())
 
 
@@ -78,7 +88,9 @@ def lacking(run: Run) -> Iterator[Answer]:
 
 
 def why(path: Path) -> str | None:
-    """Return why the results of a run are none, be it finished or not: its model could not be asked."""
+    """Return why the results of a run are none, be it finished or not:
+    its model could not be asked.
+    """
     if (path / "run.json").is_file():
         counts = tally(read(path))
         return str(counts) if counts.missing else None

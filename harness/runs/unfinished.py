@@ -1,4 +1,6 @@
-"""How far an unfinished run is, read from its working folder while another process may be writing there."""
+"""How far an unfinished run is, read from its working folder while another process may be writing
+there.
+"""
 
 import csv
 import json
@@ -28,14 +30,18 @@ class Extent:
 def extent(run: Path) -> Extent:
     """Return how far an unfinished run is. What is broken, or a link, counts as not done.
 
-    An episode counts once its part of the run is written, which has many; so the answers for the parts that
-    are not written are counted, too.
+    An episode counts once its part of the run is written, which has many;
+    so the answers for the parts that are not written are counted, too.
     """
     work = run / WORK
     names = _names(work)
     parts = [name for name in names if name.startswith("episodes-")]
     done = sum(_episodes(work / name) for name in parts if _own(work / name))
-    kept = [name for name in names if name.endswith(".jsonl") and name.startswith(("answers", "episodes-"))]
+    kept = [
+        name
+        for name in names
+        if name.endswith(".jsonl") and name.startswith(("answers", "episodes-"))
+    ]
     due, early = _due(work)
     return Extent(_locked(work / LOCK), done, due, early, sum(_lines(work / name) for name in kept))
 
@@ -85,7 +91,9 @@ def _lines(file: Path) -> int:
 
 
 def _locked(lock: Path) -> bool:
-    """Return whether a process holds a lock; where there are no such locks (Windows), none is known to."""
+    """Return whether a process holds a lock;
+    where there are no such locks (Windows), none is known to.
+    """
     try:
         import fcntl
     except ImportError:

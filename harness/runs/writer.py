@@ -31,9 +31,14 @@ _ENCODER = msgspec.json.Encoder()
 
 
 def write(
-    out: Path, manifest: Manifest, decisions: Decisions | DecisionFiles, episodes: Sequence[Episode],
-    answers: Iterable[bytes], scores: Sequence[Score], layouts: Sequence[Layout] = (),
-) -> None:  # fmt: skip
+    out: Path,
+    manifest: Manifest,
+    decisions: Decisions | DecisionFiles,
+    episodes: Sequence[Episode],
+    answers: Iterable[bytes],
+    scores: Sequence[Score],
+    layouts: Sequence[Layout] = (),
+) -> None:
     """Write a run's files, the manifest last.
 
     The decisions are already rounded; the lines of `answers.jsonl` come some at a time.
@@ -47,7 +52,8 @@ def write(
         write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
     text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
     write_whole(out / "run.json", text + b"\n")
-    pa.default_memory_pool().release_unused()  # a report often follows, which needs memory for its own tables
+    # a report often follows, which needs memory for its own tables
+    pa.default_memory_pool().release_unused()
 
 
 def lines(answers: Sequence[Answer]) -> bytes:
@@ -58,10 +64,11 @@ def lines(answers: Sequence[Answer]) -> bytes:
 def ordered(
     answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
 ) -> list[Answer]:
-    """Sort answers by decision point, and there: the ego's, the helpers', blind helpers', fusion calls'.
+    """Sort answers by decision point, and there:
+    the ego's, the helpers', blind helpers', fusion calls'.
 
-    Those of one kind are in the order of the decision point's `viewers`, where these are known. Answers for a
-    decision point without a decision, or by nobody among its viewers, are left out.
+    Those of one kind are in the order of the decision point's `viewers`, where these are known.
+    Answers for a decision point without a decision, or by nobody among its viewers, are left out.
     """
 
     def place(answer: Answer) -> tuple[Any, ...]:
@@ -74,7 +81,9 @@ def ordered(
 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
-    """Return records as CSV: the columns of the variant, then a column for each field; None is empty."""
+    """Return records as CSV: the columns of the variant, then a column for each field;
+    None is empty.
+    """
     text, records = io.StringIO(), list(records)
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}

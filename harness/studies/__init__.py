@@ -1,1 +1,3 @@
-"""Conditions by the dozen: a source of intents is played at every point of a grid, and drawn in panels."""
+"""Conditions by the dozen: a source of intents is played at every point of a grid,
+and drawn in panels.
+"""

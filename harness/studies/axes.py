@@ -1,4 +1,6 @@
-"""What can be swept, any setting of the operating point or the number of vehicles, and the grid points."""
+"""What can be swept, any setting of the operating point or the number of vehicles,
+and the grid points.
+"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,12 +29,30 @@ MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
 CROSS = " × "  # between axes that are crossed
 NONE = "none"  # of attacks, and what else may be left out
-# The usual attacks: each alone, and a false place and several voices with a lie; at a point those it allows.
+# The usual attacks: each alone, and a false place and several voices with a lie; at a point those
+# it allows.
 USUAL_ATTACKS = (
-    "liar", "liar+spoof", "liar:says=permuted", "brake", "brake+spoof", "random", "stuck", "stale", "replay",
-    "silent", "overconfident", "sybil", "liar+sybil", "flood", "spoof", "jump", "liar+jump", "ghost", "hide",
+    "liar",
+    "liar+spoof",
+    "liar:says=permuted",
+    "brake",
+    "brake+spoof",
+    "random",
+    "stuck",
+    "stale",
+    "replay",
+    "silent",
+    "overconfident",
+    "sybil",
+    "liar+sybil",
+    "flood",
+    "spoof",
+    "jump",
+    "liar+jump",
+    "ghost",
+    "hide",
     "shift",
-)  # fmt: skip
+)
 
 Value = float | str
 
@@ -49,11 +69,15 @@ class Axis:
     worded: bool = False  # its values are words, not numbers
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
-        """Return the operating point with this setting. Raises UserError where it is not allowed."""
+        """Return the operating point with this setting.
+        Raises UserError where it is not allowed.
+        """
         if self.field is None:
             return point
         if self.field not in typed_settings():
-            return point.of_radio({self.field: value if isinstance(value, str) else f"{value:.10g}"})
+            return point.of_radio(
+                {self.field: value if isinstance(value, str) else f"{value:.10g}"}
+            )
         setting: object
         if isinstance(value, str):
             left_out = value == NONE and self.field in ("attack", *_named())
@@ -74,10 +98,14 @@ AXES = {
         Axis("tau", "entropy threshold τ, nats", *SHORT["tau"], "0.3:1.05:0.05"),
         Axis("loss", "packet loss", "loss", 1.0, "0:0.5:0.05"),
         Axis("size", "vehicles, the ego included", None, 1.0, "1:4"),
-        Axis("latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"),
+        Axis(
+            "latency", "nominal latency of the channel, ms", *SHORT["latency"], "0,5,10,25,50,100"
+        ),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
-        Axis("content", "content of a message", "content", 1.0, ",".join(OF_ANY_MODEL), worded=True),
+        Axis(
+            "content", "content of a message", "content", 1.0, ",".join(OF_ANY_MODEL), worded=True
+        ),
         Axis("attack", "attack", "attack", 1.0, ",".join((NONE, *USUAL_ATTACKS)), worded=True),
     )
 }
@@ -94,7 +122,8 @@ def axis_of(name: str) -> Axis:
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
-    """Return values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
+    """Return values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends,
+    or both mixed.
 
     Raises:
         UserError: it is none, or too long.
@@ -106,28 +135,36 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     parts = [part.strip() for part in (text or axis.usual).split(",")]
     if axis.worded:
         known = {
-            "consensus": names(), "schedule": SCHEDULES, "attack": (NONE, *ATTACKS),
+            "consensus": names(),
+            "schedule": SCHEDULES,
+            "attack": (NONE, *ATTACKS),
             **{setting: (NONE, *there()) for setting, there in _named().items()},
-        }.get(axis.name)  # fmt: skip
+        }.get(axis.name)
         for name in (part for text in parts for part in text.split("+")):
             if known and (first := name.partition(":")[0]) not in known:
                 raise unknown("--grid", first, known)
         return tuple(dict.fromkeys(parts))
     values = [value for part in parts for value in _values(axis, part)]
     if len(values) > MOST_POINTS:
-        raise UserError(f"--grid {printable(text)}: {len(values)} points; give {MOST_POINTS} or fewer")
+        raise UserError(
+            f"--grid {printable(text)}: {len(values)} points; give {MOST_POINTS} or fewer"
+        )
     if axis.field is None and any(value != int(value) or value < 1 for value in values):
         raise UserError(f"--grid {printable(text)}: give whole numbers of vehicles, 1 or more")
     return tuple(dict.fromkeys(values))
 
 
 def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
-    """Return the usual values of an axis, of words those that the point allows. Raises UserError for none."""
+    """Return the usual values of an axis, of words those that the point allows.
+    Raises UserError for none.
+    """
     return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
 
 
 def _named() -> dict[str, Callable[[], Collection[str]]]:
-    """Return the settings of extensions that name something, and what returns the names that there are."""
+    """Return the settings of extensions that name something,
+    and what returns the names that there are.
+    """
     named: dict[str, Callable[[], Collection[str]]] = {}
     for kind in more_parts().values():
         named |= kind.named
@@ -154,11 +191,17 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
         numbers = [float(x) for x in part.split(":")]
         low, high, step = [*numbers, 1.0][:3] if len(numbers) > 1 else (*numbers, *numbers, 1.0)
         steps = (high - low) / step
-        if len(numbers) > 3 or not 0 <= steps <= MOST_POINTS or not np.isfinite(numbers).all() or step <= 0:
+        if (
+            len(numbers) > 3
+            or not 0 <= steps <= MOST_POINTS
+            or not np.isfinite(numbers).all()
+            or step <= 0
+        ):
             raise ValueError
     except (ValueError, ZeroDivisionError):
         raise UserError(
-            f"--grid {printable(part)}: give numbers such as {axis.usual or '0,1,2'}, a list or from:to:step"
+            f"--grid {printable(part)}: give numbers such as {axis.usual or '0,1,2'}, a list or "
+            "from:to:step"
         ) from None
     return [round(low + i * step, 10) for i in range(int(steps + 1e-9) + 1)]
 
@@ -171,7 +214,8 @@ class Setting:
     point: OperatingPoint  # the operating point
     vehicles: int  # how many, the ego included
     variable: str = ""  # what varies in the panel; empty where conditions are compared
-    value: Value | tuple[Value, ...] | None = None  # its value there; where axes are crossed, one of each
+    # its value there; where axes are crossed, one of each
+    value: Value | tuple[Value, ...] | None = None
 
     @property
     def place(self) -> dict[str, Value | None]:
@@ -185,11 +229,15 @@ class Setting:
 
 
 def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
-    """Return every combination of the values of several axes. Raises UserError if there are too many."""
+    """Return every combination of the values of several axes.
+    Raises UserError if there are too many.
+    """
     values = list(product(*grids))
     if len(values) > MOST_POINTS:
         names = " ".join(f"--over {axis.name}" for axis in axes)
-        raise UserError(f"{names}: {len(values)} combinations; give {MOST_POINTS} or fewer, with --grid")
+        raise UserError(
+            f"{names}: {len(values)} combinations; give {MOST_POINTS} or fewer, with --grid"
+        )
     return values
 
 

@@ -1,4 +1,6 @@
-"""Success on frozen scenes and in closed loop, paired by episode; also that of the reference drivers."""
+"""Success on frozen scenes and in closed loop, paired by episode;
+also that of the reference drivers.
+"""
 
 from collections.abc import Callable
 
@@ -15,7 +17,9 @@ COMPARED = ("frozen", "closed", "difference", "agreement")
 
 
 def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
-    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S, E)."""
+    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S,
+    E).
+    """
     both = difference(SUCCESS, [(frozen.T, closed.T)])
     same = over_episodes("agreement_rate", (frozen == closed).astype(float))
     worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
@@ -25,7 +29,9 @@ def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
 def rank(
     dataset: Dataset, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, dict[str, Estimate]]:
-    """Return each reference driver's `COMPARED` over a dataset's episodes, every one of which it drives."""
+    """Return each reference driver's `COMPARED` over a dataset's episodes,
+    every one of which it drives.
+    """
     from harness.world.reference import drive_apart
 
     ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)

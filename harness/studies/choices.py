@@ -1,8 +1,9 @@
 """Every set of helpers that an ego could ask, at every decision point that asking them leads to.
 
-Frozen scenes say how each course ends, and draws are keyed by seed, layout and step. So what any choice of
-helpers comes to, with these answers and these draws, follows backwards from the ends, exactly. The best of
-all choices is the oracle: a bound, since no car knows what a helper will say, or how an episode ends.
+Frozen scenes say how each course ends, and draws are keyed by seed, layout and step. So what any
+choice of helpers comes to, with these answers and these draws, follows backwards from the ends,
+exactly. The best of all choices is the oracle: a bound, since no car knows what a helper will say,
+or how an episode ends.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -61,10 +62,15 @@ class Choices:
         """Yield each level, the last first, with what its sets come to and which are chosen.
 
         Args:
-            choose: index of the set chosen in each decision, (S, N), from the level, and from the success,
-                (S, N, K), and the costs, (S, N, K, C), that each set comes to with the rest of the course.
+            choose: index of the set chosen in each decision, (S, N), from the level, and from the
+                success, (S, N, K), and the costs, (S, N, K, C), that each set comes to with the
+                rest of the course.
         """
-        following, success, costs = np.empty(0, dtype=int), np.empty((0, 0)), np.empty((0, 0, len(COSTS)))
+        following, success, costs = (
+            np.empty(0, dtype=int),
+            np.empty((0, 0)),
+            np.empty((0, 0, len(COSTS))),
+        )
         for level in reversed(self.levels):
             at = level.at[:, None]
             child, tree = self.forest.child[at, level.action], self.forest.tree[at]
@@ -81,25 +87,37 @@ class Choices:
             yield level, ends, spent, k
 
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
-        """Return success, (S, E), and costs, (S, E, C), of every episode, by a rule as in `backwards`."""
+        """Return success, (S, E), and costs, (S, E, C), of every episode,
+        by a rule as in `backwards`.
+        """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
         return _values_of(ends, k)[:, root], _values_of(spent, k)[:, root]
 
     def oracle(self) -> tuple[Floats, Floats]:
-        """Return what the best choice of helpers comes to, with the fewest messages that it takes."""
-        return self.played(lambda level, ends, spent: np.argmax(ends - PRICE * spent[..., 0], axis=-1))
+        """Return what the best choice of helpers comes to,
+        with the fewest messages that it takes.
+        """
+        return self.played(
+            lambda level, ends, spent: np.argmax(ends - PRICE * spent[..., 0], axis=-1)
+        )
 
     def index(self, asked: Bools) -> Ints:
         """Return the sets of these helpers `(..., H)`, by number."""
         codes = self.sets @ (1 << np.arange(self.sets.shape[1]))
         order = np.argsort(codes)
-        wide = np.pad(asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])])
-        places: Ints = order[np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))]
+        wide = np.pad(
+            asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])]
+        )
+        places: Ints = order[
+            np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))
+        ]
         return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
-        """Return the rule that asks whom a point's schedule asks, with each level's `worths` if known."""
+        """Return the rule that asks whom a point's schedule asks,
+        with each level's `worths` if known.
+        """
         known = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
         def choose(level: Level, ends: Floats, spent: Floats) -> Ints:
@@ -112,12 +130,16 @@ class Choices:
         return choose
 
     def worths(self, point: OperatingPoint) -> list[Floats]:
-        """Return what asking each helper is worth to a schedule, `(S x N, H)` or `(S x N, 1)` a level."""
+        """Return what asking each helper is worth to a schedule,
+        `(S x N, H)` or `(S x N, 1)` a level.
+        """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
 
 def _values_of(values: Floats, k: Ints) -> Floats:
-    """Return the values, (S, N, ...), of the sets `k`, (S, N), from those of each set, (S, N, K, ...)."""
+    """Return the values, (S, N, ...), of the sets `k`, (S, N), from those of each set,
+    (S, N, K, ...).
+    """
     index = k.reshape(*k.shape, *[1] * (values.ndim - 2))
     return np.asarray(np.take_along_axis(values, index, 2)[:, :, 0])
 
@@ -127,7 +149,8 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     shown, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
         raise UserError(
-            f"--condition {shown}: consensus {consensus} is no function of who is heard now, so that "
+            f"--condition {shown}: consensus {consensus} is no function of who is heard now, so "
+            "that "
             "the oracle would be none; give linear, or another without memory"
         )
     for setting, honest in (("messages", "own"), ("attack", ""), ("content", INTENT)):
@@ -136,7 +159,10 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
 
 
 def choices(
-    stored: ReplayedRun, point: OperatingPoint, seeds: Sequence[int], progress: Callable[[int], None]
+    stored: ReplayedRun,
+    point: OperatingPoint,
+    seeds: Sequence[int],
+    progress: Callable[[int], None],
 ) -> Choices:
     """Return all choices of an operating point. What the run has no answer to its model is asked.
 
@@ -152,10 +178,13 @@ def choices(
     members = [of for size in sizes for of in combinations(range(helpers), size)]
     if len(members) > MOST_SETS:
         raise UserError(
-            f"--condition {printable(point.name)}: {len(members)} sets of helpers, {MOST_SETS} at most; "
+            f"--condition {printable(point.name)}: {len(members)} sets of helpers, {MOST_SETS} at "
+            "most; "
             "give a smaller max_helpers"
         )
-    sets = np.array([[h in of for h in range(helpers)] for of in members]).reshape(len(members), helpers)
+    sets = np.array([[h in of for h in range(helpers)] for of in members]).reshape(
+        len(members), helpers
+    )
     at, levels = forest.root, list[Level]()
     while len(at):
         level = _level(stored, point, seed, at, sets)
@@ -180,15 +209,26 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     draws = channel_draws(
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
-    intents, ties = as_sent(point, point.prepared(intents.take(node))), tie_draws(draws, stored.spec.ties)
+    intents, ties = (
+        as_sent(point, point.prepared(intents.take(node))),
+        tie_draws(draws, stored.spec.ties),
+    )
     own_j, actions, costs = stored.joules(scenes, point)[node], [], []
     for who in sets[:, :width]:
         heard = fuse(
-            point, exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)), intents,
+            point,
+            exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)),
+            intents,
             FusionInputs(ties=ties),
-        )  # fmt: skip
+        )
         actions.append(heard.action.reshape(shape))
         energy_j = own_j[:, 0] + helpers_j(heard.infers, own_j) + stored.radio_j(point, heard)
-        each = (heard.messages, 1e3 * heard.airtime_s, 1e3 * heard.latency_s, np.ones(len(node)), energy_j)
+        each = (
+            heard.messages,
+            1e3 * heard.airtime_s,
+            1e3 * heard.latency_s,
+            np.ones(len(node)),
+            energy_j,
+        )
         costs.append(np.stack(each, -1).reshape(*shape, len(COSTS)))
     return Level(at, np.stack(actions, -1), np.stack(costs, 2), intents, draws)

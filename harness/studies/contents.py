@@ -1,8 +1,8 @@
 """What a message should hold: every content of messages at every point, and what it comes to.
 
-Every content is played at every point from stored answers, with the same draws; `nothing` is an ego that asks
-nobody. A model's runs on several families of scenes are averaged with equal weight, and differences to
-intents are paired by episode within each family.
+Every content is played at every point from stored answers, with the same draws; `nothing` is an ego
+that asks nobody. A model's runs on several families of scenes are averaged with equal weight, and
+differences to intents are paired by episode within each family.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -105,7 +105,9 @@ class Outcome:
 
         return mean_of([*map(of, self._of(family))])
 
-    def over(self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = "") -> Estimate:
+    def over(
+        self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = ""
+    ) -> Estimate:
         """Return success less another outcome's, paired by episode; plain if `metric` is."""
         return mean_difference([*self._pairs(other, family, metric)], level)
 
@@ -122,7 +124,9 @@ class Outcome:
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
         """Return success of the episodes of all families that are in a group, (S, n)."""
-        return np.hstack([each[SUCCESS][:, groups[family]] for family, each in self.families.items()])
+        return np.hstack(
+            [each[SUCCESS][:, groups[family]] for family, each in self.families.items()]
+        )
 
     def _of(self, family: str) -> list[str]:
         return list(self.families) if family == MEAN else [family]
@@ -158,16 +162,24 @@ class Result:
     @property
     def sent(self) -> list[str]:
         """The contents beside intents that a message can hold."""
-        return [content for content in self.others if content != NOTHING and CONTENTS[content].graph != TRUTH]
+        return [
+            content
+            for content in self.others
+            if content != NOTHING and CONTENTS[content].graph != TRUTH
+        ]
 
     @cached_property
     def _p(self) -> dict[Place, float | None]:
         pairs = [(setting, content) for setting in self.points for content in self.others]
-        raw = [self.at(setting, content).p_over(self.at(setting, INTENT)) for setting, content in pairs]
+        raw = [
+            self.at(setting, content).p_over(self.at(setting, INTENT)) for setting, content in pairs
+        ]
         return dict(zip([place(*pair) for pair in pairs], corrected(raw), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
-        """Return the p of a content against intents, by Holm's method for all of the model; of these None."""
+        """Return the p of a content against intents,
+        by Holm's method for all of the model; of these None.
+        """
         return self._p.get(place(setting, content))
 
     @property
@@ -200,7 +212,9 @@ def holding(point: OperatingPoint, content: str) -> OperatingPoint:
 
 
 def place(setting: Setting, content: str) -> Place:
-    """Return what decides an outcome: the operating point with this content, and the number of vehicles."""
+    """Return what decides an outcome: the operating point with this content,
+    and the number of vehicles.
+    """
     return holding(setting.point, content), setting.vehicles
 
 
@@ -243,14 +257,18 @@ def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> l
             theirs[family] = run
     result = []
     for name, theirs in by_model.items():
-        left_out = dict(_unable(list(theirs.values()), [setting.point for setting in distinct(panels)]))
+        left_out = dict(
+            _unable(list(theirs.values()), [setting.point for setting in distinct(panels)])
+        )
         if INTENT in left_out:
             raise UserError(f"{printable(name)}: {left_out[INTENT]}")
         result.append(Model(name, theirs, left_out))
     return result
 
 
-def _unable(runs: Sequence[ReplayedRun], points: Sequence[OperatingPoint]) -> Iterator[tuple[str, str]]:
+def _unable(
+    runs: Sequence[ReplayedRun], points: Sequence[OperatingPoint]
+) -> Iterator[tuple[str, str]]:
     """Yield the contents that some of these runs' agents cannot play, and why."""
     for content in PLAYED:
         try:
@@ -263,18 +281,26 @@ def _unable(runs: Sequence[ReplayedRun], points: Sequence[OperatingPoint]) -> It
 
 
 def panels_of(
-    runs: Sequence[ReplayedRun], conditions: Sequence[str], over: Sequence[str], grids: Sequence[str]
+    runs: Sequence[ReplayedRun],
+    conditions: Sequence[str],
+    over: Sequence[str],
+    grids: Sequence[str],
 ) -> list[Panel]:
-    """Return the conditions as they are, and each axis in each of them; the usual ones if none is given.
+    """Return the conditions as they are, and each axis in each of them;
+    the usual ones if none is given.
 
     Raises UserError as `sweep.settings` does, or if there are more grids than axes.
     """
     if len(grids) > len(over):
-        raise UserError(f"--grid: {len(grids)} given for {len(over)} of --over; give one for each, in order")
+        raise UserError(
+            f"--grid: {len(grids)} given for {len(over)} of --over; give one for each, in order"
+        )
     if conditions or over:
         values = [*grids, *[None] * (len(over) - len(grids))]
         conditions = conditions or [BASE]
-        varied = [(c, axis, text) for c in conditions for axis, text in zip(over, values, strict=True)]
+        varied = [
+            (c, axis, text) for c in conditions for axis, text in zip(over, values, strict=True)
+        ]
     else:
         varied = list(USUAL)
         conditions = [BASE]
@@ -292,10 +318,14 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 
     They are about the decision points that the run or a reference driver comes to.
     """
-    points = tuple({
-        holding(setting.point, content)
-        for panel in panels for setting in panel.settings for content in model.contents
-    })  # fmt: skip
+    points = tuple(
+        {
+            holding(setting.point, content)
+            for panel in panels
+            for setting in panel.settings
+            for content in model.contents
+        }
+    )
     return {
         family: lacking(
             replace(run.spec, points=points),
@@ -307,17 +337,24 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
     }
 
 
-def manifest_of(swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]) -> dict[str, Any]:
+def manifest_of(
+    swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]
+) -> dict[str, Any]:
     """Return what a study is made of."""
     return {
         "sources": [run.manifest() for model in swarms for run in model.runs.values()],
-        "contents": list(PLAYED), "seeds": list(seeds),
+        "contents": list(PLAYED),
+        "seeds": list(seeds),
         "panels": described({panel.name: panel.settings for panel in panels}),
-    }  # fmt: skip
+    }
 
 
 def run_contents(
-    swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int], out: Path, progress: Progress
+    swarms: Sequence[Model],
+    panels: Sequence[Panel],
+    seeds: Sequence[int],
+    out: Path,
+    progress: Progress,
 ) -> list[Result]:
     """Play every content at every grid point with every model's runs.
 
@@ -335,21 +372,31 @@ def run_contents(
 
 
 def _played(
-    model: Model, panels: Sequence[Panel], points: Sequence[Setting], seeds: Sequence[int],
+    model: Model,
+    panels: Sequence[Panel],
+    points: Sequence[Setting],
+    seeds: Sequence[int],
     progress: Progress,
-) -> Result:  # fmt: skip
+) -> Result:
     every = [
         replace(setting, point=holding(setting.point, content))
-        for content in model.contents for setting in points
-    ]  # fmt: skip
-    by_family: dict[Place, dict[str, Mapping[str, Floats]]] = {(s.point, s.vehicles): {} for s in every}
+        for content in model.contents
+        for setting in points
+    ]
+    by_family: dict[Place, dict[str, Mapping[str, Floats]]] = {
+        (s.point, s.vehicles): {} for s in every
+    }
     for family, run in model.runs.items():
         p = run.dataset.scenario.parameters
 
-        def read(part: Decided[Any], lag: int = p.lag_frames, hz: int = p.simulation_hz) -> dict[str, Floats]:
+        def read(
+            part: Decided[Any], lag: int = p.lag_frames, hz: int = p.simulation_hz
+        ) -> dict[str, Floats]:
             values = metric_columns(part)
             seconds, at = np.unique(part.result.latency_s, return_inverse=True)
-            off = np.array([frames(each, hz) != lag if each == each else np.nan for each in seconds.tolist()])
+            off = np.array(
+                [frames(each, hz) != lag if each == each else np.nan for each in seconds.tolist()]
+            )
             return {**values, "off_lag": off[at]}
 
         for setting, [walk] in zip(every, run.walked(every, seeds, read), strict=True):
@@ -370,19 +417,24 @@ def witnesses(run: ReplayedRun) -> Ints:
     counts = []
     for scene in run.dataset.scenes([forest.ids[n] for n in forest.root.tolist()]):
         danger = scene.record.danger
-        seen = [any(node.id == danger.vehicle for node in scene.graphs[v].nodes) for v in scene.viewers[1:]]
+        seen = [
+            any(node.id == danger.vehicle for node in scene.graphs[v].nodes)
+            for v in scene.viewers[1:]
+        ]
         heard = radios(scenario, scene.state.episode_seed, danger.sector)["danger_radio"]
         counts.append(SAFE if danger.vehicle is None else HEARD if heard else sum(seen))
     return np.array(counts)
 
 
 def groups(model: Model) -> dict[str, dict[str, Bools]]:
-    """Return by name which episodes of each family, (E,), are in each group: by who sees the danger."""
+    """Return by name which episodes of each family, (E,), are in each group:
+    by who sees the danger.
+    """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(each.max()) for each in counts.values())
     numbers = {"no danger": SAFE, **{f"a danger, seen by {n}": n for n in range(most + 1)}}
     numbers["a danger with a radio"] = HEARD
     named = {
         name: {family: each == n for family, each in counts.items()} for name, n in numbers.items()
-    } | {"any danger": {family: each != SAFE for family, each in counts.items()}}  # fmt: skip
+    } | {"any danger": {family: each != SAFE for family, each in counts.items()}}
     return {name: within for name, within in named.items() if any(map(np.any, within.values()))}

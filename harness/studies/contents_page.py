@@ -1,4 +1,6 @@
-"""The page of `harness study contents`: at equal bits and age, along axes, and by who sees the danger."""
+"""The page of `harness study contents`:
+at equal bits and age, along axes, and by who sees the danger.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import cycle
@@ -53,29 +55,45 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
     runs = [run for result in results for run in result.model.runs.values()]
     lags_s = sorted({run.dataset.scenario.parameters.decision_lag_s for run in runs})
     return Study(
-        "contents", "Intent or objects?", [text for result in results for text in headline(result)],
+        "contents",
+        "Intent or objects?",
+        [text for result in results for text in headline(result)],
         [
-            f"{'; '.join(map(_counted, results))}; channel seeds {', '.join(map(str, seeds))}. Stored "
-            f"answers are coordinated again with the same random draws at {len(results[0].points)} points "
-            "with every content, so differences are paired by episode. 95 % intervals are over episodes; a "
-            "mean gives each family the same weight and is about these families alone. Clear: p at most "
+            f"{'; '.join(map(_counted, results))}; channel seeds {', '.join(map(str, seeds))}. "
+            "Stored "
+            f"answers are coordinated again with the same random draws at {len(results[0].points)} "
+            "points "
+            "with every content, so differences are paired by episode. 95 % intervals are over "
+            "episodes; a "
+            "mean gives each family the same weight and is about these families alone. Clear: p at "
+            "most "
             f"{LEVEL:g} by Holm's method for all comparisons of a model with intents.",
-            "Bits are of all requests and replies; they add no load to a radio. All that the ego knows was "
-            "seen at the decision's start, so its age when the ego acts is the decision's latency. Frozen "
-            f"scenes let each action begin {' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after its "
-            "decision, whatever it took. Off lag are decisions that would begin in another frame: where a "
-            "content has more of them, its success is of an ego that is faster than this one; harness drive "
+            "Bits are of all requests and replies; they add no load to a radio. All that the ego "
+            "knows was "
+            "seen at the decision's start, so its age when the ego acts is the decision's latency. "
+            "Frozen "
+            f"scenes let each action begin {' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after "
+            "its "
+            "decision, whatever it took. Off lag are decisions that would begin in another frame: "
+            "where a "
+            "content has more of them, its success is of an ego that is faster than this one; "
+            "harness drive "
             "counts that time.",
-            "No message can tell what nobody sees: the last table of each model has success by how many "
-            "helpers have the danger in sight at the first decision. Where costs are drawn, a line joins the "
-            "points of a content that no cheaper one beats. Crosses are the paper's values, of intents and "
+            "No message can tell what nobody sees: the last table of each model has success by how "
+            "many "
+            "helpers have the danger in sight at the first decision. Where costs are drawn, a line "
+            "joins the "
+            "points of a content that no cheaper one beats. Crosses are the paper's values, of "
+            "intents and "
             "plain success.",
         ],
         [table for result in results for table in _tables(result, by_group)],
-        {"points": points, "groups": by_group}, {**manifest, "versions": versions()}, points,
+        {"points": points, "groups": by_group},
+        {**manifest, "versions": versions()},
+        points,
         lambda: _figures(results),
         [*_left_out(results), *(caveat for run in runs for caveat in run.caveats)],
-    )  # fmt: skip
+    )
 
 
 def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
@@ -98,13 +116,16 @@ def headline(result: Result) -> list[str]:
     gains = [f"{c} {shown(result.at(base, c).over(intent), sign='+')}" for c in result.sent]
     costs = [
         f"{content} {shown(each.leading)} % with {_kbit(each):.1f} kbit and {_age(each):.0f} ms"
-        for content in result.model.contents if (each := result.at(base, content))
-    ]  # fmt: skip
+        for content in result.model.contents
+        if (each := result.at(base, content))
+    ]
     return [
         f"{name}, {base.condition}, points of {result.words} over intents: {'; '.join(gains)}. "
         f"Of {len(result.points)} points, "
-        f"clearly better than intents: {_clear(result, True)}; clearly worse: {_clear(result, False)}.",
-        f"{name}, {result.words}, bits of an episode, and time until the ego acts: {', '.join(costs)}; "
+        f"clearly better than intents: {_clear(result, True)}; clearly worse: "
+        f"{_clear(result, False)}.",
+        f"{name}, {result.words}, bits of an episode, and time until the ego acts: "
+        f"{', '.join(costs)}; "
         f"n = {_episodes(result.model)} episodes.",
     ]
 
@@ -152,8 +173,9 @@ def _counted(result: Result) -> str:
 def _left_out(results: Sequence[Result]) -> list[str]:
     return [
         f"{printable(result.model.name)}: {content} is left out: {why}"
-        for result in results for content, why in result.model.left_out.items()
-    ]  # fmt: skip
+        for result in results
+        for content, why in result.model.left_out.items()
+    ]
 
 
 def _tables(result: Result, by_group: "pd.DataFrame") -> Iterator[Table]:
@@ -181,31 +203,51 @@ def _at_base(result: Result) -> Table:
         outcome = result.at(result.base, content)
         late, off_lag = (f"{100 * outcome.estimate(name).value:.1f}" for name in (LATE, OFF_LAG))
         p = "" if content == INTENT else p_cell(result.p(result.base, content))
-        rows.append((
-            content, shown(outcome.leading), _over(result, result.base, content), p,
-            f"{_kbit(outcome):.2f}", f"{_age(outcome):.1f}", late, off_lag,
-            *(shown(outcome.estimate(half)) for half in entry(result.lead).halves),
-        ))  # fmt: skip
+        rows.append(
+            (
+                content,
+                shown(outcome.leading),
+                _over(result, result.base, content),
+                p,
+                f"{_kbit(outcome):.2f}",
+                f"{_age(outcome):.1f}",
+                late,
+                off_lag,
+                *(shown(outcome.estimate(half)) for half in entry(result.lead).halves),
+            )
+        )
     return Table(
         f"{result.model.name}, {result.base.condition}",
         (
-            "content", f"{result.words} %", "over intents", "p", "kbit", "age, ms", "late %",
-            "off lag %", *(("with a danger %", "without %") if entry(result.lead).halves else ()),
-        ), rows,
-        "Over intents: in points, bold where it is clear. kbit: of all requests and replies of an episode. "
+            "content",
+            f"{result.words} %",
+            "over intents",
+            "p",
+            "kbit",
+            "age, ms",
+            "late %",
+            "off lag %",
+            *(("with a danger %", "without %") if entry(result.lead).halves else ()),
+        ),
+        rows,
+        "Over intents: in points, bold where it is clear. kbit: of all requests and replies of an "
+        "episode. "
         "Age: of what the ego knows when it acts. Late: decisions longer than the window.",
         terminal=(0, 1, 2, 4, 5, 6),
-    )  # fmt: skip
+    )
 
 
 def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> Table:
-    """Of settings in the first condition that cost no more than intents in it, show each content's best."""
+    """Of settings in the first condition that cost no more than intents in it,
+    show each content's best.
+    """
     intent = result.at(result.base, INTENT)
     settings = {"as it is": result.base} | {
         f"{panel.axis} {_value(setting)}": setting
-        for panel in result.panels for setting in panel.settings
+        for panel in result.panels
+        for setting in panel.settings
         if setting.condition == result.base.condition and panel.axis in SPENDING
-    }  # fmt: skip
+    }
     rows = []
     for content in result.model.contents:
         outcomes = [(result.at(setting, content), name) for name, setting in settings.items()]
@@ -219,10 +261,12 @@ def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> T
         rows.append((content, name, shown(best.leading), gain, *costs))
     return Table(
         f"{result.model.name}, {result.base.condition}: at the {title} of intents",
-        ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"), rows,
-        f"Of the settings of {' and '.join(SPENDING)} that cost no more than intents with the condition as "
+        ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"),
+        rows,
+        f"Of the settings of {' and '.join(SPENDING)} that cost no more than intents with the "
+        "condition as "
         "it is, the best of each content; chosen on these episodes, which flatters it.",
-    )  # fmt: skip
+    )
 
 
 def _by_family(result: Result) -> Table:
@@ -248,20 +292,28 @@ def _along(result: Result, panel: Panel) -> Table:
     theirs = _theirs(panel.axis)
     for setting in panel.settings:
         outcomes = [result.at(setting, content) for content in contents]
-        rows.append((
-            _value(setting), *(shown(outcome.leading) for outcome in outcomes),
-            *(_over(result, setting, content) for content in result.sent),
-            *([theirs.get(setting.value, "")] if theirs else []),
-        ))  # fmt: skip
+        rows.append(
+            (
+                _value(setting),
+                *(shown(outcome.leading) for outcome in outcomes),
+                *(_over(result, setting, content) for content in result.sent),
+                *([theirs.get(setting.value, "")] if theirs else []),
+            )
+        )
     heads = (
-        panel.axis, *(f"{content}, %" for content in contents), *(f"{c} over intents" for c in result.sent),
+        panel.axis,
+        *(f"{content}, %" for content in contents),
+        *(f"{c} over intents" for c in result.sent),
         *(["the paper, %"] if theirs else []),
-    )  # fmt: skip
+    )
     note = (
-        "Differences are in points, bold where they are clear. The paper's value is of intents and of plain "
+        "Differences are in points, bold where they are clear. The paper's value is of intents and "
+        "of plain "
         "success, in scenes of its own."
     )
-    return Table(f"{result.model.name}, {panel.name}: {result.words}", heads, rows, note, folded=True)
+    return Table(
+        f"{result.model.name}, {panel.name}: {result.words}", heads, rows, note, folded=True
+    )
 
 
 def _by_group(result: Result, rows: "pd.DataFrame") -> Table:
@@ -270,7 +322,8 @@ def _by_group(result: Result, rows: "pd.DataFrame") -> Table:
         of = each.set_index("content")
         scores = [percent(of.loc[c], "success", "success_low", "success_high") for c in contents]
         gains = [
-            percent(of.loc[c], "over_intent", "over_intent_low", "over_intent_high") for c in result.sent
+            percent(of.loc[c], "over_intent", "over_intent_low", "over_intent_high")
+            for c in result.sent
         ]
         cells.append((str(group), str(of.n.iloc[0]), *scores, *gains))
     heads = (
@@ -294,31 +347,48 @@ def _costs(result: Result) -> "Iterator[tuple[str, str, list[Steps]]]":
             look: dict[str, Any] = {"color": COLOURS[n % len(COLOURS)]}
             places = sorted(
                 (cost(outcome), -100 * outcome.leading.value)
-                for setting in result.points if (outcome := result.at(setting, content))
-            )  # fmt: skip
+                for setting in result.points
+                if (outcome := result.at(setting, content))
+            )
             x, y = np.array(places).T * [[1], [-1]]
             best = y >= np.maximum.accumulate(y)
             marker = look | {"marker": MARKERS[n % len(MARKERS)], "markersize": 4}
-            steps += [Steps(content, x, y, marker | {"linestyle": ""}), Steps("", x[best], y[best], look)]
+            steps += [
+                Steps(content, x, y, marker | {"linestyle": ""}),
+                Steps("", x[best], y[best], look),
+            ]
         yield result.model.name, title, steps
 
 
 def _curves(result: Result) -> "list[pd.DataFrame]":
-    """Return a part of a summary for each panel, as figures take it: a content in place of a condition."""
+    """Return a part of a summary for each panel, as figures take it:
+    a content in place of a condition.
+    """
     import pandas as pd
 
     return [
-        pd.DataFrame([
-            {
-                "source": result.model.name, "panel": PAPER.get(panel.axis, (panel.axis,))[0],
-                "condition": content, "variable": panel.axis, "value": setting.value, "metric": result.lead,
-                "mean": e.value, "ci_low": e.low, "ci_high": e.high, "interval": "episodes",
-            }
-            for content in result.model.contents for setting in panel.settings
-            if (e := result.at(setting, content).leading)
-        ])
-        for panel in result.panels if panel.axis
-    ]  # fmt: skip
+        pd.DataFrame(
+            [
+                {
+                    "source": result.model.name,
+                    "panel": PAPER.get(panel.axis, (panel.axis,))[0],
+                    "condition": content,
+                    "variable": panel.axis,
+                    "value": setting.value,
+                    "metric": result.lead,
+                    "mean": e.value,
+                    "ci_low": e.low,
+                    "ci_high": e.high,
+                    "interval": "episodes",
+                }
+                for content in result.model.contents
+                for setting in panel.settings
+                if (e := result.at(setting, content).leading)
+            ]
+        )
+        for panel in result.panels
+        if panel.axis
+    ]
 
 
 def _theirs(axis: str) -> dict[Any, str]:
@@ -332,40 +402,67 @@ def _theirs(axis: str) -> dict[Any, str]:
 
 
 def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
-    """Return the paper's success of intents as figures take it, as far as panels have its values."""
+    """Return the paper's success of intents as figures take it,
+    as far as panels have its values.
+    """
     import pandas as pd
 
-    return pd.DataFrame([
-        {"panel": curve.panel[0], "metric": SUCCESS, "value": value, "low": float(text), "high": float(text)}
-        for curve in curves for value, text in _theirs(curve.variable[0]).items()
-        if curve.value.min() <= value <= curve.value.max()
-    ], columns=["panel", "metric", "value", "low", "high"])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {
+                "panel": curve.panel[0],
+                "metric": SUCCESS,
+                "value": value,
+                "low": float(text),
+                "high": float(text),
+            }
+            for curve in curves
+            for value, text in _theirs(curve.variable[0]).items()
+            if curve.value.min() <= value <= curve.value.max()
+        ],
+        columns=["panel", "metric", "value", "low", "high"],
+    )
 
 
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return a row for each model, grid point, content and family, with the mean over families."""
     import pandas as pd
 
-    def row(result: Result, panel: Panel, setting: Setting, content: str, family: str) -> dict[str, Any]:
+    def row(
+        result: Result, panel: Panel, setting: Setting, content: str, family: str
+    ) -> dict[str, Any]:
         outcome, intent = result.at(setting, content), result.at(setting, INTENT)
         last = family == result.families[-1]
         return {
-            "model": result.model.name, "family": family, "condition": setting.condition,
-            "variable": panel.axis, "value": setting.value, "content": content,
-            **_success(outcome.estimate(SUCCESS, family), outcome.over(intent, family, metric=SUCCESS)),
-            **_balanced(result, outcome, intent, family), "lead": result.lead,
+            "model": result.model.name,
+            "family": family,
+            "condition": setting.condition,
+            "variable": panel.axis,
+            "value": setting.value,
+            "content": content,
+            **_success(
+                outcome.estimate(SUCCESS, family), outcome.over(intent, family, metric=SUCCESS)
+            ),
+            **_balanced(result, outcome, intent, family),
+            "lead": result.lead,
             "p_holm": result.p(setting, content) if last else None,
             **{
                 key: value
-                for name in METRICS for key, value in _ends(name, outcome.estimate(name, family)).items()
+                for name in METRICS
+                for key, value in _ends(name, outcome.estimate(name, family)).items()
             },
-        }  # fmt: skip
+        }
 
-    return pd.DataFrame([
-        row(result, panel, setting, content, family)
-        for result in results for panel in result.panels for setting in panel.settings
-        for content in result.model.contents for family in result.families
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            row(result, panel, setting, content, family)
+            for result in results
+            for panel in result.panels
+            for setting in panel.settings
+            for content in result.model.contents
+            for family in result.families
+        ]
+    )
 
 
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
@@ -378,11 +475,18 @@ def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
             intent = result.at(result.base, INTENT).pooled(within)
             for content in result.model.contents:
                 success = result.at(result.base, content).pooled(within)
-                rows.append({
-                    "model": result.model.name, "condition": result.base.condition, "group": name,
-                    "content": content,
-                    **_success(over_episodes(SUCCESS, success), difference(SUCCESS, [(success.T, intent.T)])),
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "model": result.model.name,
+                        "condition": result.base.condition,
+                        "group": name,
+                        "content": content,
+                        **_success(
+                            over_episodes(SUCCESS, success),
+                            difference(SUCCESS, [(success.T, intent.T)]),
+                        ),
+                    }
+                )
     return pd.DataFrame(rows)
 
 

@@ -1,4 +1,6 @@
-"""What fits the decision window on a declared computer, and how near its rates are to a run's own times."""
+"""What fits the decision window on a declared computer,
+and how near its rates are to a run's own times.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,12 +33,17 @@ class Fit:
     joules: Estimate  # that it takes; of a run, the mean
 
 
-def fits(device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float) -> list[Fit]:
-    """Return each row with each kind of answer, of which `window_s` is the time from seeing to the answer."""
+def fits(
+    device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float
+) -> list[Fit]:
+    """Return each row with each kind of answer,
+    of which `window_s` is the time from seeing to the answer.
+    """
     return [
-        _fit(device, row, kind, answers, window_s) for row in rows
+        _fit(device, row, kind, answers, window_s)
+        for row in rows
         for kind in ([DECISION] if row.answer_ms else answers.output)
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,8 @@ def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
 
 
 def answers_of(run: Run) -> Answers:
-    """Return the ego's answers of a run, as given, and as if one letter of each prompt were read out.
+    """Return the ego's answers of a run, as given,
+    and as if one letter of each prompt were read out.
 
     Raises:
         UserError: nobody counted their tokens.
@@ -67,11 +75,16 @@ def answers_of(run: Run) -> Answers:
         raise UserError(f"{printable(run.path)} has no answer of its ego; give another run")
     mode, ones = run.manifest.answer, np.ones(len(counts))
     _, place = np.unique([answer.scene.partition("-")[0] for answer in egos], return_inverse=True)
-    return Answers(counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"])
+    return Answers(
+        counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"]
+    )
 
 
 def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: float) -> Fit:
-    speed, output = devices.speed(device, row), answers.output.get(kind, np.zeros(len(answers.prompt)))
+    speed, output = (
+        devices.speed(device, row),
+        answers.output.get(kind, np.zeros(len(answers.prompt))),
+    )
     pairs = list(zip(answers.prompt.tolist(), output.tolist(), strict=True))
     seconds, joules = (
         np.array([of(speed, *pair) for pair in pairs]) for of in (devices.seconds, devices.joules)
@@ -87,7 +100,9 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A figure of a run's answers that were asked alone, beside what a device profile says of it."""
+    """A figure of a run's answers that were asked alone,
+    beside what a device profile says of it.
+    """
 
     what: str  # `seconds` of an answer, or a rate by its name in a profile
     role: str  # whose answers
@@ -96,9 +111,13 @@ class Comparison:
 
 
 def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
-    """Compare a profile with a run's own times. Raises UserError if no answer of the run was asked alone."""
+    """Compare a profile with a run's own times.
+    Raises UserError if no answer of the run was asked alone.
+    """
     alone = [a for a in run.answers if a.seconds is not None and a.error is None and not a.retries]
-    alone = [a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens]
+    alone = [
+        a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens
+    ]
     figures = [
         figure
         for role in dict.fromkeys(a.role for a in alone)
@@ -106,7 +125,8 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     ]
     if not figures:
         raise UserError(
-            f"{printable(run.path)} has no answer that was asked alone and timed; run it with --batch-size 1 "
+            f"{printable(run.path)} has no answer that was asked alone and timed; run it with "
+            "--batch-size 1 "
             "--no-cache"
         )
     return figures
@@ -115,8 +135,12 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
 def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
     speed, role = devices.speed(device, row), alone[0].role
     stated = [devices.seconds(speed, *tokens(answer)) for answer in alone]
-    yield Comparison("seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated)))
-    read = [(a.prompt_tokens / a.first_token_s, a) for a in alone if a.first_token_s and a.prompt_tokens]
+    yield Comparison(
+        "seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated))
+    )
+    read = [
+        (a.prompt_tokens / a.first_token_s, a) for a in alone if a.first_token_s and a.prompt_tokens
+    ]
     written = [(1 / a.token_s, a) for a in alone if a.token_s]
     for name, pairs in zip(devices.RATES, (read, written), strict=True):
         if pairs:

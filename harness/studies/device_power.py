@@ -34,9 +34,13 @@ class Power:
 
 
 def measure(
-    backend: Backend, requests: Sequence[Request], meters: Sequence[Counter], window_s: float,
-    progress: Callable[[int], None], sleep: Callable[[float], None] = time.sleep,
-) -> tuple[list[Power], int]:  # fmt: skip
+    backend: Backend,
+    requests: Sequence[Request],
+    meters: Sequence[Counter],
+    window_s: float,
+    progress: Callable[[int], None],
+    sleep: Callable[[float], None] = time.sleep,
+) -> tuple[list[Power], int]:
     """Ask alone, again and again, for some windows of time, and say what that took.
 
     Args:
@@ -74,15 +78,20 @@ def measure(
     for name, spent_j in joules.items():
         idle_watts = idle[name] / idled_s
         more = spent_j - idle_watts * seconds
-        estimates = (seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers))
+        estimates = (
+            seed_interval(each) for each in (spent_j / seconds, spent_j / answers, more / answers)
+        )
         powers.append(Power(name, idle_watts, *estimates))
     return powers, int(answers.sum())
 
 
 def measure_agent(
-    agent: Agent, meters: Sequence[Counter], window_s: float, device: str | None,
+    agent: Agent,
+    meters: Sequence[Counter],
+    window_s: float,
+    device: str | None,
     progress: Callable[[int], None],
-) -> tuple[list[Power], int]:  # fmt: skip
+) -> tuple[list[Power], int]:
     """Load an agent's model on a device, and `measure` it with questions of the default dataset."""
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))
@@ -92,7 +101,11 @@ def measure_agent(
 
 
 def _ask(backend: Backend, request: Request) -> None:
-    """Ask one question. Raises Unanswered if it gets no answer, whose joules would be those of a failure."""
+    """Ask one question. Raises Unanswered if it gets no answer,
+    whose joules would be those of a failure.
+    """
     [completion] = backend.complete([request])
     if completion.error is not None:
-        raise Unanswered(f"{printable(completion.error, 300)}: no answer, so that nothing is measured")
+        raise Unanswered(
+            f"{printable(completion.error, 300)}: no answer, so that nothing is measured"
+        )

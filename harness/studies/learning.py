@@ -1,9 +1,10 @@
-"""`harness study schedule learn`: learn what asking a helper is worth from where train decisions lead.
+"""`harness study schedule learn`: learn what asking a helper is worth from where train decisions
+lead.
 
-At every decision point that some choice of helpers leads to, asking one helper alone has a gain: success with
-it less success without, the rest of the course decided as the schedule decides. The network learns the gain,
-averaged over the channel's draws; then the rest of the courses is decided by the network, and it learns anew.
-The threshold is chosen on tune layouts.
+At every decision point that some choice of helpers leads to, asking one helper alone has a gain:
+success with it less success without, the rest of the course decided as the schedule decides. The
+network learns the gain, averaged over the channel's draws; then the rest of the courses is decided
+by the network, and it learns anew. The threshold is chosen on tune layouts.
 """
 
 import json
@@ -39,23 +40,29 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
     """Return a run with its layout seeds in words.
 
-    Raises UserError unless all are for this purpose, and its layouts are those of the seeds and none of those
-    that are reported.
+    Raises UserError unless all are for this purpose,
+    and its layouts are those of the seeds and none of those that are reported.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
     if purposes(first, count) != [wanted]:
         raise UserError(
-            f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} layouts, which "
+            f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} "
+            "layouts, which "
             "`harness dataset build --seed` makes"
         )
     rebuilt.refuse(stored.dataset, [run.dataset for run in reported])
-    return f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, {amount(len(seeds), 'layout')}"
+    return (
+        f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, "
+        f"{amount(len(seeds), 'layout')}"
+    )
 
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
     """Return inputs (n, F) and gains (n,) of asking each helper alone, wherever it may be asked."""
-    alone = [tree.index(np.eye(tree.sets.shape[1], dtype=bool)[h]) for h in range(tree.sets.shape[1])]
+    alone = [
+        tree.index(np.eye(tree.sets.shape[1], dtype=bool)[h]) for h in range(tree.sets.shape[1])
+    ]
     rows, targets = [], []
     for level, ends, _, _ in tree.backwards(choose):
         known = known_of(point, level.intents, level.draws)
@@ -68,14 +75,18 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
 
 def fit(x: Floats, y: Floats) -> Network:
-    """Fit the network that says y (n,) of x (n, F), by least squares: Adam, whole batches, decay."""
+    """Fit the network that says y (n,) of x (n, F), by least squares:
+    Adam, whole batches, decay.
+    """
     draws = noise.generator("schedule", "weights")
     centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
     z, n = (x - centre) / scale, len(y)
     weights = [
-        draws.normal(0, x.shape[1] ** -0.5, (x.shape[1], UNITS)), np.zeros(UNITS),
-        draws.normal(0, 0.1, UNITS), np.array(y.mean()),
-    ]  # fmt: skip
+        draws.normal(0, x.shape[1] ** -0.5, (x.shape[1], UNITS)),
+        np.zeros(UNITS),
+        draws.normal(0, 0.1, UNITS),
+        np.array(y.mean()),
+    ]
     means, squares = ([np.zeros_like(w) for w in weights] for _ in range(2))
     for step in range(1, STEPS + 1):
         into, bias, out, base = weights
@@ -95,14 +106,17 @@ def fit(x: Floats, y: Floats) -> Network:
     return Network(parts[0], parts[1], parts[2], parts[3], parts[4], float(parts[5]))
 
 
-def learn(train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]) -> Network:
+def learn(
+    train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
+) -> Network:
     """Learn the network from runs on train layouts, under an operating point.
 
     Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rest = None, [each.scheduled(point) for each in trees]
-    looks = point.changed(schedule="coverage", threshold=None)  # it needs the outlook, as the network does
+    # it needs the outlook, as the network does
+    looks = point.changed(schedule="coverage", threshold=None)
     for _ in range(ROUNDS):
         pairs = [gains(each, looks, choose) for each, choose in zip(trees, rest, strict=True)]
         network = fit(*(np.concatenate(part) for part in zip(*pairs, strict=True)))
@@ -120,7 +134,10 @@ def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold
 
 
 def tuned(
-    network: Network, tune: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
+    network: Network,
+    tune: Sequence[ReplayedRun],
+    point: OperatingPoint,
+    progress: Callable[[int], None],
 ) -> float:
     """Return the threshold with the most success on tune layouts, as it counts, averaged over runs.
 
@@ -140,18 +157,24 @@ def text(stated: Stated) -> str:
     fields = asdict(stated)
     network = fields.pop("network")
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
-    return "\n".join([*lines, "", "[network]", *(f"{k} = {json.dumps(v)}" for k, v in network.items()), ""])
+    return "\n".join(
+        [*lines, "", "[network]", *(f"{k} = {json.dumps(v)}" for k, v in network.items()), ""]
+    )
 
 
 def run_learn(
-    train: Sequence[ReplayedRun], tune: Sequence[ReplayedRun], point: OperatingPoint, out: Path, command: str,
+    train: Sequence[ReplayedRun],
+    tune: Sequence[ReplayedRun],
+    point: OperatingPoint,
+    out: Path,
+    command: str,
     progress: Callable[[int], None],
-) -> Stated:  # fmt: skip
+) -> Stated:
     """Learn a schedule, choose its threshold, and write its file.
 
     Raises:
-        UserError: a run is on layouts for another purpose, or the operating point's answers are no function
-            of who is heard.
+        UserError: a run is on layouts for another purpose,
+            or the operating point's answers are no function of who is heard.
         Unanswered: too many questions got no answer.
     """
     learnt_from = tuple(layouts(stored, "train") for stored in train)
@@ -162,9 +185,14 @@ def run_learn(
         stored.settle()
     weights = {name: np.asarray(part).tolist() for name, part in asdict(network).items()}
     schedule = Stated(
-        description=f"Learnt: the gain of asking a helper, under {point.name}.", command=command,
-        learnt_from=learnt_from, tuned_on=tuned_on, condition=point.name,
-        threshold=threshold, inputs=INPUTS, network=Weights(**weights),
-    )  # fmt: skip
+        description=f"Learnt: the gain of asking a helper, under {point.name}.",
+        command=command,
+        learnt_from=learnt_from,
+        tuned_on=tuned_on,
+        condition=point.name,
+        threshold=threshold,
+        inputs=INPUTS,
+        network=Weights(**weights),
+    )
     write_whole(out, text(schedule))
     return schedule

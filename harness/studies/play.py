@@ -33,18 +33,32 @@ if TYPE_CHECKING:
 
 NAMES = ("source", "panel", "condition", "variable")
 EPISODE_COLUMNS = {
-    "success": "success_rate", "trigger_rate": "trigger_rate", "latency_ms": "latency_proxy_ms",
-    "messages": "messages_per_episode", "effective_loss": "effective_loss",
-}  # fmt: skip
+    "success": "success_rate",
+    "trigger_rate": "trigger_rate",
+    "latency_ms": "latency_proxy_ms",
+    "messages": "messages_per_episode",
+    "effective_loss": "effective_loss",
+}
 ENDS = ("success_rate", "unsafe_rate", "late_rate")
 PER_DECISION = (
-    "latency_proxy_ms", "deadline_miss_rate", "trigger_rate", "messages_per_episode", "bits_per_episode",
-    "effective_loss", "observed_reply_loss",
-)  # fmt: skip
+    "latency_proxy_ms",
+    "deadline_miss_rate",
+    "trigger_rate",
+    "messages_per_episode",
+    "bits_per_episode",
+    "effective_loss",
+    "observed_reply_loss",
+)
 COLUMNS = (
-    "latency_ms", "deadline_missed", "triggered", "messages", "request_bits", "reply_bits", "effective_loss",
+    "latency_ms",
+    "deadline_missed",
+    "triggered",
+    "messages",
+    "request_bits",
+    "reply_bits",
+    "effective_loss",
     "observed_loss",
-)  # fmt: skip
+)
 Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, ...)
 
 
@@ -53,7 +67,8 @@ class WalkResult:
     """What a walk at one operating point came to, for some seeds and episodes of each."""
 
     episodes: Ints  # their numbers, (E,)
-    # each of `ENDS`, and success by danger where that is known, (S, E); NaN where an episode was left out
+    # each of `ENDS`, and success by danger where that is known, (S, E); NaN where an episode was
+    # left out
     ends: Mapping[str, Floats]
     columns: Mapping[str, Floats]  # what was read of the decisions by name, (n, ...)
     places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
@@ -71,8 +86,11 @@ class Source(Protocol):
         """Return what a reader needs to know of where the intents come from."""
         ...
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
-        """Yield walks at each grid point in turn, in parts of some episodes; every point has the same draws.
+    def walked(
+        self, settings: Sequence[Setting], seeds: Sequence[int]
+    ) -> Iterator[Iterable[WalkResult]]:
+        """Yield walks at each grid point in turn, in parts of some episodes;
+        every point has the same draws.
 
         A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
         """
@@ -89,12 +107,18 @@ def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
 
 
 def walk_through(
-    world: World[Any], points: Sequence[OperatingPoint], ask: Ask[Any], seeds: Sequence[int],
-    episodes: Ints, ties: str, read: Read = metric_columns,
-) -> Iterator[tuple[dict[str, Floats], Ints]]:  # fmt: skip
+    world: World[Any],
+    points: Sequence[OperatingPoint],
+    ask: Ask[Any],
+    seeds: Sequence[int],
+    episodes: Ints,
+    ties: str,
+    read: Read = metric_columns,
+) -> Iterator[tuple[dict[str, Floats], Ints]]:
     """Yield what is read of each point's decisions, rounded as rows, and `places`.
 
-    `episodes` (E,) are ascending. What is read of messages, (n, H), is NaN where a step has fewer helpers.
+    `episodes` (E,) are ascending. What is read of messages, (n, H),
+    is NaN where a step has fewer helpers.
     """
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
@@ -124,41 +148,61 @@ def _below(arrays: Sequence[Floats]) -> Floats:
 class PanelResult:
     """What a source came to at the grid points of a panel."""
 
-    # a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`, `metric`,
-    # `mean`, `ci_low`, `ci_high`, `n`, `interval`
+    # a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`,
+    # `metric`, `mean`, `ci_low`, `ci_high`, `n`, `interval`
     summary: "pd.DataFrame"
     episodes: "pd.DataFrame"  # a row a grid point, seed and episode
 
 
 def play(
-    source: Source, panel: str, settings: Sequence[Setting], seeds: Sequence[int],
+    source: Source,
+    panel: str,
+    settings: Sequence[Setting],
+    seeds: Sequence[int],
     progress: Callable[[int], None],
-) -> PanelResult:  # fmt: skip
-    """Play every grid point with every seed of the channel, which is paired with itself across the points.
+) -> PanelResult:
+    """Play every grid point with every seed of the channel,
+    which is paired with itself across the points.
 
-    `panel` is what tables call this set of grid points; `progress` is called with 1 for each of them.
+    `panel` is what tables call this set of grid points;
+    `progress` is called with 1 for each of them.
     """
     import pandas as pd
 
     rows, episodes = list[dict[str, Any]](), list[pd.DataFrame]()
     for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
         parts = [_part(walk, len(seeds)) for walk in walks]
-        metrics = {name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics}
+        metrics = {
+            name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics
+        }
         of_seeds = zip(*(part.latency_ms for part in parts), strict=True)
         latency_ms = np.array([percentiles(np.concatenate(of_seed)) for of_seed in of_seeds])
         # Where axes are crossed, the columns of each come last.
         place = {"source": source.name, "panel": panel, **setting.place}
         first = {name: place.pop(name) for name in (*NAMES, "value")}
         rows += [
-            {**first, "metric": metric, "mean": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n,
-             "interval": interval, **place}
+            {
+                **first,
+                "metric": metric,
+                "mean": e.value,
+                "ci_low": e.low,
+                "ci_high": e.high,
+                "n": e.n,
+                "interval": interval,
+                **place,
+            }
             for metric, e, interval in _estimates(source, metrics, latency_ms)
-        ]  # fmt: skip
+        ]
         numbers = np.concatenate([part.episodes for part in parts])
-        table = pd.DataFrame({
-            **first, "seed": np.repeat(seeds, len(numbers)), "episode": np.tile(numbers, len(seeds)),
-            **{name: metrics[metric].ravel() for name, metric in EPISODE_COLUMNS.items()}, **place,
-        })  # fmt: skip
+        table = pd.DataFrame(
+            {
+                **first,
+                "seed": np.repeat(seeds, len(numbers)),
+                "episode": np.tile(numbers, len(seeds)),
+                **{name: metrics[metric].ravel() for name, metric in EPISODE_COLUMNS.items()},
+                **place,
+            }
+        )
         episodes.append(table[table.success.notna()].astype({"success": bool, "messages": int}))
         progress(1)
     whole = pd.concat(episodes, ignore_index=True).round({"latency_ms": 3, "effective_loss": 6})
@@ -207,9 +251,10 @@ def _estimates(
 def over_own_episodes(name: str, values: Floats) -> Estimate:
     """Return Student's t over seeds that have episodes of their own, of a metric's values (S, E).
 
-    A stratified share of E episodes is exact but for rounding to whole ones, so that seeds may agree to the
-    last episode and be wrong by the same. Half an episode, the largest standard deviation that rounding up or
-    down can have, is the least that the means of a yes or no count as having.
+    A stratified share of E episodes is exact but for rounding to whole ones, so that seeds may
+    agree to the last episode and be wrong by the same. Half an episode, the largest standard
+    deviation that rounding up or down can have, is the least that the means of a yes or no count as
+    having.
     """
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:

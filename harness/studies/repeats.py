@@ -1,7 +1,8 @@
-"""`harness eval --repeats`: the same evaluation several times, with other draws of its model's answers.
+"""`harness eval --repeats`: the same evaluation several times,
+with other draws of its model's answers.
 
-A repeat is a whole run with a sampling seed of its own; channel and layouts are the same. What differs
-between repeats is the model's chance alone. All intervals are over episodes.
+A repeat is a whole run with a sampling seed of its own; channel and layouts are the same. What
+differs between repeats is the model's chance alone. All intervals are over episodes.
 """
 
 import math
@@ -44,15 +45,20 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """Return the runs of several repeats, each with the next sampling seed, by the name of their folders."""
+    """Return the runs of several repeats, each with the next sampling seed,
+    by the name of their folders.
+    """
     first = spec.settings.sampling_seed
     return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
 
 
 def run_repeats(
-    spec: Spec, repeats: int, out: Path,
-    progress: Progress, cache_file: Path | None,
-) -> "Repeats":  # fmt: skip
+    spec: Spec,
+    repeats: int,
+    out: Path,
+    progress: Progress,
+    cache_file: Path | None,
+) -> "Repeats":
     """Evaluate every repeat in a folder of its own under `out`; those that are there stay.
 
     Completions are kept between runs in the cache file, if there is one.
@@ -69,7 +75,9 @@ def run_repeats(
 
 
 class Wavering(NamedTuple):
-    """A decision point at which repeats decided otherwise, and how often each action was decided."""
+    """A decision point at which repeats decided otherwise,
+    and how often each action was decided.
+    """
 
     scene: str
     condition: str
@@ -86,7 +94,9 @@ class Repeats:
 
     def __post_init__(self) -> None:
         if len({(run.conditions, run.grid) for run in self.runs}) > 1:
-            raise UserError(f"{printable(self.path)}: its runs are not of the same episodes and conditions")
+            raise UserError(
+                f"{printable(self.path)}: its runs are not of the same episodes and conditions"
+            )
 
     @property
     def k(self) -> int:
@@ -101,19 +111,26 @@ class Repeats:
     @cached_property
     def scores(self) -> tuple[Score, ...]:
         """All figures, as a run's summary has its own."""
-        estimates = [(c, *figure) for n, c in enumerate(self.conditions) for figure in self._of_condition(n)]
+        estimates = [
+            (c, *figure) for n, c in enumerate(self.conditions) for figure in self._of_condition(n)
+        ]
         estimates += [(ALL, *figure) for figure in self._doubts()]
         return tuple(Score.of(*figure, "episodes") for figure in estimates)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
         """Return one figure; NaN where it is not known."""
-        return next(s.estimate for s in self.scores if (s.condition, s.metric) == (condition, metric))
+        return next(
+            s.estimate for s in self.scores if (s.condition, s.metric) == (condition, metric)
+        )
 
     def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
         _, counts, episodes = self._actions
         asked = counts[place].sum(axis=(-2, -1)) > 0
         for metric, share in ((FLIPS, flips), (STABLE, stable)):
-            yield metric, rate_interval(known_mean(share(counts[place]), axis=-1)[asked], episodes[asked])
+            yield (
+                metric,
+                rate_interval(known_mean(share(counts[place]), axis=-1)[asked], episodes[asked]),
+            )
         success = self._success[:, place]
         yield SUCCESS, rate_interval(success.mean(axis=(0, 1)))
         wins = success.sum(axis=0)
@@ -126,11 +143,15 @@ class Repeats:
     def _success(self) -> Floats:
         """Whether each episode succeeded, (k, C, S, E)."""
         metrics = [METRICS[SUCCESS]]
-        return np.array([by_episode(metrics, r.grid, r.decisions, r.episodes)[SUCCESS] for r in self.runs])
+        return np.array(
+            [by_episode(metrics, r.grid, r.decisions, r.episodes)[SUCCESS] for r in self.runs]
+        )
 
     @cached_property
     def _actions(self) -> tuple[list[str], Ints, Ints]:
-        """Decision points (D,), how many repeats took each action there, (C, D, S, A), and their episodes."""
+        """Decision points (D,), how many repeats took each action there, (C, D, S, A),
+        and their episodes.
+        """
         labels = {scene for run in self.runs for scene in run.decisions.labels("scene") if scene}
         scenes, run = sorted(labels), self.runs[0]
         conditions, seeds, _ = run.grid.shape
@@ -138,13 +159,19 @@ class Repeats:
         episodes = np.zeros(len(scenes), dtype=np.int64)
         for run in self.runs:
             scene = run.decisions.codes("scene", scenes)
-            condition, seed, episode = np.unravel_index(run.grid.places(run.decisions), run.grid.shape)
-            np.add.at(counts, (condition, scene, seed, run.decisions.codes("action", run.actions)), 1)
+            condition, seed, episode = np.unravel_index(
+                run.grid.places(run.decisions), run.grid.shape
+            )
+            np.add.at(
+                counts, (condition, scene, seed, run.decisions.codes("action", run.actions)), 1
+            )
             episodes[scene] = episode
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """Return the decision points that repeats disagree on, those with most pairs that do first."""
+        """Return the decision points that repeats disagree on,
+        those with most pairs that do first.
+        """
         scenes, counts, _ = self._actions
         shares = np.nan_to_num(known_mean(flips(counts), axis=-1))
         n = counts.sum(axis=-1)
@@ -158,13 +185,19 @@ class Repeats:
         return [point for point in points if point.flips > 0]
 
     def _doubts(self) -> Iterator[tuple[str, Estimate]]:
-        """Yield the entropy that the ego's answers state, and that of the actions which they rank first."""
+        """Yield the entropy that the ego's answers state,
+        and that of the actions which they rank first.
+        """
         intents: dict[str, list[tuple[float, ...]]] = {}
         for run in self.runs:
             for answer in run.answers:
                 if answer.role == "ego":
-                    intents.setdefault(answer.scene, []).extend([answer.intent] if answer.intent else [])
-        both = np.array([_doubt(np.array(p)) if len(p) > 1 else (math.nan,) * 2 for p in intents.values()])
+                    intents.setdefault(answer.scene, []).extend(
+                        [answer.intent] if answer.intent else []
+                    )
+        both = np.array(
+            [_doubt(np.array(p)) if len(p) > 1 else (math.nan,) * 2 for p in intents.values()]
+        )
         episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
         for name, values in ((STATED, both[:, 0]), (SAMPLED, both[:, 1])):
             yield name, in_range(name, episode_interval(values, episodes))
@@ -172,25 +205,33 @@ class Repeats:
 
 
 def flips(counts: Ints) -> Floats:
-    """Return the share of pairs of repeats that act differently, (...), of counts (..., A); NaN for none."""
+    """Return the share of pairs of repeats that act differently, (...), of counts (..., A);
+    NaN for none.
+    """
     n = counts.sum(axis=-1)
     pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
     return np.where(pairs > 0, 1 - same / np.maximum(pairs, 1), np.nan)
 
 
 def stable(counts: Ints) -> Floats:
-    """Return 1 where all repeats act alike, else 0, (...), of counts (..., A); NaN for fewer than two."""
+    """Return 1 where all repeats act alike, else 0, (...), of counts (..., A);
+    NaN for fewer than two.
+    """
     n = counts.sum(axis=-1)
     return np.where(n > 1, counts.max(axis=-1) == n, np.nan)
 
 
 def all_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return the probability that j of k repeats, drawn without replacement, all succeed: pass^j."""
+    """Return the probability that j of k repeats, drawn without replacement,
+    all succeed: pass^j.
+    """
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
 
 def any_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return the probability that one or more of j of k succeed: any@j without bias (Chen et al. 2021)."""
+    """Return the probability that one or more of j of k succeed:
+    any@j without bias (Chen et al. 2021).
+    """
     return 1 - all_of(k - wins, k, j)
 
 
@@ -199,10 +240,11 @@ def _choose(n: Floats, j: int) -> Floats:
 
 
 def between_share(values: Floats) -> Estimate:
-    """Return the share of variance of values (E, k) between episodes: ICC(1) of Shrout and Fleiss (1979).
+    """Return the share of variance of values (E, k) between episodes:
+    ICC(1) of Shrout and Fleiss (1979).
 
-    Below 0 where repeats of one episode differ more than episodes do; NaN where nothing differs. The interval
-    resamples episodes.
+    Below 0 where repeats of one episode differ more than episodes do;
+    NaN where nothing differs. The interval resamples episodes.
     """
     n, k = values.shape
     unknown = Estimate(math.nan, math.nan, math.nan, n, 0)
@@ -221,10 +263,11 @@ def between_share(values: Floats) -> Estimate:
 
 
 def _doubt(p: Floats) -> tuple[float, float]:
-    """Mean entropy of intents (n, A), and the entropy of their likeliest actions, by Miller and Madow (1955).
+    """Mean entropy of intents (n, A), and the entropy of their likeliest actions,
+    by Miller and Madow (1955).
 
-    The entropy of a few draws is too small on average; they add half of one less than the number of different
-    actions that were drawn, over n.
+    The entropy of a few draws is too small on average;
+    they add half of one less than the number of different actions that were drawn, over n.
     """
     n = len(p)
     shares = np.bincount(p.argmax(axis=-1), minlength=p.shape[1]) / n
@@ -246,32 +289,45 @@ def repeats_study(repeats: Repeats) -> Study:
     variant, place = msgspec.to_builtins(first.variant), beside(repeats.path / PAGE)
     rows = [{**variant, **msgspec.to_builtins(score)} for score in repeats.scores]
     reports = ((place(run), run.path.name) for run in repeats.runs)
-    links = (Markup('<p><a href="{}">Report of {}</a></p>').format(*each) for each in reports if each[0])
+    links = (
+        Markup('<p><a href="{}">Report of {}</a></p>').format(*each) for each in reports if each[0]
+    )
     found = of_runs({run.path.name: run for run in repeats.runs}, Kind.VOID, Kind.CAVEAT)
     return Study(
-        "repeats", f"{k} repeats of {first.variant} on {source}", headline(repeats),
+        "repeats",
+        f"{k} repeats of {first.variant} on {source}",
+        headline(repeats),
         [
             f"{k} repeats × {amount(len(first.seeds), 'channel seed')} of "
             f"{amount(len(repeats.runs[0].grid.episodes), 'episode')} at temperature "
             f"{first.settings.temperature:g}. Each repeat is a whole run with its own "
-            "sampling seed, and with the same episodes and channel seeds, so they differ only in the "
-            "random draws of the model's answers. 95 % intervals are over episodes. All figures are in "
+            "sampling seed, and with the same episodes and channel seeds, so they differ only in "
+            "the "
+            "random draws of the model's answers. 95 % intervals are over episodes. All figures "
+            "are in "
             "repeats.csv."
         ],
-        list(_tables(repeats)), {"repeats": pd.DataFrame(rows)},
+        list(_tables(repeats)),
+        {"repeats": pd.DataFrame(rows)},
         {
-            "sources": [{"name": first.variant.model}], "runs": [run.path.name for run in repeats.runs],
+            "sources": [{"name": first.variant.model}],
+            "runs": [run.path.name for run in repeats.runs],
             "temperature": first.settings.temperature,
             "sampling_seeds": [run.manifest.settings.sampling_seed for run in repeats.runs],
-            "dataset": source, "conditions": list(repeats.conditions), "versions": versions(),
+            "dataset": source,
+            "conditions": list(repeats.conditions),
+            "versions": versions(),
         },
         {
-            "repeats": str(repeats.path), "runs": [str(run.path) for run in repeats.runs],
-            "temperature": first.settings.temperature, "figures": rows,
+            "repeats": str(repeats.path),
+            "runs": [str(run.path) for run in repeats.runs],
+            "temperature": first.settings.temperature,
+            "figures": rows,
         },
         caveats=[finding.sentence for finding in found],
-        more=Markup("\n").join(links), figures=lambda: {"repeats": _figure(repeats)},
-    )  # fmt: skip
+        more=Markup("\n").join(links),
+        figures=lambda: {"repeats": _figure(repeats)},
+    )
 
 
 def _figure(repeats: Repeats) -> "Figure":
@@ -281,15 +337,21 @@ def _figure(repeats: Repeats) -> "Figure":
     most = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
     parts = {
         "share, %": {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN},
-        "episodes, %": {f"any@{j}": f"any@{j}" for j in reversed(most)} | {"succeed": SUCCESS}
+        "episodes, %": {f"any@{j}": f"any@{j}" for j in reversed(most)}
+        | {"succeed": SUCCESS}
         | {f"pass^{j}": f"pass^{j}" for j in most},
-    }  # fmt: skip
+    }
     panels = [
-        Rows(quantity, list(rows), {
-            c: [repeats.estimate(c, metric) for metric in rows.values()] for c in repeats.conditions
-        })
+        Rows(
+            quantity,
+            list(rows),
+            {
+                c: [repeats.estimate(c, metric) for metric in rows.values()]
+                for c in repeats.conditions
+            },
+        )
         for quantity, rows in parts.items()
-    ]  # fmt: skip
+    ]
     return intervals(panels, conditions(repeats.conditions))
 
 
@@ -306,47 +368,63 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
             (c, *cells(c, FLIPS, STABLE), str(repeats.estimate(c, FLIPS).n), *cells(c, BETWEEN))
             for c in repeats.conditions
         ],
-        "A decision flips if two repeats that both reached a decision point chose different actions "
-        "there. The first column is the share of such pairs; the second is the share of the n decision "
-        "points at which all repeats that reached them chose the same action. Points that only one repeat "
-        "reached count in neither. Variance between episodes is the intraclass correlation of success, "
-        "ICC(1): 100 % if repeats change nothing, about 0 if knowing the episode does not help to predict "
+        "A decision flips if two repeats that both reached a decision point chose different "
+        "actions "
+        "there. The first column is the share of such pairs; the second is the share of the n "
+        "decision "
+        "points at which all repeats that reached them chose the same action. Points that only one "
+        "repeat "
+        "reached count in neither. Variance between episodes is the intraclass correlation of "
+        "success, "
+        "ICC(1): 100 % if repeats change nothing, about 0 if knowing the episode does not help to "
+        "predict "
         f"its repeats, a dash if all outcomes are the same; n is {episodes} episodes.",
         terminal=range(5),
     )
     passes, anys = ([f"{name}{j}" for j in range(2, k + 1)] for name in ("pass^", "any@"))
     heads = ("condition", "episodes succeed, %", *passes, *anys)
     yield Table(
-        "Episodes", heads, [(c, *cells(c, SUCCESS, *passes, *anys)) for c in repeats.conditions],
-        f"Of j repeats drawn from the {k} without replacement, pass^j: all succeed, and any@j: one or more "
+        "Episodes",
+        heads,
+        [(c, *cells(c, SUCCESS, *passes, *anys)) for c in repeats.conditions],
+        f"Of j repeats drawn from the {k} without replacement, pass^j: all succeed, and any@j: one "
+        "or more "
         "succeeds; in "
-        f"percent of n = {episodes} episodes.", terminal=(0, 1, k, len(heads) - 1),
-    )  # fmt: skip
+        f"percent of n = {episodes} episodes.",
+        terminal=(0, 1, k, len(heads) - 1),
+    )
     yield Table(
-        "Stated and sampled entropy", ("entropy of the ego's own answers", "nats", "decision points"),
+        "Stated and sampled entropy",
+        ("entropy of the ego's own answers", "nats", "decision points"),
         [
             (name.removesuffix("_nats").replace("_", " "), nats(e), str(e.n))
-            for name in (STATED, SAMPLED, DOUBT) if (e := repeats.estimate(ALL, name))
+            for name in (STATED, SAMPLED, DOUBT)
+            if (e := repeats.estimate(ALL, name))
         ],
         "Stated: the mean entropy of the distributions in the answers. Sampled: the entropy, over "
-        f"repeats, of the most probable action, with the correction of Miller and Madow. From {k} repeats "
-        "it is a rough estimate, and too small on average. Points with fewer than two answers that could "
+        f"repeats, of the most probable action, with the correction of Miller and Madow. From {k} "
+        "repeats "
+        "it is a rough estimate, and too small on average. Points with fewer than two answers that "
+        "could "
         "be read are left out.",
-    )  # fmt: skip
+    )
     if points := repeats.wavering(MOST_POINTS):
         yield Table(
             "Where most pairs of repeats disagree",
             ("decision point", "condition", "pairs that differ, %", "actions chosen"),
             [
                 (
-                    point.scene, point.condition, f"{100 * point.flips:.0f}",
+                    point.scene,
+                    point.condition,
+                    f"{100 * point.flips:.0f}",
                     ", ".join(f"{n} × {action}" for action, n in point.actions.items()),
                 )
                 for point in points
             ],
-            f"Over all repeats and channel seeds. harness report {repeats.runs[0].path.name}, typed in this "
+            f"Over all repeats and channel seeds. harness report {repeats.runs[0].path.name}, "
+            "typed in this "
             "folder, shows the prompts and answers.",
-        )  # fmt: skip
+        )
 
 
 def nats(e: Estimate) -> str:
@@ -355,7 +433,9 @@ def nats(e: Estimate) -> str:
 
 
 def headline(repeats: Repeats) -> list[str]:
-    """Say how often decisions flip, how much of success is chance, and what the ego states of it."""
+    """Say how often decisions flip, how much of success is chance,
+    and what the ego states of it.
+    """
     return [_flip_sentence(repeats), *_variance_sentence(repeats), *_entropy_sentence(repeats)]
 
 
@@ -366,7 +446,8 @@ def _flip_sentence(repeats: Repeats) -> str:
     flips, once = repeats.estimate(c, FLIPS), repeats.estimate(c, SUCCESS)
     everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
-        f"Asked again at temperature {m.settings.temperature:g}, {m.variant} decides differently in "
+        f"Asked again at temperature {m.settings.temperature:g}, {m.variant} decides differently "
+        "in "
         f"{shown(flips)} % of decisions under {c} (n = {flips.n} decision points). "
         f"{shown(once)} % of its episodes succeed, {shown(everywhere)} % in all {k} repeats and "
         f"{shown(anywhere)} % in at least one (n = {once.n} episodes)."
@@ -374,7 +455,11 @@ def _flip_sentence(repeats: Repeats) -> str:
 
 
 def _variance_sentence(repeats: Repeats) -> Iterator[str]:
-    shares = {c: e for c in repeats.conditions if not math.isnan((e := repeats.estimate(c, BETWEEN)).value)}
+    shares = {
+        c: e
+        for c in repeats.conditions
+        if not math.isnan((e := repeats.estimate(c, BETWEEN)).value)
+    }
     if shares:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
@@ -393,6 +478,7 @@ def _entropy_sentence(repeats: Repeats) -> Iterator[str]:
     elif more.high < 0:
         verdict = "less than its repeats show"
     yield (
-        f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: over repeats, the most probable "
+        f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: over repeats, the "
+        "most probable "
         f"action has {nats(sampled)} nats (difference {nats(more)}; n = {more.n} decision points)."
     )

@@ -1,4 +1,6 @@
-"""A finished run as a source: its answers are coordinated again, and no model is asked what the run has."""
+"""A finished run as a source: its answers are coordinated again,
+and no model is asked what the run has.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,9 +47,13 @@ from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
 SILENT = Progress()
 WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
-_GIVE_IT = "to ask it, give --model with its folder, .gguf file or hub id, or write a card models/NAME.toml"
+_GIVE_IT = (
+    "to ask it, give --model with its folder, .gguf file or hub id, or write a card "
+    "models/NAME.toml"
+)
 OWN = ("ego", "helper")  # roles that have one answer a vehicle
-MORE = "more-answers.jsonl"  # answers at decision points that the run did not come to, and its fusion calls
+# answers at decision points that the run did not come to, and its fusion calls
+MORE = "more-answers.jsonl"
 
 
 class ReplayedRun:
@@ -68,22 +74,27 @@ class ReplayedRun:
     same_episodes = True
 
     def __init__(
-        self, folder: Path, latency: str = "run", progress: Progress = SILENT, asks: bool = True,
-        dataset: Path | None = None, models: Sequence[Card] = (),
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        latency: str = "run",
+        progress: Progress = SILENT,
+        asks: bool = True,
+        dataset: Path | None = None,
+        models: Sequence[Card] = (),
+    ) -> None:
         """A run.
 
         Args:
             folder: its folder.
             latency: `run` for its own inference times, `paper` for the paper's.
-            progress: of questions that the model is asked; before the first to a language model it is told
-                how much is asked.
-            asks: whether its model is asked what the run has no answer to. Else a walk is left out that
-                comes to a decision point without an answer of the ego, and one that needs a helper whom the
-                run did not ask is refused.
+            progress: of questions that the model is asked;
+                before the first to a language model it is told how much is asked.
+            asks: whether its model is asked what the run has no answer to. Else a walk is left out
+                that comes to a decision point without an answer of the ego, and one that needs a
+                helper whom the run did not ask is refused.
             dataset: folder of its dataset; None where the run states.
-            models: cards that the user gave; a model of another name is asked only if the user has a card
-                file of it. What a run says of a model's place is never used.
+            models: cards that the user gave; a model of another name is asked only if the user has
+                a card file of it. What a run says of a model's place is never used.
         """
         if latency not in ("run", "paper"):
             raise unknown("--latency", latency, ("run", "paper"))
@@ -105,13 +116,19 @@ class ReplayedRun:
         self.left_out: set[str] = set()
         self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
-        missing = tally(self.run).missing  # a lost message is a part of the run; what it lacks is asked again
+        # a lost message is a part of the run; what it lacks is asked again
+        missing = tally(self.run).missing
         answers = {a.id: a for a in self.run.answers if a.error is None or a.role not in missing}
         times = PAPER if latency == "paper" else manifest.latency
         self._asker = Asker(
-            spec_of(self.run, FrozenSource(self.dataset)), self._open, times, folder / MORE, answers,
-            self._count_answered, self._set_left,
-        )  # fmt: skip
+            spec_of(self.run, FrozenSource(self.dataset)),
+            self._open,
+            times,
+            folder / MORE,
+            answers,
+            self._count_answered,
+            self._set_left,
+        )
 
     def _set_left(self, count: int) -> None:
         self._left = count
@@ -126,13 +143,22 @@ class ReplayedRun:
         if self._announced or not any(agent.can.language_model for agent in self.spec.agents):
             return
         self._announced = True
-        tokens = [answer.prompt_tokens for answer in self.run.answers if answer.prompt_tokens is not None]
-        size = f" (about {float(f'{self._left * np.mean(tokens):.2g}'):.0f} prompt tokens)" if tokens else ""
+        tokens = [
+            answer.prompt_tokens for answer in self.run.answers if answer.prompt_tokens is not None
+        ]
+        size = (
+            f" (about {float(f'{self._left * np.mean(tokens):.2g}'):.0f} prompt tokens)"
+            if tokens
+            else ""
+        )
         reached = self.run.decisions.scenes
-        lacks = len(reached) * self.vehicles - sum(answer.role in OWN for answer in self.run.answers)
+        lacks = len(reached) * self.vehicles - sum(
+            answer.role in OWN for answer in self.run.answers
+        )
         questions = "1 question" if self._left == 1 else f"{self._left} questions"
         unasked = (
-            f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} at most"
+            f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} "
+            "at most"
         )
         self._progress.say(
             f"{printable(self.name)} is asked {questions} now that the run did not ask{size}"
@@ -146,15 +172,18 @@ class ReplayedRun:
     def manifest(self) -> dict[str, Any]:
         """Return the run, the digest of its dataset, and where its times come from."""
         return {
-            "name": self.name, "run": str(self.run.path), "dataset_sha256": self.dataset.sha256,
+            "name": self.name,
+            "run": str(self.run.path),
+            "dataset_sha256": self.dataset.sha256,
             "latency": msgspec.to_builtins(self._asker.latency),
             "decision_points_without_answer": sorted(self.left_out),
-        }  # fmt: skip
+        }
 
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int], read: Read = metric_columns
     ) -> Iterator[Sequence[WalkResult]]:
-        """Walk all episodes, with the ego and so many of the nearest vehicles; `read` has their columns.
+        """Walk all episodes, with the ego and so many of the nearest vehicles;
+        `read` has their columns.
 
         Raises:
             UserError: a point has the run's model fuse, and it cannot.
@@ -195,7 +224,9 @@ class ReplayedRun:
         return taken
 
     def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
-        """Return joules that radios take to send the messages of each decision, (n,); NaN where unknown."""
+        """Return joules that radios take to send the messages of each decision, (n,);
+        NaN where unknown.
+        """
         profile = self.run.manifest.device_profile
         if profile is None:
             return np.full(heard.messages.shape, np.nan)
@@ -204,7 +235,9 @@ class ReplayedRun:
 
     @property
     def spec(self) -> Spec:
-        """The evaluation that made the run, with all that decides its answers; it has no conditions."""
+        """The evaluation that made the run, with all that decides its answers;
+        it has no conditions.
+        """
         return self._asker.spec
 
     @property
@@ -213,7 +246,9 @@ class ReplayedRun:
         return self._asker.answers
 
     def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
-        """Return all answers by request id, with these; what is not there is asked, and kept in the run."""
+        """Return all answers by request id, with these;
+        what is not there is asked, and kept in the run.
+        """
         with self._writing():
             self._asker.answer(requests)
         return self.answers
@@ -224,7 +259,8 @@ class ReplayedRun:
         counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
-            f"{name}: left out episodes that reach one of {n} decision points without a stored answer; "
+            f"{name}: left out episodes that reach one of {n} decision points without a stored "
+            "answer; "
             "without --no-model the model is asked there"
         )
         return tuple(filter(None, (lost, left_out if n else "")))
@@ -234,7 +270,9 @@ class ReplayedRun:
         self._asker.settle()
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
-        """Return what every vehicle intends. Where the run has no answer of an ego its model is asked."""
+        """Return what every vehicle intends.
+        Where the run has no answer of an ego its model is asked.
+        """
         with self._writing():
             return self._asker(scenes)
 
@@ -244,10 +282,16 @@ class ReplayedRun:
             return self._asker.whole(scenes)
 
     def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        """Return what vehicles intend where a helper is wanted; the model is asked what the run lacks."""
+        """Return what vehicles intend where a helper is wanted;
+        the model is asked what the run lacks.
+        """
         asked, places = wanted_in(scenes, wanted)
         if not self._asks and any(self._asker.lacks(asked, blind, places)):
-            lacks = "that are shown nothing, which messages=blind needs" if blind else "that it did not ask"
+            lacks = (
+                "that are shown nothing, which messages=blind needs"
+                if blind
+                else "that it did not ask"
+            )
             remedy = "" if blind else ", or make the run again with --ask all"
             raise UserError(
                 f"--no-model: {printable(self.run.path)} lacks answers of helpers {lacks}; "
@@ -257,25 +301,36 @@ class ReplayedRun:
             return self._asker.helpers(scenes, wanted, blind)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """Return what vehicles intend; unless the model is asked, walks without an answer are left out."""
+        """Return what vehicles intend; unless the model is asked,
+        walks without an answer are left out.
+        """
         lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
         if any(lacks):
             if self._asks:
                 return self(scenes)
-            self.left_out |= {scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking}
+            self.left_out |= {
+                scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking
+            }
             leave_out(np.array(lacks))
         return self._asker.laid_out(scenes)
 
     def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
-        """Return the same where helpers are shown nothing, as far as the run has answers or asks them all."""
+        """Return the same where helpers are shown nothing,
+        as far as the run has answers or asks them all.
+        """
         with self._writing():
             return self._asker.blind(scenes, at)
 
-    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
-        """Return the ego's answers to these sets of messages; what the run lacks is asked, and kept in it."""
+    def fusion_call(
+        self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Fuses:
+        """Return the ego's answers to these sets of messages;
+        what the run lacks is asked, and kept in it.
+        """
         if not self._asks:
             raise UserError(
-                f"--no-model: {printable(self.run.path)} may lack answers to other sets of messages, which "
+                f"--no-model: {printable(self.run.path)} may lack answers to other sets of "
+                "messages, which "
                 "a fusion call needs; leave it out"
             )
         with self._writing():
@@ -291,7 +346,9 @@ class ReplayedRun:
             with alone(self.run.path / f".{MORE}.lock"):
                 yield
         except BlockingIOError:
-            raise UserError(f"{printable(self.run.path)} is being written by another process; wait") from None
+            raise UserError(
+                f"{printable(self.run.path)} is being written by another process; wait"
+            ) from None
 
     def _open(self) -> Backend:
         """This process's backend, opened once: a forked process may not ask its parent's."""
@@ -311,7 +368,8 @@ class ReplayedRun:
         if not same_model(stored, now):
             changes = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
-                f"{shown}: the model is not what it was ({printable(', '.join(changes))}); run again"
+                f"{shown}: the model is not what it was ({printable(', '.join(changes))}); run "
+                "again"
             )
         return together(cards, models, default_file())
 
@@ -319,7 +377,9 @@ class ReplayedRun:
 class _Nearest:
     """A run's intents, of which only the nearest helpers' count."""
 
-    def __init__(self, stored: ReplayedRun, helpers: int, leave_out: Callable[[Bools], None]) -> None:
+    def __init__(
+        self, stored: ReplayedRun, helpers: int, leave_out: Callable[[Bools], None]
+    ) -> None:
         self._stored, self._helpers, self._leave_out = stored, helpers, leave_out
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
@@ -337,7 +397,9 @@ class _Nearest:
         range_m = np.where(near, intents.range_m, np.nan)
         return replace(intents, valid=intents.valid & near, range_m=range_m)
 
-    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+    def fusion_call(
+        self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
 
     def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:

@@ -1,8 +1,9 @@
-"""`harness study schedule compare`: schedules on stored answers, between asking nobody and the oracle.
+"""`harness study schedule compare`: schedules on stored answers,
+between asking nobody and the oracle.
 
-All schedules decide the same episodes with the same draws, so what they differ in is whom they ask, and when.
-A schedule's settings are its threshold and how many helpers it asks at most. Which setting is best is chosen
-on tune layouts, where a run on such is given, and reported on others.
+All schedules decide the same episodes with the same draws, so what they differ in is whom they ask,
+and when. A schedule's settings are its threshold and how many helpers it asks at most. Which
+setting is best is chosen on tune layouts, where a run on such is given, and reported on others.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
     from harness.studies.figures.points import Steps
 
 RESAMPLES = 2000
-SHARES = np.arange(0.0, 1.0, 0.1)  # of decision points that ask nobody, at the thresholds that are tried
+# of decision points that ask nobody, at the thresholds that are tried
+SHARES = np.arange(0.0, 1.0, 0.1)
 NEVER, ALWAYS, RANDOM = "never", "always", "random"
 
 
@@ -93,8 +95,12 @@ class Play:
 
     @property
     def means(self) -> dict[str, float]:
-        """Messages, milliseconds on air and joules of an episode, and milliseconds of a decision."""
-        means = dict(zip(COSTS, (self.costs.sum(axis=(0, 1)) / self.success.size).tolist(), strict=True))
+        """Messages, milliseconds on air and joules of an episode,
+        and milliseconds of a decision.
+        """
+        means = dict(
+            zip(COSTS, (self.costs.sum(axis=(0, 1)) / self.success.size).tolist(), strict=True)
+        )
         decisions = means.pop("decisions")
         return {**means, "latency_ms": means["latency_ms"] / decisions}
 
@@ -105,11 +111,15 @@ def plays(
     """Play candidates of one schedule; what asking is worth by it is worked out once."""
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
-    return [Play(c, *choices.played(rule), counting) for c, rule in zip(candidates, rules, strict=True)]
+    return [
+        Play(c, *choices.played(rule), counting) for c, rule in zip(candidates, rules, strict=True)
+    ]
 
 
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
-    """Return what to try of a schedule: tenths of what asking is worth, its own threshold, and 0."""
+    """Return what to try of a schedule:
+    tenths of what asking is worth, its own threshold, and 0.
+    """
     most = range(1, point.ask.max_helpers + 1)
     own = point.changed(schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
@@ -128,15 +138,16 @@ class Chosen:
     success: Estimate  # of episodes, as it counts
     plain: Estimate  # the same over all episodes alike
     over_paper: Estimate  # success less that of the paper's schedule
-    # of no such difference, by Holm's method for all schedules of the run; None without an interval, and for
-    # the paper's own and the oracle
+    # of no such difference, by Holm's method for all schedules of the run; None without an
+    # interval, and for the paper's own and the oracle
     p: float | None
     over_random: Estimate  # success less that of `random` with as many messages
     closed: Estimate  # share of the gap between the paper's schedule and the oracle that it closes
     messages: Estimate  # its messages as a share of the paper's
     # success averaged over budgets from no message to those of `always`, at the settings of `front`
     area: Estimate
-    area_j: Estimate  # the same over joules, from those of asking nobody; NaN where they are unknown
+    # the same over joules, from those of asking nobody; NaN where they are unknown
+    area_j: Estimate
 
 
 @dataclass(frozen=True)
@@ -153,7 +164,9 @@ class Compared:
 
     @property
     def paper(self) -> Play:
-        """The paper's schedule at the operating point's tau, with all the helpers that it allows."""
+        """The paper's schedule at the operating point's tau,
+        with all the helpers that it allows.
+        """
         return _at(self.plays[PAPER], self._untuned(PAPER))
 
     @property
@@ -177,15 +190,19 @@ class Compared:
         return self.counting.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
     def chosen(self, schedule: str) -> Play:
-        """Return the play with the most success on tune layouts within the budget; of equals the cheapest.
+        """Return the play with the most success on tune layouts within the budget;
+        of equals the cheapest.
 
-        Where none is within the budget, it is the cheapest. Without tune layouts it is the untuned one.
+        Where none is within the budget, it is the cheapest.
+        Without tune layouts it is the untuned one.
         """
         if not self.tune:
             return _at(self.plays[schedule], self._untuned(schedule))
         budget = self.budget * _at(self.tune[PAPER], self._untuned(PAPER)).messages.mean()
         cheapest = min(self.tune[schedule], key=lambda play: play.messages.mean())
-        within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [cheapest]
+        within = [play for play in self.tune[schedule] if play.messages.mean() <= budget] or [
+            cheapest
+        ]
         best = max(within, key=lambda play: (round(play.rate, 9), -play.messages.mean()))
         return _at(self.plays[schedule], best.candidate)
 
@@ -195,7 +212,8 @@ class Compared:
         return bool(np.isfinite(self.oracle.means["energy_j"]))
 
     def front(self, schedule: str, cost: str = "messages") -> list[Play]:
-        """Return what is taken as the budget grows: of the settings it allows, the best on tune layouts.
+        """Return what is taken as the budget grows:
+        of the settings it allows, the best on tune layouts.
 
         Without tune layouts the best on these, which flatters them. The first asks nobody.
         """
@@ -209,7 +227,9 @@ class Compared:
         return taken
 
     def _ranked(self, schedule: str) -> list[tuple[Play, float]]:
-        """A schedule's plays, and never asking, each with its success on tune layouts, else its own."""
+        """A schedule's plays, and never asking, each with its success on tune layouts,
+        else its own.
+        """
         every = [self.plays[NEVER][0], *(self.plays[schedule] if schedule != NEVER else ())]
         tuned = {play.candidate: play for of in self.tune.values() for play in of}
         return [(play, tuned.get(play.candidate, play).rate) for play in every]
@@ -225,7 +245,9 @@ class Compared:
         ]
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
-        """Return success averaged over budgets beyond never asking, with a bootstrap over episodes."""
+        """Return success averaged over budgets beyond never asking,
+        with a bootstrap over episodes.
+        """
         of_bound = [(play, play.rate) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
         success = self._successes([play for play, _ in ranked])
@@ -256,22 +278,30 @@ class Compared:
         """The paper's schedule, the chosen candidate of every one, and last the oracle."""
         plays = [self.paper, *map(self.chosen, self.names), self.oracle]
         raw = [self.counting.p_value(play.success, self.paper.success) for play in plays[1:-1]]
-        return [self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)]
+        return [
+            self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)
+        ]
 
     def _row(self, play: Play, p: float | None) -> Chosen:
         counting, success = self.counting, self._successes([play, self.paper, self.oracle])
         messages = self._resampled([play.messages, self.paper.messages])
         return Chosen(
-            play, counting.estimate(play.success), counting.plain.estimate(play.success),
-            counting.difference(play.success, self.paper.success), p,
+            play,
+            counting.estimate(play.success),
+            counting.plain.estimate(play.success),
+            counting.difference(play.success, self.paper.success),
+            p,
             counting.difference(play.success, self.random_like(play)),
             self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
-            self._interval(_ratio(messages[:, 0], messages[:, 1])), self.area(play.candidate.schedule),
+            self._interval(_ratio(messages[:, 0], messages[:, 1])),
+            self.area(play.candidate.schedule),
             self.area(play.candidate.schedule, "energy_j"),
-        )  # fmt: skip
+        )
 
     def random_like(self, play: Play) -> Floats:
-        """Return success of `random` with as many messages, (S, E): a mean of its two shares next to it."""
+        """Return success of `random` with as many messages, (S, E):
+        a mean of its two shares next to it.
+        """
         most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
         ladder = sorted(
@@ -285,14 +315,20 @@ class Compared:
 
 
 def compare(
-    stored: ReplayedRun, tune: ReplayedRun | None, point: OperatingPoint, names: Sequence[str],
-    seeds: Sequence[int], budget: float, counting: Mapping[ReplayedRun, Success],
+    stored: ReplayedRun,
+    tune: ReplayedRun | None,
+    point: OperatingPoint,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    budget: float,
+    counting: Mapping[ReplayedRun, Success],
     progress: Callable[[int], None],
-) -> Compared:  # fmt: skip
-    """Play every schedule on a run, and on one on tune layouts; `counting` is how success counts in each.
+) -> Compared:
+    """Play every schedule on a run, and on one on tune layouts;
+    `counting` is how success counts in each.
 
-    What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates are
-    chosen within `budget`, a share of the messages that the paper's schedule takes.
+    What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates
+    are chosen within `budget`, a share of the messages that the paper's schedule takes.
 
     Raises:
         UserError: no schedule can change anything at the point.
@@ -314,23 +350,39 @@ def compare(
 
 
 def run_schedules(
-    runs: Sequence[ReplayedRun], tune: Sequence[ReplayedRun], condition: str, names: Sequence[str],
-    seeds: Sequence[int], budget: float, out: Path, progress: Progress,
-) -> list[Compared]:  # fmt: skip
+    runs: Sequence[ReplayedRun],
+    tune: Sequence[ReplayedRun],
+    condition: str,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    budget: float,
+    out: Path,
+    progress: Progress,
+) -> list[Compared]:
     """Compare schedules on runs, each with its run on tune layouts, or with none.
 
     Raises:
-        UserError: as `compare` does, or the folder has another comparison, or a run is on other layouts.
+        UserError: as `compare` does, or the folder has another comparison,
+            or a run is on other layouts.
         Unanswered: too many questions got no answer; the runs keep all others.
     """
     every = [*runs, *tune]
     for run in tune:
         layouts(run, "tune", runs)
-    refuse_other(out, "schedule", {
-        "sources": [run.manifest() for run in every], "condition": condition, "schedules": list(names),
-        "budget": budget, "seeds": list(seeds),
-    })  # fmt: skip
-    progress.more(sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names))
+    refuse_other(
+        out,
+        "schedule",
+        {
+            "sources": [run.manifest() for run in every],
+            "condition": condition,
+            "schedules": list(names),
+            "budget": budget,
+            "seeds": list(seeds),
+        },
+    )
+    progress.more(
+        sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names)
+    )
     counting = counted(every)
     compared = [
         compare(run, tune_run, point_of([run], condition), names, seeds, budget, counting, progress)
@@ -342,7 +394,9 @@ def run_schedules(
 
 
 def _means(weights: Floats, values: Sequence[Floats]) -> Floats:
-    """Return means over seeds and, by weights (B, E), over episodes, of P values (S, E) each, (B, P)."""
+    """Return means over seeds and, by weights (B, E), over episodes,
+    of P values (S, E) each, (B, P).
+    """
     return np.asarray(weights @ np.array([each.mean(axis=0) for each in values]).T)
 
 
@@ -351,9 +405,11 @@ def _at(plays: Sequence[Play], candidate: Candidate) -> Play:
 
 
 def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Floats:
-    """Mean over budgets from 0 to `most`, (B,), of the success, (B, P), of the setting taken at each budget.
+    """Mean over budgets from 0 to `most`, (B,), of the success, (B, P),
+    of the setting taken at each budget.
 
-    At a budget that setting is taken which ranks highest, (P,), of those whose messages, (B, P), it allows.
+    At a budget that setting is taken which ranks highest, (P,), of those whose messages,
+    (B, P), it allows.
     """
     order = np.lexsort((np.broadcast_to(-ranks, messages.shape), messages), axis=1)
     costs = np.take_along_axis(messages, order, 1)
@@ -375,15 +431,30 @@ def _ratio(part: Floats, whole: Floats) -> Floats:
 SLACK = 1.1  # by which messages may exceed on these layouts what they were on tune layouts
 BUDGETS = {"messages": "messages per episode", "energy_j": "joules per episode"}
 HEADS = (
-    "schedule", "balanced %", "success %", "msgs", "J", "over paper's", "gap closed %", "p",
-    "over random, points", "messages, % of the paper's", "on air, ms", "latency, ms", "area, %",
+    "schedule",
+    "balanced %",
+    "success %",
+    "msgs",
+    "J",
+    "over paper's",
+    "gap closed %",
+    "p",
+    "over random, points",
+    "messages, % of the paper's",
+    "on air, ms",
+    "latency, ms",
+    "area, %",
     "area over joules, %",
-)  # fmt: skip
+)
 JOULES, IF_BALANCED = ("J", "area over joules, %"), ("balanced %",)
 
 
-def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]) -> Study:
-    """Declare the study of schedules on one or several runs; `runs` are these and those on tune layouts."""
+def schedule_study(
+    compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]
+) -> Study:
+    """Declare the study of schedules on one or several runs;
+    `runs` are these and those on tune layouts.
+    """
     first, data = compared[0], tables(compared)
     words = first.counting.words
     tuned = bool(first.tune)
@@ -391,57 +462,88 @@ def schedule_study(compared: Sequence[Compared], runs: Sequence[ReplayedRun], se
         f"Both were chosen for the most {words} on tune layouts, within "
         f"{100 * first.budget:.0f} % of the paper's messages there."
         if tuned
-        else "Both are the defaults of the condition and of the schedule; give a run on tune layouts to have "
+        else "Both are the defaults of the condition and of the schedule; give a run on tune "
+        "layouts to have "
         "them chosen."
     )
-    best = "that is best on tune layouts" if tuned else "that is best on these layouts, which flatters it"
+    best = (
+        "that is best on tune layouts"
+        if tuned
+        else "that is best on these layouts, which flatters it"
+    )
     return Study(
-        "schedule", "Whom the ego asks, and when",
+        "schedule",
+        "Whom the ego asks, and when",
         [sentence for run in compared for sentence in headline(run)],
         [
-            "Decisions are made again from stored answers with the same random draws, channel seeds "
-            f"{', '.join(map(str, seeds))}; n is {first.regret.n} episodes, differences are paired by "
+            "Decisions are made again from stored answers with the same random draws, channel "
+            "seeds "
+            f"{', '.join(map(str, seeds))}; n is {first.regret.n} episodes, differences are paired "
+            "by "
             "episode, and 95 % intervals are over episodes; those of shares and areas come from a "
             "bootstrap. The oracle knows how every course ends: it is a bound and no schedule.",
-            "After a schedule's name stand the most helpers that it asks, and the threshold above which "
+            "After a schedule's name stand the most helpers that it asks, and the threshold above "
+            "which "
             "it asks. "
-            + chosen + f" A line of the figure shows, of the settings within a budget, the one {best}.",
+            + chosen
+            + f" A line of the figure shows, of the settings within a budget, the one {best}.",
         ],
-        [_table(run) for run in compared], data,
+        [_table(run) for run in compared],
+        data,
         {
-            "sources": [run.manifest() for run in runs], "condition": first.point.name,
-            "schedules": first.names, "budget": first.budget, "seeds": list(seeds), "versions": versions(),
+            "sources": [run.manifest() for run in runs],
+            "condition": first.point.name,
+            "schedules": first.names,
+            "budget": first.budget,
+            "seeds": list(seeds),
+            "versions": versions(),
         },
-        data["schedules"], lambda: {"fronts": _fronts(compared)},
+        data["schedules"],
+        lambda: {"fronts": _fronts(compared)},
         [caveat for run in runs for caveat in run.caveats],
-    )  # fmt: skip
+    )
 
 
 def name_of(row: Chosen) -> str:
-    """Return a schedule with the setting chosen for it: at most so many helpers, above a threshold."""
+    """Return a schedule with the setting chosen for it:
+    at most so many helpers, above a threshold.
+    """
     return f"{row.play.candidate.schedule} {row.play.candidate}"
 
 
 def headline(compared: Compared) -> list[str]:
     """Say the paper's regret, and what the best schedule within half of its messages closes."""
-    regret, bound, words = compared.regret, compared.oracle.means["messages"], compared.counting.words
+    regret, bound, words = (
+        compared.regret,
+        compared.oracle.means["messages"],
+        compared.counting.words,
+    )
     sentences = [
-        f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points above that "
-        f"of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with {bound:.1f} "
+        f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points "
+        "above that "
+        f"of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with "
+        f"{bound:.1f} "
         f"instead of {compared.paper.means['messages']:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
         by_name = {name_of(row): row for row in within}
-        first, *close = compared.counting.most({name: row.play.success for name, row in by_name.items()})
+        first, *close = compared.counting.most(
+            {name: row.play.success for name, row in by_name.items()}
+        )
         best = by_name[first]
-        within_budget = f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
+        within_budget = (
+            f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
+        )
         sentences.append(
-            f"{within_budget}no schedule clearly has the most {words}: it is {shown(best.success)} %, and "
+            f"{within_budget}no schedule clearly has the most {words}: it is {shown(best.success)} "
+            "%, and "
             f"these cannot be told apart there: {some_of([first, *close])}."
             if close
-            else f"{within_budget}{first} has the most {words}, {shown(best.success)} %, a difference of "
-            f"{shown(best.over_paper)} points from the paper's schedule: it closes {shown(best.closed)} % "
+            else f"{within_budget}{first} has the most {words}, {shown(best.success)} %, a "
+            "difference of "
+            f"{shown(best.over_paper)} points from the paper's schedule: it closes "
+            f"{shown(best.closed)} % "
             f"of that gap with {shown(best.messages)} % of the messages."
         )
     return sentences
@@ -452,8 +554,10 @@ def _fronts(compared: Sequence[Compared]) -> "Figure":
 
     panels = [
         (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
-        for run in compared for cost in BUDGETS if cost == "messages" or run.energy
-    ]  # fmt: skip
+        for run in compared
+        for cost in BUDGETS
+        if cost == "messages" or run.energy
+    ]
     return fronts(panels, compared[0].counting.words)
 
 
@@ -467,9 +571,13 @@ def _steps(run: Compared, cost: str) -> "Iterator[Steps]":
 
     for n, name in enumerate(name for name in run.names if name != NEVER):
         yield steps(
-            name, run.front(name, cost), linestyle="-" if n < len(COLOURS) else ":", markersize=3,
-            color=COLOURS[n % len(COLOURS)], marker=MARKERS[n % len(MARKERS)],
-        )  # fmt: skip
+            name,
+            run.front(name, cost),
+            linestyle="-" if n < len(COLOURS) else ":",
+            markersize=3,
+            color=COLOURS[n % len(COLOURS)],
+            marker=MARKERS[n % len(MARKERS)],
+        )
     yield steps("oracle, a bound", run.oracle_front(), linestyle="--", color=INK)
     tau = f"entropy above {run.point.ask.tau_nats:g}"
     yield steps(tau, [run.paper], linestyle="", marker="*", color=INK, markersize=9)
@@ -487,26 +595,44 @@ def _table(run: Compared) -> Table:
             DASH if paper else shown(e) for e in (row.over_paper, row.closed, row.messages)
         )
         cells = (
-            name_of(row) + " (the paper's)" * paper, shown(row.success), shown(row.plain),
-            f"{means['messages']:.1f}", f"{means['energy_j']:.1f}", over, closed, p_cell(row.p),
-            shown(row.over_random), share, f"{means['airtime_ms']:.3f}", f"{means['latency_ms']:.1f}",
-            shown(row.area), shown(row.area_j),
-        )  # fmt: skip
+            name_of(row) + " (the paper's)" * paper,
+            shown(row.success),
+            shown(row.plain),
+            f"{means['messages']:.1f}",
+            f"{means['energy_j']:.1f}",
+            over,
+            closed,
+            p_cell(row.p),
+            shown(row.over_random),
+            share,
+            f"{means['airtime_ms']:.3f}",
+            f"{means['latency_ms']:.1f}",
+            shown(row.area),
+            shown(row.area_j),
+        )
         rows.append([cell for head, cell in zip(HEADS, cells, strict=True) if head in heads])
     return Table(
-        f"{run.name}, {run.point.name}", heads, rows,
-        "Messages, milliseconds on air and joules are per episode, latency is per decision. Over paper's: "
-        f"{words} less that of the paper's schedule, in points; over random: less that of the schedule "
+        f"{run.name}, {run.point.name}",
+        heads,
+        rows,
+        "Messages, milliseconds on air and joules are per episode, latency is per decision. Over "
+        "paper's: "
+        f"{words} less that of the paper's schedule, in points; over random: less that of the "
+        "schedule "
         "random with as many messages. Gap: from the paper's schedule to the oracle. Area: "
-        f"{words} averaged over budgets from no message to always asking all; over joules, from the joules "
-        "of asking nobody. p comes from the interval and is corrected by Holm's method for all schedules of "
+        f"{words} averaged over budgets from no message to always asking all; over joules, from "
+        "the joules "
+        "of asking nobody. p comes from the interval and is corrected by Holm's method for all "
+        "schedules of "
         "the table; bold: 0.05 or less. All settings are in settings.csv.",
         terminal=[n for n, head in enumerate(heads[: heads.index("p")]) if head != plain],
-    )  # fmt: skip
+    )
 
 
 def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
-    """Return `schedules`, each at the setting chosen for it, and `settings`, all that were played."""
+    """Return `schedules`, each at the setting chosen for it, and `settings`,
+    all that were played.
+    """
     import pandas as pd
 
     def ends(name: str, e: Estimate) -> dict[str, Any]:
@@ -519,22 +645,35 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
 
     schedules = [
         {
-            **place(run, row.play), "lead": run.counting.metric, **ends("success", row.plain),
+            **place(run, row.play),
+            "lead": run.counting.metric,
+            **ends("success", row.plain),
             **(ends("balanced_success", row.success) if run.counting.metric == BALANCED else {}),
-            "n": row.success.n, **row.play.means,
-            **ends("over_paper", row.over_paper), "p_holm": row.p, **ends("over_random", row.over_random),
-            **ends("gap_closed", row.closed), **ends("messages_share", row.messages),
-            **ends("area", row.area), **ends("area_j", row.area_j),
+            "n": row.success.n,
+            **row.play.means,
+            **ends("over_paper", row.over_paper),
+            "p_holm": row.p,
+            **ends("over_random", row.over_random),
+            **ends("gap_closed", row.closed),
+            **ends("messages_share", row.messages),
+            **ends("area", row.area),
+            **ends("area_j", row.area_j),
         }
-        for run in compared for row in run.rows
-    ]  # fmt: skip
+        for run in compared
+        for row in run.rows
+    ]
     settings = [
         {
-            **place(run, play), **_rates(play), **play.means, **_on_tune(run, play),
+            **place(run, play),
+            **_rates(play),
+            **play.means,
+            **_on_tune(run, play),
             "on_front": any(play is taken for taken in run.front(play.candidate.schedule)),
         }
-        for run in compared for plays in run.plays.values() for play in plays
-    ]  # fmt: skip
+        for run in compared
+        for plays in run.plays.values()
+        for play in plays
+    ]
     return {"schedules": pd.DataFrame(schedules), "settings": pd.DataFrame(settings)}
 
 

@@ -1,4 +1,6 @@
-"""A study: what was computed, in tables, figures and sentences, and one writer of its folder and page."""
+"""A study: what was computed, in tables, figures and sentences,
+and one writer of its folder and page.
+"""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,7 +40,8 @@ class Study:
     # how it was made: n, what the intervals are over, and what the outcome is conditional on
     about: Sequence[str]
     tables: Sequence[Table]  # for the page and the terminal
-    data: "Mapping[str, pd.DataFrame]"  # the tables that are written as CSV and JSON Lines, by file name
+    # the tables that are written as CSV and JSON Lines, by file name
+    data: "Mapping[str, pd.DataFrame]"
     manifest: Mapping[str, Any]  # what it was made of
     answer: Any  # what `--json` prints, a data frame or plain values
     # draws them by file name, where matplotlib is installed
@@ -78,17 +81,26 @@ def write_study(study: Study, out: Path) -> Path:
     for stem, table in study.data.items():
         write_table(table, out / stem)
     section = Section(
-        study.title, study.headline, study.about, study.tables, caveats=study.caveats, pictures=pictures,
+        study.title,
+        study.headline,
+        study.about,
+        study.tables,
+        caveats=study.caveats,
+        pictures=pictures,
         more=study.more,
-    )  # fmt: skip
+    )
     write_whole(out / "index.html", document([section]))
-    manifest = json.dumps({"format": f"swarmdrive-{study.kind}/1", **study.manifest}, allow_nan=False)
+    manifest = json.dumps(
+        {"format": f"swarmdrive-{study.kind}/1", **study.manifest}, allow_nan=False
+    )
     write_whole(out / f"{study.kind}.json", msgspec.json.format(manifest, indent=1) + "\n")
     return out / "index.html"
 
 
 def undrawn(study: Study) -> UserError | None:
-    """Return what keeps the figures of a study from being drawn: a package that is not installed."""
+    """Return what keeps the figures of a study from being drawn:
+    a package that is not installed.
+    """
     if study.figures is dict:
         return None
     try:
@@ -116,9 +128,13 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
     texts = table.select_dtypes(exclude=["number", "bool"])
     # Few texts are in many rows, so that one look at each is cheaper than `neutral` of every cell.
     risky = [
-        column for _, column in texts.items() if any(neutral(text) is not text for text in column.unique())
+        column
+        for _, column in texts.items()
+        if any(neutral(text) is not text for text in column.unique())
     ]
-    safe = table.assign(**{str(column.name): column.astype(object).map(neutral) for column in risky})
+    safe = table.assign(
+        **{str(column.name): column.astype(object).map(neutral) for column in risky}
+    )
     with replacing(path.with_name(f"{path.name}.csv")) as part:
         safe.to_csv(part, index=False, lineterminator="\n", compression=None)
     with replacing(path.with_name(f"{path.name}.jsonl")) as part:
@@ -130,15 +146,17 @@ def refuse_taken(out: Path, kind: str) -> None:
     for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
-                f"--out {printable(out)} holds something else, as its {name}.json says; name another folder"
+                f"--out {printable(out)} holds something else, as its {name}.json says; name "
+                "another folder"
             )
 
 
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
-    """Raise UserError if a folder has a run, another kind of study, or one of this kind made otherwise.
+    """Raise UserError if a folder has a run, another kind of study,
+    or one of this kind made otherwise.
 
-    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their latency. What
-    an older study does not state is not held against it.
+    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their
+    latency. What an older study does not state is not held against it.
     """
     refuse_taken(out, kind)
     try:
@@ -149,18 +167,25 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
         stated = None
     now = json.loads(json.dumps(manifest))
     theirs = {**now, **stated} if stated and isinstance(stated, dict) else {}  # else it is no study
-    if keys := [key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)]:
+    if keys := [
+        key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)
+    ]:
         raise UserError(
-            f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another folder with "
+            f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another "
+            "folder with "
             "--out, or delete it"
         )
 
 
 class Cells:
-    """Finished parts of a study in a file, a line each, so that the same command continues a killed one."""
+    """Finished parts of a study in a file, a line each,
+    so that the same command continues a killed one.
+    """
 
     def __init__(self, path: Path, depends_on: str) -> None:
-        """Read a file. Torn lines and those of another digest of all that decides a part do not count."""
+        """Read a file. Torn lines and those of another digest of all that decides a part do not
+        count.
+        """
         self._path, self._of = path, depends_on
         data = bytes_of(path, "rows") if path.is_file() else b""
         self._torn = bool(data) and not data.endswith(b"\n")
@@ -178,7 +203,9 @@ class Cells:
     def __contains__(self, key: Sequence[Any]) -> bool:
         return tuple(key) in self._cells
 
-    def part(self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    def part(
+        self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]
+    ) -> Mapping[str, Any]:
         """Return a part as it was kept, to the last bit, or else compute it and keep it.
 
         Its values are plain, or arrays of two axes.

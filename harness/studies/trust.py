@@ -1,7 +1,8 @@
-"""`harness study trust`: every consensus rule under every attack, and its cost while nobody attacks.
+"""`harness study trust`: every consensus rule under every attack,
+and its cost while nobody attacks.
 
-A run's stored answers are played again under each rule, attack and share of attackers. All cells have the
-same episodes, channel draws and attackers, so differences are paired by episode.
+A run's stored answers are played again under each rule, attack and share of attackers. All cells
+have the same episodes, channel draws and attackers, so differences are paired by episode.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,16 +59,21 @@ class Cell:
     share: float  # of the helpers that attack
     success: Floats  # (S, E)
     unsafe: Floats  # which episodes end unsafely, (S, E)
-    # mean -ln of the probability that the policy gives to safe actions, over decisions with one; NaN without
+    # mean -ln of the probability that the policy gives to safe actions, over decisions with one;
+    # NaN without
     nats: Floats  # (S, E)
-    # messages heard, by episode: attackers' that were suspected, and not; honest ones that were, and not
+    # messages heard, by episode: attackers' that were suspected, and not; honest ones that were,
+    # and not
     flagged: Floats | None  # (4, E); None of a rule that judges nobody
-    first: Sequence[int]  # messages until an attacker was suspected, by attacker, episode and seed; 0: never
+    # messages until an attacker was suspected, by attacker, episode and seed; 0: never
+    first: Sequence[int]
 
     def detection(self) -> dict[str, Estimate]:
-        """Return precision, recall, F1 and false alarms of messages; nothing if the rule judges nobody.
+        """Return precision, recall, F1 and false alarms of messages;
+        nothing if the rule judges nobody.
 
-        False alarms are the share of honest messages that were suspected. Intervals resample episodes.
+        False alarms are the share of honest messages that were suspected.
+        Intervals resample episodes.
         """
         if self.flagged is None:
             return {}
@@ -103,7 +109,9 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
     consensus, *settings = rule.split(":")
     pairs = dict(setting.partition("=")[::2] for setting in settings)
     if pairs.keys() - {"weight_cap"}:
-        raise UserError(f"--rules {printable(rule)}: a rule may have a weight_cap, such as {CAPPED}")
+        raise UserError(
+            f"--rules {printable(rule)}: a rule may have a weight_cap, such as {CAPPED}"
+        )
     more: dict[str, Any] = {key: setting_of(key, value) for key, value in pairs.items()}
     name = f"{point.name} · {rule}" + (f" · {text}" if text else "")
     return point.changed(name=name, consensus=consensus, attack=text, **more)
@@ -123,7 +131,9 @@ def names_of(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def shares_of(text: str) -> tuple[float, ...]:
-    """Return the shares above 0 of a list such as `0,1/3,2/3`; peace is always played. Raises UserError."""
+    """Return the shares above 0 of a list such as `0,1/3,2/3`; peace is always played.
+    Raises UserError.
+    """
     try:
         shares = [float(Fraction(part.strip())) for part in text.split(",")]
     except (ValueError, ZeroDivisionError):
@@ -131,7 +141,9 @@ def shares_of(text: str) -> tuple[float, ...]:
     if not all(0 <= share <= 1 for share in shares):
         raise UserError(f"--share {printable(text)}: give shares from 0 to 1, such as 0,1/3,2/3")
     if not any(shares):
-        raise UserError(f"--share {printable(text)}: nobody attacks; give a share above 0 as well: 0,1/3")
+        raise UserError(
+            f"--share {printable(text)}: nobody attacks; give a share above 0 as well: 0,1/3"
+        )
     return tuple(dict.fromkeys(share for share in shares if share))
 
 
@@ -186,7 +198,8 @@ class Bench:
     alone: Floats  # success of an ego that never asks, (S, E)
     counting: Success  # of all cells
     caveats: tuple[str, ...] = ()  # what the run lacks
-    unfused: str | None = None  # why no rule fuses here, where the only one is the linear pool in name
+    # why no rule fuses here, where the only one is the linear pool in name
+    unfused: str | None = None
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
@@ -212,22 +225,32 @@ class Bench:
         return self.counting.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
-        """Return what a rule costs while nobody attacks: its success less the linear pool's, paired."""
+        """Return what a rule costs while nobody attacks:
+        its success less the linear pool's, paired.
+        """
         return self.counting.difference(self.at(rule).success, self.at(BASE).success)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
-        """Return what an attack takes from a rule: success under it less success in peace, paired."""
+        """Return what an attack takes from a rule:
+        success under it less success in peace, paired.
+        """
         return self.counting.difference(self.at(rule, attack, share).success, self.at(rule).success)
 
     @cached_property
     def holm(self) -> Mapping[Key, float | None]:
-        """P of no difference to the linear pool under the same attack, by Holm's method over the grid."""
+        """P of no difference to the linear pool under the same attack,
+        by Holm's method over the grid.
+        """
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
         pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
-        return dict(zip(keys, corrected([self.counting.p_value(*pair) for pair in pairs]), strict=True))
+        return dict(
+            zip(keys, corrected([self.counting.p_value(*pair) for pair in pairs]), strict=True)
+        )
 
     def clear(self, *key: Any) -> bool:
-        """Return whether a rule differs from the linear pool under an attack by more than chance explains."""
+        """Return whether a rule differs from the linear pool under an attack by more than chance
+        explains.
+        """
         return (self.holm.get(key) or 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
@@ -245,17 +268,23 @@ class Bench:
 
 
 def run_bench(
-    run: ReplayedRun, condition: str, rules: Sequence[str], attacks: Sequence[str], shares: Sequence[float],
-    seeds: Sequence[int], out: Path, progress: Progress,
-) -> Bench:  # fmt: skip
+    run: ReplayedRun,
+    condition: str,
+    rules: Sequence[str],
+    attacks: Sequence[str],
+    shares: Sequence[float],
+    seeds: Sequence[int],
+    out: Path,
+    progress: Progress,
+) -> Bench:
     """Play every cell that the folder has not; it keeps them.
 
-    Without rules or attacks the usual ones are played, as far as the point allows them. The linear pool is
-    added to the rules. Attacks have no shares of their own, and `shares` are above 0.
+    Without rules or attacks the usual ones are played, as far as the point allows them. The linear
+    pool is added to the rules. Attacks have no shares of their own, and `shares` are above 0.
 
     Raises:
-        UserError: the point has no channel, or asks nobody, or its rule is a fusion call, or none of the
-            rules changes anything; or the folder has another such study.
+        UserError: the point has no channel, or asks nobody, or its rule is a fusion call, or none
+            of the rules changes anything; or the folder has another such study.
     """
     point = point_of([run], condition)
     if why := point.idle("attack"):
@@ -263,8 +292,10 @@ def run_bench(
     if point.guard.attack or EGO_PROMPT in rules:
         asked_again = f"{condition}{',' if ':' in condition else ':'}consensus={EGO_PROMPT}"
         raise UserError(
-            "harness study trust: give a condition without attack, and rules that are arithmetic; a fusion "
-            f"call is attacked by `harness eval --condition {printable(asked_again)} --attack injection`"
+            "harness study trust: give a condition without attack, and rules that are arithmetic; "
+            "a fusion "
+            f"call is attacked by `harness eval --condition {printable(asked_again)} --attack "
+            "injection`"
         )
     attacks = attacks or [str(name) for name in usual_at(AXES["attack"], point) if name != NONE]
     if not attacks:
@@ -273,24 +304,43 @@ def run_bench(
         )
     unfused = point.idle("consensus")
     if unfused and set(rules) - {BASE}:
-        raise UserError(f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out")
+        raise UserError(
+            f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out"
+        )
     usual = [rule for rule in RULES if not reads_plans(rule)]
     every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*usual, CAPPED)))])
-    every: list[Key] = list(dict.fromkeys([
-        *((rule, PEACE, 0.0) for rule in every_rule),
-        *((BASE, EXCLUDED, share) for share in shares),
-        *product(every_rule, attacks, shares),
-    ]))  # fmt: skip
+    every: list[Key] = list(
+        dict.fromkeys(
+            [
+                *((rule, PEACE, 0.0) for rule in every_rule),
+                *((BASE, EXCLUDED, share) for share in shares),
+                *product(every_rule, attacks, shares),
+            ]
+        )
+    )
     for key in every:
         under(point, *key)  # which checks that they go together
-    refuse_other(out, "trust", {
-        "sources": [{"name": run.name}], "dataset": run.run.source, "condition": condition,
-        "seeds": list(seeds), "rules": list(every_rule), "attacks": list(attacks), "shares": list(shares),
-    })  # fmt: skip
+    refuse_other(
+        out,
+        "trust",
+        {
+            "sources": [{"name": run.name}],
+            "dataset": run.run.source,
+            "condition": condition,
+            "seeds": list(seeds),
+            "rules": list(every_rule),
+            "attacks": list(attacks),
+            "shares": list(shares),
+        },
+    )
     depends_on = [
-        run.manifest(), str(run.run.manifest.identity), point.record(), list(seeds),
-        point.radio.profile and CHANNELS.record(point.radio.profile), versions(),
-    ]  # fmt: skip
+        run.manifest(),
+        str(run.run.manifest.identity),
+        point.record(),
+        list(seeds),
+        point.radio.profile and CHANNELS.record(point.radio.profile),
+        versions(),
+    ]
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 
     missing = [key for key in every if key not in kept]
@@ -306,53 +356,84 @@ def run_bench(
     for key in every:
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
-    [[alone]] = run.walked([Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds)
+    [[alone]] = run.walked(
+        [Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds
+    )
     run.settle()
     return Bench(
-        run.name, run.run.source, condition, tuple(seeds), cells, alone.ends[SUCCESS],
-        Success(run.dataset.dangerous), run.caveats, unfused,
-    )  # fmt: skip
+        run.name,
+        run.run.source,
+        condition,
+        tuple(seeds),
+        cells,
+        alone.ends[SUCCESS],
+        Success(run.dataset.dangerous),
+        run.caveats,
+        unfused,
+    )
 
 
 def trust_study(bench: Bench) -> Study:
-    """Declare the study of a bench: a heat map, tables of rules and of success a share, and of detection."""
+    """Declare the study of a bench: a heat map, tables of rules and of success a share,
+    and of detection.
+    """
     import pandas as pd
 
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
     cells = [
-        {"rule": c.rule, "attack": c.attack or None, "share": c.share,
-         "success": as_mapping(over_episodes(SUCCESS, c.success)),
-         bench.counting.metric: as_mapping(bench.counting.estimate(c.success)),
-         "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None}
+        {
+            "rule": c.rule,
+            "attack": c.attack or None,
+            "share": c.share,
+            "success": as_mapping(over_episodes(SUCCESS, c.success)),
+            bench.counting.metric: as_mapping(bench.counting.estimate(c.success)),
+            "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None,
+        }
         for c in bench.cells.values()
-    ]  # fmt: skip
+    ]
     means = [
         {"rule": rule, "share": share, **as_mapping(bench.mean(rule, share))}
-        for share in bench.shares for rule in bench.rules
-    ]  # fmt: skip
+        for share in bench.shares
+        for rule in bench.rules
+    ]
     n = bench.price(BASE).n
     return Study(
-        "trust", f"Consensus rules under attack: {bench.name} on {bench.source}", headline(bench),
+        "trust",
+        f"Consensus rules under attack: {bench.name} on {bench.source}",
+        headline(bench),
         [
             f"n = {crossed(n, len(bench.seeds))} under {bench.condition}. All cells have "
-            "the same episodes, channel draws and attackers, so differences are paired by episode; 95 % "
+            "the same episodes, channel draws and attackers, so differences are paired by episode; "
+            "95 % "
             "intervals are over episodes. Price in peace: the difference in "
-            f"{bench.counting.words} from linear while nobody attacks, in points. All figures are in "
+            f"{bench.counting.words} from linear while nobody attacks, in points. All figures are "
+            "in "
             "figures.csv."
         ],
-        [table for share in bench.shares for table in _tables(bench, share)] + [*_detections(bench)],
+        [table for share in bench.shares for table in _tables(bench, share)]
+        + [*_detections(bench)],
         {"figures": pd.DataFrame(rows)},
         {
-            "sources": [{"name": bench.name}], "dataset": bench.source, "condition": bench.condition,
-            "seeds": list(bench.seeds), "rules": list(bench.rules), "attacks": list(bench.attacks),
-            "shares": list(bench.shares), "versions": versions(),
+            "sources": [{"name": bench.name}],
+            "dataset": bench.source,
+            "condition": bench.condition,
+            "seeds": list(bench.seeds),
+            "rules": list(bench.rules),
+            "attacks": list(bench.attacks),
+            "shares": list(bench.shares),
+            "versions": versions(),
         },
         {
-            "run": bench.name, "dataset": bench.source, "condition": bench.condition, "cells": cells,
-            "alone": as_mapping(bench.counting.estimate(bench.alone)), "means": means,
+            "run": bench.name,
+            "dataset": bench.source,
+            "condition": bench.condition,
+            "cells": cells,
+            "alone": as_mapping(bench.counting.estimate(bench.alone)),
+            "means": means,
         },
-        lambda: {"heat-map": _heat_map(bench)}, bench.caveats,
-    )  # fmt: skip
+        lambda: {"heat-map": _heat_map(bench)},
+        bench.caveats,
+    )
 
 
 def _heat_map(bench: Bench) -> "Figure":
@@ -360,30 +441,40 @@ def _heat_map(bench: Bench) -> "Figure":
     from harness.studies.figures.heat_map import heat_map
 
     panels = {
-        _title(share): np.array([
-            [100 * bench.success(rule, attack, share * bool(attack)).value for rule in bench.rules]
-            for attack in (PEACE, *bench.attacks)
-        ])
+        _title(share): np.array(
+            [
+                [
+                    100 * bench.success(rule, attack, share * bool(attack)).value
+                    for rule in bench.rules
+                ]
+                for attack in (PEACE, *bench.attacks)
+            ]
+        )
         for share in bench.shares
-    }  # fmt: skip
+    }
     return heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)
 
 
 def headline(bench: Bench) -> list[str]:
-    """Say what asking is worth in peace, what the worst attack takes from linear, and who withstands it."""
+    """Say what asking is worth in peace, what the worst attack takes from linear,
+    and who withstands it.
+    """
     share, peace = bench.shares[0], bench.success(BASE)
     alone, worst = bench.counting.estimate(bench.alone), bench.worst(BASE, share)
     words = bench.counting.words
     if bench.unfused:
         return [
-            f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego that never "
+            f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego "
+            "that never "
             "asks.",
             f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: "
-            f"{words} is {shown(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
+            f"{words} is {shown(bench.success(BASE, worst, share))} %. No rule fuses anything, "
+            "since "
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
     sentences = [
-        f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and {shown(alone)} % with "
+        f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and "
+        f"{shown(alone)} % with "
         "an ego that never asks.",
         f"If {100 * share:.0f} % of the helpers attack, {_worst(bench, share)}",
         f"On average over all {len(bench.attacks)} attacks, {_best(bench, share)}",
@@ -396,7 +487,8 @@ def headline(bench: Bench) -> list[str]:
             and 100 * bench.loss(rule, "liar+spoof", share).value >= -LOSES
         ]
         sentences.append(
-            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost {COSTS:g} "
+            f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost "
+            f"{COSTS:g} "
             f"point or less in peace: {', '.join(robust) or 'none'}."
         )
     return sentences
@@ -410,20 +502,27 @@ def _worst(bench: Bench, share: float) -> str:
     if not close:
         return f"{worst} harms the linear pool most: {left}."
     return (
-        f"no attack clearly harms the linear pool most: {left} at the least, and these attacks cannot be "
+        f"no attack clearly harms the linear pool most: {left} at the least, and these attacks "
+        "cannot be "
         f"told apart there: {some_of([worst, *close])}."
     )
 
 
 def _best(bench: Bench, share: float) -> str:
     """Say which rule has the most over all attacks, or that none clearly does."""
-    best, *close = bench.counting.most({rule: bench.over_attacks(rule, share) for rule in bench.rules})
+    best, *close = bench.counting.most(
+        {rule: bench.over_attacks(rule, share) for rule in bench.rules}
+    )
     most, linear = (shown(bench.mean(rule, share)) for rule in (best, BASE))
     if not close:
         price = _price(bench, best)
-        return f"{best} has the most, {most} % (linear: {linear}); its price in peace, in points: {price}."
+        return (
+            f"{best} has the most, {most} % (linear: {linear}); its price in peace, in points: "
+            f"{price}."
+        )
     return (
-        f"no rule clearly has the most: it is {most} % (linear: {linear}), and these rules cannot be told "
+        f"no rule clearly has the most: it is {most} % (linear: {linear}), and these rules cannot "
+        "be told "
         f"apart there: {some_of([best, *close])}."
     )
 
@@ -439,27 +538,37 @@ def _title(share: float) -> str:
 def _tables(bench: Bench, share: float) -> Iterator[Table]:
     rows: list[Sequence[str]] = [
         (
-            rule, _price(bench, rule), shown(bench.mean(rule, share)), attack := bench.worst(rule, share),
+            rule,
+            _price(bench, rule),
+            shown(bench.mean(rule, share)),
+            attack := bench.worst(rule, share),
             shown(bench.success(rule, attack, share)),
         )
         for rule in bench.rules
-    ]  # fmt: skip
+    ]
     heads = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
     yield Table(_title(share), heads, rows, terminal=range(len(heads)))
     rows = [("nobody attacks", *(shown(bench.success(rule)) for rule in bench.rules))]
     rows += [
-        (attack, *(
-            strong(shown(bench.success(rule, attack, share)), bench.clear(rule, attack, share))
-            for rule in bench.rules
-        ))
+        (
+            attack,
+            *(
+                strong(shown(bench.success(rule, attack, share)), bench.clear(rule, attack, share))
+                for rule in bench.rules
+            ),
+        )
         for attack in bench.attacks
-    ]  # fmt: skip
+    ]
     yield Table(
-        f"{_title(share)}: {bench.counting.words}, %", ("attack", *bench.rules), rows,
-        "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 after Holm's "
-        "correction over the grid. For comparison, a linear pool that knows the attackers and does not hear "
+        f"{_title(share)}: {bench.counting.words}, %",
+        ("attack", *bench.rules),
+        rows,
+        "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 "
+        "after Holm's "
+        "correction over the grid. For comparison, a linear pool that knows the attackers and does "
+        "not hear "
         f"them succeeds in {shown(bench.success(BASE, EXCLUDED, share))} %.",
-    )  # fmt: skip
+    )
 
 
 def _detections(bench: Bench) -> Iterator[Table]:
@@ -467,19 +576,33 @@ def _detections(bench: Bench) -> Iterator[Table]:
     for rule in bench.rules:
         rows = [
             (
-                c.attack or "nobody attacks", f"{c.share:.2f}", *map(shown, c.detection().values()),
-                "–" if not c.caught else f"{c.time_to_detection:.0f}", f"{len(c.caught)} of {len(c.first)}",
+                c.attack or "nobody attacks",
+                f"{c.share:.2f}",
+                *map(shown, c.detection().values()),
+                "–" if not c.caught else f"{c.time_to_detection:.0f}",
+                f"{len(c.caught)} of {len(c.first)}",
             )
-            for c in bench.cells.values() if c.rule == rule and c.flagged is not None
-        ]  # fmt: skip
+            for c in bench.cells.values()
+            if c.rule == rule and c.flagged is not None
+        ]
         if rows:
             yield Table(
                 f"How well {rule} finds attackers",
-                ("attack", "share", "precision %", "recall %", "F1 %", "false alarms %",
-                 "messages until an attacker is found, median", "attackers found"), rows,
-                "Counted over messages that were heard. An attack that leaves a message unchanged cannot be "
+                (
+                    "attack",
+                    "share",
+                    "precision %",
+                    "recall %",
+                    "F1 %",
+                    "false alarms %",
+                    "messages until an attacker is found, median",
+                    "attackers found",
+                ),
+                rows,
+                "Counted over messages that were heard. An attack that leaves a message unchanged "
+                "cannot be "
                 "found in it. The rule's parameters were chosen on tune layouts.",
-            )  # fmt: skip
+            )
 
 
 def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:

@@ -1,8 +1,8 @@
 """Light and weather, and how they limit a camera. Other sensors are as by day.
 
-Contrast falls with distance as exp(-d / `fades_m`) (Koschmieder 1924). Meteorological visibility, the
-distance at which 5 % of the contrast are left, is three times `fades_m`. The figures are declared for this
-harness.
+Contrast falls with distance as exp(-d / `fades_m`) (Koschmieder 1924). Meteorological visibility,
+the distance at which 5 % of the contrast are left, is three times `fades_m`. The figures are
+declared for this harness.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,15 @@ class Ambient:
     light: float = 1.0  # brightness of what the sky lights, 1 by day; lamps keep their brightness
     haze: Colour = (205, 217, 228)  # colour to which everything fades
     sky: Colour = (134, 178, 222)  # colour overhead
-    glare_rad: float = 0.0  # angle around a low sun within which a camera tells nothing; 0 without a low sun
+    # angle around a low sun within which a camera tells nothing; 0 without a low sun
+    glare_rad: float = 0.0
 
 
 DAY = "day"
 AMBIENTS = {
     DAY: Ambient(60.0, 260.0),
-    "night": Ambient(40.0, 35.0, light=0.45, haze=(16, 18, 26), sky=(6, 8, 18)),  # in its own headlamps
+    # in its own headlamps
+    "night": Ambient(40.0, 35.0, light=0.45, haze=(16, 18, 26), sky=(6, 8, 18)),
     "rain": Ambient(45.0, 90.0, light=0.75, haze=(150, 156, 162), sky=(128, 134, 142)),
     "fog": Ambient(30.0, 25.0, light=0.9, haze=(196, 200, 204), sky=(186, 190, 194)),
     "glare": Ambient(60.0, 260.0, glare_rad=radians(15.0)),

@@ -1,28 +1,31 @@
 """Beacons: how vehicles know of each other before anybody asks.
 
 The ego and the helpers broadcast their position, as with a CAM or a BSM; they hear each other. With
-`radio_share` so does other traffic, the danger among it: the ego and all helpers hear it. A receiver knows a
-sender from the last beacon that it received, and extrapolates from there at constant speed along the heading,
-as real receivers do. The settings are the scenario's (`Parameters`):
+`radio_share` so does other traffic, the danger among it: the ego and all helpers hear it. A
+receiver knows a sender from the last beacon that it received, and extrapolates from there at
+constant speed along the heading, as real receivers do. The settings are the scenario's
+(`Parameters`):
 
-    rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second, finds the
-              vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last CAM says; or that
-              one older than 1 s or, for three CAMs on end, than the last interval of one that moved. Each
-              vehicle begins at a time of its own.
-    delay     20 ms until all receivers have it, a frame: NR Mode 2 waits 17.5 ms for a slot on average.
-    loss      8 %, the paper's V2X profile. That losses are independent is assumed: a shadowed link loses
-              many beacons in a row. With `beacon_channel` a beacon of 190 bytes (3GPP TR 36.885) is lost as
-              on that radio's link: by where both are when it is sent, what stands between them, and shadowing
-              that belongs to the layout, and not to a run's seed.
-    noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT (arXiv 2203.10638). That a
-              speed has 0.1 m/s, and that errors are new in each beacon, is assumed. They are the sender's,
-              so all receivers read the same, rounded to 1 cm, 1 cm/s and 1 mrad.
-    content   pose, speed and class, and the ego's target speed, which no CAM has: that is assumed. A CAM may
-              have a turn indicator (EN 302 637-2, 7.1: in its low-frequency part); none is sent here.
+    rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second,
+              finds the vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last
+              CAM says; or that one older than 1 s or, for three CAMs on end, than the last interval
+              of one that moved. Each vehicle begins at a time of its own. delay     20 ms until all
+              receivers have it, a frame: NR Mode 2 waits 17.5 ms for a slot on average. loss      8
+              %, the paper's V2X profile. That losses are independent is assumed: a shadowed link
+              loses many beacons in a row. With `beacon_channel` a beacon of 190 bytes (3GPP TR
+              36.885) is lost as on that radio's link: by where both are when it is sent, what
+              stands between them, and shadowing that belongs to the layout, and not to a run's
+              seed. noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT
+              (arXiv 2203.10638). That a speed has 0.1 m/s, and that errors are new in each beacon,
+              is assumed. They are the sender's, so all receivers read the same, rounded to 1 cm, 1
+              cm/s and 1 mrad. content   pose, speed and class, and the ego's target speed, which no
+              CAM has: that is assumed. A CAM may have a turn indicator (EN 302 637-2, 7.1: in its
+              low-frequency part); none is sent here.
 
-Before the start of an episode, its vehicles have driven at constant speed, and the first beacon, up to LEAD_S
-before the start, is received by everybody. Draws are keyed by layout seed, sender, receiver and number of the
-beacon, so no condition, no seed of the channel and no order of asking changes what anybody knows.
+Before the start of an episode, its vehicles have driven at constant speed, and the first beacon, up
+to LEAD_S before the start, is received by everybody. Draws are keyed by layout seed, sender,
+receiver and number of the beacon, so no condition, no seed of the channel and no order of asking
+changes what anybody knows.
 """
 
 import math
@@ -42,20 +45,27 @@ from harness.world.state import Beacon, VehicleState, WorldState
 
 LEAD_S = 1.0
 BITS = 8 * 190
-SHORTEST_S, LONGEST_S, UNMOVED = 0.1, 1.0, 3  # T_GenCam_DCC, T_GenCamMax and N_GenCam of EN 302 637-2
+# T_GenCam_DCC, T_GenCamMax and N_GenCam of EN 302 637-2
+SHORTEST_S, LONGEST_S, UNMOVED = 0.1, 1.0, 3
 TURN_RAD, MOVE_M, CHANGE_MPS = math.radians(4), 4.0, 0.5
 NO_SEED = -1  # in place of the channel's seed, since beacons belong to the layout
 ROUNDING_S = 1e-9
 
 
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
-    """Return the newest beacon of the sender that the receiver has; None if it knows the truth instead."""
+    """Return the newest beacon of the sender that the receiver has;
+    None if it knows the truth instead.
+    """
     heard = [b for b in state.beacons if b.sender == sender and receiver in b.heard_by]
-    return max((b for b in heard if _is_there(b, state.time_s)), key=lambda b: b.time_s, default=None)
+    return max(
+        (b for b in heard if _is_there(b, state.time_s)), key=lambda b: b.time_s, default=None
+    )
 
 
 def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
-    """Return the sender's state as the receiver estimates it; the truth for itself or perfect knowledge."""
+    """Return the sender's state as the receiver estimates it;
+    the truth for itself or perfect knowledge.
+    """
     return estimated(state.vehicle(sender), last_heard(state, sender, receiver), state.time_s)
 
 
@@ -74,7 +84,9 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 
 
 def lead_in(p: Parameters, poses: Floats) -> Floats:
-    """Extrapolate the poses at the start, (V, 4), back to the first beacon at constant speed, (F, V, 4)."""
+    """Extrapolate the poses at the start, (V, 4),
+    back to the first beacon at constant speed, (F, V, 4).
+    """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz
     course = [x + speed * np.cos(heading) * time_s, y + speed * np.sin(heading) * time_s]
@@ -82,40 +94,68 @@ def lead_in(p: Parameters, poses: Floats) -> Floats:
 
 
 def broadcast(
-    p: Parameters, seed: int, before: Sequence[Beacon], radios: Sequence[str], target_mps: float,
-    poses: Floats, first_frame: int, loss: Callable[[int], Floats],
-) -> tuple[Beacon, ...]:  # fmt: skip
-    """Return the beacons that matter after some more frames: the last ones received, and those under way.
+    p: Parameters,
+    seed: int,
+    before: Sequence[Beacon],
+    radios: Sequence[str],
+    target_mps: float,
+    poses: Floats,
+    first_frame: int,
+    loss: Callable[[int], Floats],
+) -> tuple[Beacon, ...]:
+    """Return the beacons that matter after some more frames:
+    the last ones received, and those under way.
 
-    The ego is the first of the `radios`; it and a helper hear each other. `poses` are x, y, heading and speed
-    of each in each frame, (F, V, 4), from `first_frame` on; 0 is the start. `loss` gives for one of these
-    frames, counted from 0, the probability that a beacon is lost on the link to each helper, `(H,)`.
+    The ego is the first of the `radios`; it and a helper hear each other. `poses` are x, y, heading
+    and speed of each in each frame, (F, V, 4), from `first_frame` on; 0 is the start. `loss` gives
+    for one of these frames, counted from 0, the probability that a beacon is lost on the link to
+    each helper, `(H,)`.
     """
     kept: list[Beacon] = []
     for place, sender in enumerate(radios):
         receivers = tuple(radios[:1] if place else radios[1:])
         target = None if place else target_mps
         links = slice(place - 1, place) if place else slice(None)
-        kept += _after(p, seed, before, sender, receivers, target, poses[:, place], first_frame, loss, links)
+        kept += _after(
+            p, seed, before, sender, receivers, target, poses[:, place], first_frame, loss, links
+        )
     return tuple(kept)
 
 
 def announced(
-    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: Sequence[str],
-    target_mps: float | None, poses: Floats, first_frame: int, loss: Callable[[int], Floats],
-) -> tuple[Beacon, ...]:  # fmt: skip
-    """Return the beacons that matter of a sender whom all receivers hear, with poses (F, 4): see `broadcast`.
+    p: Parameters,
+    seed: int,
+    before: Sequence[Beacon],
+    sender: str,
+    receivers: Sequence[str],
+    target_mps: float | None,
+    poses: Floats,
+    first_frame: int,
+    loss: Callable[[int], Floats],
+) -> tuple[Beacon, ...]:
+    """Return the beacons that matter of a sender whom all receivers hear,
+    with poses (F, 4): see `broadcast`.
 
     `loss` gives the probability that a beacon is lost on the link to each receiver.
     """
     every, heard_by = slice(None), tuple(receivers)
-    return tuple(_after(p, seed, before, sender, heard_by, target_mps, poses, first_frame, loss, every))
+    return tuple(
+        _after(p, seed, before, sender, heard_by, target_mps, poses, first_frame, loss, every)
+    )
 
 
 def _after(
-    p: Parameters, seed: int, before: Sequence[Beacon], sender: str, receivers: tuple[str, ...],
-    target_mps: float | None, poses: Floats, first_frame: int, loss: Callable[[int], Floats], links: slice,
-) -> Sequence[Beacon]:  # fmt: skip
+    p: Parameters,
+    seed: int,
+    before: Sequence[Beacon],
+    sender: str,
+    receivers: tuple[str, ...],
+    target_mps: float | None,
+    poses: Floats,
+    first_frame: int,
+    loss: Callable[[int], Floats],
+    links: slice,
+) -> Sequence[Beacon]:
     """Return the beacons of one sender that matter after some frames, by time."""
     if p.perfect_knowledge:
         return ()
@@ -128,13 +168,19 @@ def _after(
     return _that_matter(newest_first, {*receivers}, time_s)[::-1]
 
 
-def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: float) -> list[Beacon]:
-    """Keep a sender's beacons under way, the last that each receiver has, and under `cam` the last sent."""
+def _that_matter(
+    newest_first: Iterable[Beacon], receivers: set[str], time_s: float
+) -> list[Beacon]:
+    """Keep a sender's beacons under way, the last that each receiver has,
+    and under `cam` the last sent.
+    """
     kept = list[Beacon]()
     for beacon in newest_first:
         if not receivers:
             break
-        if not receivers.isdisjoint(beacon.heard_by) or (beacon.interval_s is not None and not kept):
+        if not receivers.isdisjoint(beacon.heard_by) or (
+            beacon.interval_s is not None and not kept
+        ):
             kept.append(beacon)
         if _is_there(beacon, time_s):
             receivers = receivers.difference(beacon.heard_by)
@@ -142,9 +188,17 @@ def _that_matter(newest_first: Iterable[Beacon], receivers: set[str], time_s: fl
 
 
 def _sent(
-    p: Parameters, seed: int, sender: str, receivers: tuple[str, ...], target_mps: float | None,
-    poses: Floats, first_frame: int, before: Sequence[Beacon], loss: Callable[[int], Floats], links: slice,
-) -> Iterator[Beacon]:  # fmt: skip
+    p: Parameters,
+    seed: int,
+    sender: str,
+    receivers: tuple[str, ...],
+    target_mps: float | None,
+    poses: Floats,
+    first_frame: int,
+    before: Sequence[Beacon],
+    loss: Callable[[int], Floats],
+    links: slice,
+) -> Iterator[Beacon]:
     """Yield the beacons of one vehicle with poses (F, 4) in these frames, the last first.
 
     `links` selects the values of `loss` for its receivers.
@@ -184,7 +238,9 @@ def _sent(
 
 
 def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
-    """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2, 6.1.3)."""
+    """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2,
+    6.1.3).
+    """
     if last is None or last.interval_s is None:
         return replace(beacon, interval_s=LONGEST_S, unmoved=0)
     age_s = beacon.time_s - last.time_s + ROUNDING_S
@@ -215,10 +271,11 @@ def _lead_frames(p: Parameters) -> int:
 def losses(
     p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
 ) -> Callable[[int], Floats]:
-    """Return a function that gives, for a frame, the probability to lose a beacon on each link, `(H,)`.
+    """Return a function that gives, for a frame,
+    the probability to lose a beacon on each link, `(H,)`.
 
-    `world` returns the state; a link is from the first of the `radios` to each other; `poses` are x, y,
-    heading and speed of all vehicles in each frame, (F, V, 4).
+    `world` returns the state; a link is from the first of the `radios` to each other; `poses` are
+    x, y, heading and speed of all vehicles in each frame, (F, V, 4).
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:
@@ -232,16 +289,24 @@ def losses(
     @cache
     def at(frame: int) -> Floats:
         there = zip(state.vehicles, poses[frame].tolist(), strict=True)
-        vehicles = tuple(replace(v, x_m=x, y_m=y, heading_rad=heading) for v, (x, y, heading, _) in there)
+        vehicles = tuple(
+            replace(v, x_m=x, y_m=y, heading_rad=heading) for v, (x, y, heading, _) in there
+        )
         links = site([(replace(state, vehicles=vehicles), radios)])
-        return np.asarray(radio.loss(links, trips.shadow(links.xy_m, radio.decorrelation_m), BITS)[0])
+        return np.asarray(
+            radio.loss(links, trips.shadow(links.xy_m, radio.decorrelation_m), BITS)[0]
+        )
 
     return at
 
 
 @lru_cache(maxsize=1024)
-def _draws(p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]) -> tuple[float, Floats, Floats]:
-    """Draw a sender's phase as a share of its period, its errors, (n, 4), and draws for receivers, (R, n)."""
+def _draws(
+    p: Parameters, seed: int, sender: str, receivers: tuple[str, ...]
+) -> tuple[float, Floats, Floats]:
+    """Draw a sender's phase as a share of its period, its errors, (n, 4),
+    and draws for receivers, (R, n).
+    """
     n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
     own = noise.generator("beacons", seed, sender)
     phase = float(own.random())

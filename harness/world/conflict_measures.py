@@ -1,20 +1,24 @@
-"""Measure conflicts of the ego with other vehicles in time: time to collision and post-encroachment time.
+"""Measure conflicts of the ego with other vehicles in time:
+time to collision and post-encroachment time.
 
-*Time to collision* (TTC) is "the time required for two vehicles to collide if they continue at their present
-speeds and on the same path" (Hayward 1972, Near-miss determination through use of a scale of danger, Highway
-Research Record 384, 24-34). Here both go straight on from their pose in a frame, at their speed: it is the
-time until their outlines touch, for crossing paths too, and missing where they do not within `HORIZON_S`.
+*Time to collision* (TTC) is "the time required for two vehicles to collide if they continue at
+their present speeds and on the same path" (Hayward 1972, Near-miss determination through use of a
+scale of danger, Highway Research Record 384, 24-34). Here both go straight on from their pose in a
+frame, at their speed: it is the time until their outlines touch, for crossing paths too, and
+missing where they do not within `HORIZON_S`.
 
-*Post-encroachment time* (PET; Allen, Shin and Cooper 1978, Analysis of traffic conflicts and collisions,
-Transportation Research Record 667) is "the time between when the first vehicle last occupied a position and
-the second vehicle subsequently arrived at the same position" (FHWA-HRT-08-051, SSAM, chapter 2). Over all
-positions its least value is the least time between a moment of one vehicle and a later one of the other in
-which their outlines overlap. So it is of what was driven, and nothing is predicted; it is missing where the
-second does not arrive within `HORIZON_S`.
+*Post-encroachment time* (PET; Allen, Shin and Cooper 1978, Analysis of traffic conflicts and
+collisions, Transportation Research Record 667) is "the time between when the first vehicle last
+occupied a position and the second vehicle subsequently arrived at the same position"
+(FHWA-HRT-08-051, SSAM, chapter 2). Over all positions its least value is the least time between a
+moment of one vehicle and a later one of the other in which their outlines overlap. So it is of what
+was driven, and nothing is predicted; it is missing where the second does not arrive within
+`HORIZON_S`.
 
-Of both, the least counts, over all other vehicles and over ten moments a second, the step of the trajectories
-that SSAM is used with (FHWA-HRT-10-038, section 3). A collision has 0. Numbers depend neither on which worlds
-are measured together, nor on how an episode's frames are divided among calls.
+Of both, the least counts, over all other vehicles and over ten moments a second, the step of the
+trajectories that SSAM is used with (FHWA-HRT-10-038, section 3). A collision has 0. Numbers depend
+neither on which worlds are measured together, nor on how an episode's frames are divided among
+calls.
 """
 
 import math
@@ -26,11 +30,12 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 from harness.world.state import separation_m
 
-# SSAM's default for the greatest PET of a conflict (FHWA-HRT-08-051); it also bounds what a TTC predicts.
+# SSAM's default for the greatest PET of a conflict (FHWA-HRT-08-051); it also bounds what a TTC
+# predicts.
 HORIZON_S = 5.0
 SHORT_TTC_S = 1.5  # SSAM's default for the greatest TTC of a conflict
-# Below it an encroachment is critical by Peesapati and others 2018, as Westhofen and others list it in
-# Criticality Metrics for Automated Driving, https://criticality-metrics.readthedocs.io.
+# Below it an encroachment is critical by Peesapati and others 2018, as Westhofen and others list it
+# in Criticality Metrics for Automated Driving, https://criticality-metrics.readthedocs.io.
 SHORT_PET_S = 1.5
 MOMENTS_HZ = 10
 DECIMALS = 3  # decimals of both, s
@@ -38,12 +43,16 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """The conflicts of a world's ego since some decision, and what those to come are measured by."""
+    """The conflicts of a world's ego since some decision,
+    and what those to come are measured by.
+    """
 
     ttc_s: float = np.inf  # least time to collision; inf where missing
     pet_s: float = np.inf  # least post-encroachment time; inf where missing
-    trail: Floats = field(default_factory=lambda: np.empty((0, 0, 3)))  # x, y and heading lately, (T, V, 3)
-    # the box around all outlines of each vehicle so far: least x and y, and negative greatest, (4, V)
+    # x, y and heading lately, (T, V, 3)
+    trail: Floats = field(default_factory=lambda: np.empty((0, 0, 3)))
+    # the box around all outlines of each vehicle so far: least x and y, and negative greatest, (4,
+    # V)
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
@@ -54,12 +63,17 @@ class Conflicts:
         return replace(self, ttc_s=0.0, pet_s=0.0)
 
     def recast(self, places: Sequence[int]) -> "Conflicts":
-        """Return the same for other vehicles: each one's place among those before, or -1 for a new one.
+        """Return the same for other vehicles:
+        each one's place among those before, or -1 for a new one.
 
         Where a vehicle was that has left is forgotten.
         """
         at = np.array(places)
-        trail = np.where((at < 0)[:, None], np.nan, self.trail[:, at]) if self.trail.size else self.trail
+        trail = (
+            np.where((at < 0)[:, None], np.nan, self.trail[:, at])
+            if self.trail.size
+            else self.trail
+        )
         box = np.where(at < 0, np.inf, self.box[:, at]) if self.box.size else self.box
         return replace(self, trail=trail, box=box)
 
@@ -74,9 +88,15 @@ def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
 
     They are inf where nothing came near in time, and NaN where nothing was measured.
     """
-    named = {"ttc": (ttc_s.round(DECIMALS), SHORT_TTC_S), "pet": (pet_s.round(DECIMALS), SHORT_PET_S)}
+    named = {
+        "ttc": (ttc_s.round(DECIMALS), SHORT_TTC_S),
+        "pet": (pet_s.round(DECIMALS), SHORT_PET_S),
+    }
     return {
-        **{f"{name}_s": np.where(np.isfinite(values), values, np.nan) for name, (values, _) in named.items()},
+        **{
+            f"{name}_s": np.where(np.isfinite(values), values, np.nan)
+            for name, (values, _) in named.items()
+        },
         **{
             f"short_{name}": np.where(np.isnan(values), np.nan, values < short)
             for name, (values, short) in named.items()
@@ -89,9 +109,9 @@ def observe(
 ) -> list[Conflicts]:
     """Return the conflicts of each world after some more frames.
 
-    `poses` are x, y, heading and speed, (W, frames, vehicles, 4), the ego first, NaN where there is none, and
-    `sizes_m` length and width, (W, vehicles, 2). `first_frame` has the number of each world's first frame,
-    (W,), and `hz` is frames a second.
+    `poses` are x, y, heading and speed, (W, frames, vehicles, 4), the ego first, NaN where there is
+    none, and `sizes_m` length and width, (W, vehicles, 2). `first_frame` has the number of each
+    world's first frame, (W,), and `hz` is frames a second.
     """
     every = max(1, round(hz / MOMENTS_HZ))
     numbers = first_frame[:, None] + np.arange(poses.shape[1])
@@ -100,7 +120,11 @@ def observe(
     after = list(before)
     if seen.size:
         measured = _measured(
-            [before[n] for n in seen.tolist()], poses[seen], sizes_m[seen], moments[seen], every / hz
+            [before[n] for n in seen.tolist()],
+            poses[seen],
+            sizes_m[seen],
+            moments[seen],
+            every / hz,
         )
         for n, conflicts in zip(seen.tolist(), measured, strict=True):
             after[n] = conflicts
@@ -110,7 +134,9 @@ def observe(
 def _measured(
     before: Sequence[Conflicts], poses: Floats, sizes_m: Floats, moments: Bools, step_s: float
 ) -> list[Conflicts]:
-    """Return the conflicts of each world after some moments, (W, frames), which are `step_s` apart."""
+    """Return the conflicts of each world after some moments, (W, frames),
+    which are `step_s` apart.
+    """
     counts, rows = np.count_nonzero(moments, axis=1), poses[moments]
     worlds = np.repeat(np.arange(len(before)), counts)
     x, y, heading, speed = (np.ascontiguousarray(rows[..., k]) for k in range(4))
@@ -124,12 +150,17 @@ def _measured(
     for world, each in enumerate(before):
         so_far[:, world, : each.box.shape[1]] = each.box
     so_far = np.fmin(so_far, arrived)
-    most = math.floor(HORIZON_S / step_s + 1e-9)  # moments within it: at 15 Hz they are 133 ms apart
+    # moments within it: at 15 Hz they are 133 ms apart
+    most = math.floor(HORIZON_S / step_s + 1e-9)
     lag = np.array([round(min(each.pet_s / step_s, most + 1)) for each in before])
-    _lower_lag(lag, [each.trail for each in before], rows, counts, sizes_m, (boxes, arrived, so_far))
+    _lower_lag(
+        lag, [each.trail for each in before], rows, counts, sizes_m, (boxes, arrived, so_far)
+    )
     pets_s = np.where(lag <= most, lag * step_s, np.inf).tolist()
     vehicles = np.count_nonzero(~np.isnan(x[starts]), axis=1).tolist()
-    ends = zip(before, starts.tolist(), counts.tolist(), vehicles, ttc_s.tolist(), pets_s, strict=True)
+    ends = zip(
+        before, starts.tolist(), counts.tolist(), vehicles, ttc_s.tolist(), pets_s, strict=True
+    )
     after = []
     for world, (each, start, count, v, ttc, pet) in enumerate(ends):
         new = rows[start : start + count, :v, :3]
@@ -138,18 +169,24 @@ def _measured(
     return after
 
 
-def times_to_collision(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
+def times_to_collision(
+    poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats
+) -> Floats:
     """Return when the outlines of pairs touch if both go straight on, (n,) s; inf for never.
 
-    Each has x, y, heading and speed, (n, 4), and length and width, (n, 2). On each axis of either outline,
-    the extents of two that move evenly overlap in one interval; the outlines do in what all four share.
+    Each has x, y, heading and speed, (n, 4), and length and width, (n, 2). On each axis of either
+    outline, the extents of two that move evenly overlap in one interval; the outlines do in what
+    all four share.
     """
-    cos, sin, its_cos, its_sin = (turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin))
+    cos, sin, its_cos, its_sin = (
+        turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin)
+    )
     (dx, dy), speed, its_speed = (others - poses)[:, :2].T, poses[:, 3], others[:, 3]
     vx, vy = its_speed * its_cos - speed * cos, its_speed * its_sin - speed * sin
     dot, cross = np.abs(cos * its_cos + sin * its_sin), np.abs(cos * its_sin - sin * its_cos)
     enter, leave = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # where none moves along an axis
+    # where none moves along an axis
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         for c, s, (length, width), (its_length, its_width) in (
             (cos, sin, sizes_m.T, their_sizes_m.T),
             (its_cos, its_sin, their_sizes_m.T, sizes_m.T),
@@ -165,10 +202,13 @@ def times_to_collision(poses: Floats, sizes_m: Floats, others: Floats, their_siz
     return np.where((enter < leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
 
 
-def _lower_ttc(ttc_s: Floats, worlds: Ints, poses: Floats, sizes_m: Floats, motion: Sequence[Floats]) -> None:
+def _lower_ttc(
+    ttc_s: Floats, worlds: Ints, poses: Floats, sizes_m: Floats, motion: Sequence[Floats]
+) -> None:
     """Lower the least time to collision of each world, (W,), by that in frames, (N,), of `worlds`.
 
-    `poses` are (N, vehicles, 4), and `motion` positions and velocities in x and y, each (N, vehicles).
+    `poses` are (N, vehicles, 4), and `motion` positions and velocities in x and y,
+    each (N, vehicles).
     """
     dx, dy, vx, vy = (v[:, 1:] - v[:, :1] for v in motion)
     reach = np.hypot(*np.moveaxis(sizes_m, -1, 0)) / 2
@@ -180,13 +220,17 @@ def _lower_ttc(ttc_s: Floats, worlds: Ints, poses: Floats, sizes_m: Floats, moti
     may &= apart <= (reach + np.minimum(ttc_s, HORIZON_S)[worlds, None] * np.sqrt(squared)) ** 2
     rows, others = np.nonzero(may)
     own, others = worlds[rows], others + 1
-    times_s = times_to_collision(poses[rows, 0], sizes_m[own, 0], poses[rows, others], sizes_m[own, others])
+    times_s = times_to_collision(
+        poses[rows, 0], sizes_m[own, 0], poses[rows, others], sizes_m[own, others]
+    )
     within = times_s <= HORIZON_S
     np.minimum.at(ttc_s, own[within], times_s[within])
 
 
 def _boxes(x: Floats, y: Floats, cos: Floats, sin: Floats, sizes_m: Floats) -> Floats:
-    """Return boxes around outlines (N, vehicles): least x and y, negative greatest, (4, N, vehicles)."""
+    """Return boxes around outlines (N, vehicles):
+    least x and y, negative greatest, (4, N, vehicles).
+    """
     half, across = sizes_m[..., 0] / 2, sizes_m[..., 1] / 2
     east, south = half * cos + across * sin, half * sin + across * cos
     return np.stack([x - east, y - south, -x - east, -y - south])
@@ -198,13 +242,19 @@ def _meet(box: Floats, other: Floats) -> Bools:
 
 
 def _lower_lag(
-    lag: Ints, trails: Sequence[Floats], rows: Floats, counts: Ints, sizes_m: Floats, boxes: Sequence[Floats]
+    lag: Ints,
+    trails: Sequence[Floats],
+    rows: Floats,
+    counts: Ints,
+    sizes_m: Floats,
+    boxes: Sequence[Floats],
 ) -> None:
-    """Lower the least post-encroachment time of each world, (W,) in moments, by arrivals in its moments.
+    """Lower the least post-encroachment time of each world, (W,) in moments,
+    by arrivals in its moments.
 
-    Each world has so many moments, (W,), whose poses follow each other in `rows`, (N, vehicles, 4). `boxes`
-    are around each outline (4, N, vehicles), around all of these in each world, and around all since its
-    start, (4, W, vehicles).
+    Each world has so many moments, (W,), whose poses follow each other in `rows`, (N, vehicles, 4).
+    `boxes` are around each outline (4, N, vehicles), around all of these in each world, and around
+    all since its start, (4, W, vehicles).
     """
     outlines, arrived, so_far = boxes
     most, starts = int(lag.max()), np.cumsum(counts) - counts
@@ -228,7 +278,9 @@ def _lower_lag(
     step_m = np.hypot(moves[..., 0], moves[..., 1]) + np.hypot(*size.T)[:, None] / 2 * moves[..., 2]
     step_m = np.fmax.reduce(step_m, axis=1, initial=1e-9)
     pairs = np.repeat(np.arange(len(worlds)), counts[worlds])
-    moment = np.arange(len(pairs)) - np.repeat(np.cumsum(counts[worlds]) - counts[worlds], counts[worlds])
+    moment = np.arange(len(pairs)) - np.repeat(
+        np.cumsum(counts[worlds]) - counts[worlds], counts[worlds]
+    )
     row = starts[worlds[pairs]] + moment
     where = _meet(so_far[:, worlds[pairs], first[pairs]], outlines[:, row, second[pairs]])
     pairs, moment, row = pairs[where], moment[where], row[where]

@@ -1,8 +1,9 @@
 """highway-env's four-way intersection as a road, for an ego that goes straight over it.
 
-An ego from the south goes north, so for it "left" is the west arm, "right" the east arm and "oncoming" the
-north arm. For one from another arm these names are turned; lanes and coordinates stay. Lane width and radii
-are those of highway-env 1.12's `IntersectionEnv`; a test holds them against its road network.
+An ego from the south goes north, so for it "left" is the west arm, "right" the east arm and
+"oncoming" the north arm. For one from another arm these names are turned; lanes and coordinates
+stay. Lane width and radii are those of highway-env 1.12's `IntersectionEnv`; a test holds them
+against its road network.
 """
 
 from functools import cache
@@ -17,14 +18,16 @@ LANE_WIDTH_M = 4.0
 JUNCTION_M = 11.0  # from the centre to where approach lanes end
 ARM_M = 100.0  # length of an approach or exit lane
 LEFT_TURN_RADIUS_M = 13.0
-SECTOR_REACH_M = (8.0, 50.0)  # stretch of the approach lane, from the conflict point, that is looked at
+# stretch of the approach lane, from the conflict point, that is looked at
+SECTOR_REACH_M = (8.0, 50.0)
 
 # South, west, north, east: highway-env's nodes o0..o3. An arm is a number in this order.
 APPROACHES = ("own", "left", "oncoming", "right")
 SECTORS = ("left", "right", "oncoming")  # where danger can come from
 ROUTES = ("straight", "left")
 EXITS = ("exit-own", "exit-left", "exit-ahead", "exit-right")
-# Right of way of highway-env's intersection: the road from west to east first, straight before left.
+# Right of way of highway-env's intersection: the road from west to east first, straight before
+# left.
 PRIORITY = {"straight": (1, 3), "left": (0, 2)}
 
 
@@ -37,7 +40,9 @@ def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
     ways, ego = paths(arm), ("own", "straight")
     # A path that merges into the ego's lane brings no danger here.
     meetings = {key: at for key, at in crossings(ways, ego).items() if at.kind == "crossing"}
-    points = [meetings[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))]
+    points = [
+        meetings[key] for key in (("left", "straight"), ("right", "straight"), ("oncoming", "left"))
+    ]
     return Road(
         facts={
             "kind": "four-way intersection",
@@ -91,7 +96,9 @@ def _southern(route: str) -> Floats:
     """Return the points of a path that starts on the south arm."""
     half, end = LANE_WIDTH_M / 2, JUNCTION_M + ARM_M
     count = int(ARM_M / STEP_M)
-    approach = np.column_stack([np.full(count, half), np.linspace(end, JUNCTION_M, count, endpoint=False)])
+    approach = np.column_stack(
+        [np.full(count, half), np.linspace(end, JUNCTION_M, count, endpoint=False)]
+    )
     if route == "straight":
         inside = np.linspace(JUNCTION_M, -JUNCTION_M, int(2 * JUNCTION_M / STEP_M), endpoint=False)
         leaving = np.linspace(-JUNCTION_M, -end, count + 1)
@@ -99,7 +106,9 @@ def _southern(route: str) -> Floats:
         return np.concatenate([approach, np.column_stack([np.full(len(y), half), y])])
     angle = np.linspace(0, np.pi / 2, int(LEFT_TURN_RADIUS_M * np.pi / 2 / STEP_M), endpoint=False)
     radius = LEFT_TURN_RADIUS_M
-    arc = np.column_stack([half - radius + radius * np.cos(angle), JUNCTION_M - radius * np.sin(angle)])
+    arc = np.column_stack(
+        [half - radius + radius * np.cos(angle), JUNCTION_M - radius * np.sin(angle)]
+    )
     leaving = np.linspace(-JUNCTION_M, -end, count + 1)
     return np.concatenate([approach, arc, np.column_stack([leaving, np.full(count + 1, -half)])])
 
@@ -122,7 +131,9 @@ def network() -> Any:
 
 
 def ground(far_m: float) -> Ground:
-    """Return the ground: both roads up to `far_m`, with the centre line and the stop line of each arm."""
+    """Return the ground: both roads up to `far_m`,
+    with the centre line and the stop line of each arm.
+    """
     half = LANE_WIDTH_M
     # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
     angle = np.linspace(np.pi, 1.5 * np.pi, 9)

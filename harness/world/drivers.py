@@ -1,14 +1,15 @@
 """Reference drivers: rule-based baselines to compare models with.
 
-`cruise` keeps its speed, `brake` always brakes, `local-view` plans with what the ego's sensors know and
-`full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view` knows, and
-keep a rule of the road with those who keep it, too (`precedence`).
+`cruise` keeps its speed, `brake` always brakes, `local-view` plans with what the ego's sensors know
+and `full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view`
+knows, and keep a rule of the road with those who keep it, too (`precedence`).
 
-Three references look at nothing at all. `uniform` holds every action for equally likely. `constant` always
-takes the action that did best in a scenario's tune layouts: `constants.csv` has what each clears, and
-`benchmarks/constants.py` writes it. Where `limits` is 2, best is success balanced over dangerous and harmless
-layouts. `open-loop` takes the fixed sequence of actions that did best there, by their trees: `open_loop.csv`,
-which `benchmarks/open_loop.py` writes. After its end the last action is taken again.
+Three references look at nothing at all. `uniform` holds every action for equally likely. `constant`
+always takes the action that did best in a scenario's tune layouts: `constants.csv` has what each
+clears, and `benchmarks/constants.py` writes it. Where `limits` is 2, best is success balanced over
+dangerous and harmless layouts. `open-loop` takes the fixed sequence of actions that did best there,
+by their trees: `open_loop.csv`, which `benchmarks/open_loop.py` writes. After its end the last
+action is taken again.
 """
 
 import csv
@@ -32,7 +33,9 @@ CONSTANTS = Path(__file__).with_name("constants.csv")
 OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")
 
 
-def choose(scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> str:
+def choose(
+    scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None
+) -> str:
     """Return a driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
     [action] = choices(scenario, [(driver, graph, truth)])
     return action
@@ -46,17 +49,23 @@ def choices(
     A driver may also be an action, which is always taken.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
-    planned = iter(plans(scenario, [_read(scenario, *each) for each in asked if each[0] not in always]))
+    planned = iter(
+        plans(scenario, [_read(scenario, *each) for each in asked if each[0] not in always])
+    )
     return [always.get(driver) or next(planned) for driver, *_ in asked]
 
 
 def constant(scenario: Scenario) -> str | None:
-    """Return the action of the driver `constant` in a scenario; None where nobody has measured it."""
+    """Return the action of the driver `constant` in a scenario;
+    None where nobody has measured it.
+    """
     return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
 
 def open_loop(scenario: Scenario) -> tuple[str, ...] | None:
-    """Return the actions of the driver `open-loop`, from the first; None where nobody has measured them."""
+    """Return the actions of the driver `open-loop`, from the first;
+    None where nobody has measured them.
+    """
     return _open_loops().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
 
@@ -87,7 +96,9 @@ def _score(row: Mapping[str, str]) -> int:
     return (cleared - harmless_cleared) * harmless + harmless_cleared * (layouts - harmless)
 
 
-def _read(scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None) -> SceneGraph:
+def _read(
+    scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None
+) -> SceneGraph:
     """Return the graph that a driver plans with."""
     read = truth if driver == PRIVILEGED else graph
     if read is None:

@@ -10,7 +10,8 @@ from harness.core.seeds import LAST_EPISODE, LAST_SEED
 Kind = Literal["car", "van", "truck"]
 Part = Literal["ego", "helper", "other"]
 Side = Literal["own", "left", "right"]  # of the ego's ways, from the one that it is on
-# No metre, second or share comes near these bounds, and infinity and huge integers do not pass them.
+# No metre, second or share comes near these bounds, and infinity and huge integers do not pass
+# them.
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
@@ -21,7 +22,9 @@ class Closed(Struct, frozen=True, forbid_unknown_fields=True):
     """A record with these members and no other; its bounds hold where it is read."""
 
     def __getitem__(self, key: str) -> Any:
-        """Return a member by its name in a file: how plug-ins of 0.2 read it, until 0.4.0, with a warning."""
+        """Return a member by its name in a file:
+        how plug-ins of 0.2 read it, until 0.4.0, with a warning.
+        """
         names = dict(zip(self.__struct_encode_fields__, self.__struct_fields__, strict=True))
         if key not in names or (value := getattr(self, names[key])) is UNSET:
             raise KeyError(key)

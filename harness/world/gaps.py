@@ -8,13 +8,16 @@ from harness.world.state import rectangle, separation_m
 
 
 def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
-    """Return the least gap between the ego's outline and another's in each world, at most `least_m`, (W,).
+    """Return the least gap between the ego's outline and another's in each world,
+    at most `least_m`, (W,).
 
-    `poses` are x, y and heading, (W, frames, vehicles, 3 or more), the ego first, NaN without a vehicle, and
-    `sizes_m` length and width, (W, vehicles, 2); `least_m` is the least gap before these frames.
+    `poses` are x, y and heading, (W, frames, vehicles, 3 or more), the ego first, NaN without a
+    vehicle, and `sizes_m` length and width, (W, vehicles, 2); `least_m` is the least gap before
+    these frames.
     """
     centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
-    # Two centres are at least both half widths apart from touching, and at most both half diagonals.
+    # Two centres are at least both half widths apart from touching, and at most both half
+    # diagonals.
     farthest_m = np.hypot(*np.moveaxis(sizes_m, -1, 0))[:, None]
     most_m = centres_m - (sizes_m[:, None, :1, 1] + sizes_m[:, None, 1:, 1]) / 2
     bound_m = np.fmin(least_m, np.fmin.reduce(most_m, axis=(1, 2), initial=np.inf))
@@ -32,7 +35,8 @@ def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
         )
         np.minimum.at(gaps_m, worlds[pairs], shapely.distance(*outlines))
 
-    # The pair with the smallest bound in each world is measured first; few others can then be nearer.
+    # The pair with the smallest bound in each world is measured first; few others can then be
+    # nearer.
     likely = np.lexsort((at_least_m, worlds))
     measure(likely[np.diff(worlds[likely], prepend=-1) > 0])
     measure(np.flatnonzero(at_least_m < gaps_m[worlds]))

@@ -1,10 +1,11 @@
-"""A planner that sees everything and plans for all agents of a layout together, in least summed time.
+"""A planner that sees everything and plans for all agents of a layout together,
+in least summed time.
 
-Agents keep to their paths, so that they affect each other by where they are, and by the traffic behind them
-that brakes. So each agent's sequences of actions (`HORIZON`) are simulated alone, with the other traffic. Two
-of them go together if the agents stay `MARGIN_M` apart and touch no traffic as the other one makes it drive.
-Branch and bound finds who does what. A plan counts only if the simulator, with everybody in it, ends as it
-promises; else the next best is driven.
+Agents keep to their paths, so that they affect each other by where they are, and by the traffic
+behind them that brakes. So each agent's sequences of actions (`HORIZON`) are simulated alone, with
+the other traffic. Two of them go together if the agents stay `MARGIN_M` apart and touch no traffic
+as the other one makes it drive. Branch and bound finds who does what. A plan counts only if the
+simulator, with everybody in it, ends as it promises; else the next best is driven.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +52,9 @@ class Rehearsal(World):
         self.taken = (*self.taken, action)
 
     def parts(self, step: int) -> list["Rehearsal"]:
-        """Return a world for each action of a step; of those that set the same target one counts."""
+        """Return a world for each action of a step;
+        of those that set the same target one counts.
+        """
         calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
         to = {self.target_after(action): action for action in calm_last}
         if self.script is None:
@@ -70,7 +73,8 @@ class Options:
 
     actions: Sequence[tuple[str, ...]]
     arrives_s: Floats  # when it reaches its goal, (n,); inf for never
-    poses: Floats  # x, y and heading after each frame, of it and then of other traffic, (n, F, V, 3)
+    # x, y and heading after each frame, of it and then of other traffic, (n, F, V, 3)
+    poses: Floats
     sizes_m: Floats  # length and width of these, (V, 2)
     hz: int  # frames a second
 
@@ -106,15 +110,19 @@ def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Opt
     """Return what each agent of some layouts can do, by a layout's seed and an agent's place."""
     begun = [world for seed in seeds for world in rehearsals(scenario, seed)]
     ended = [
-        world for group in by_scenario(begun) for world in _courses(group)
+        world
+        for group in by_scenario(begun)
+        for world in _courses(group)
         if world.outcome.result in ("cleared", "time_out")
-    ]  # fmt: skip
+    ]
     frames = dict.fromkeys(seeds, 0)
     for world in ended:
         frames[world.seed] = max(frames[world.seed], world.frame)
     for group in by_scenario([world for world in ended if world.outcome.success]):
         _drive_on(group, [frames[world.seed] for world in group])
-    worlds: dict[tuple[int, int], list[Rehearsal]] = {(world.seed, world.agent): [] for world in begun}
+    worlds: dict[tuple[int, int], list[Rehearsal]] = {
+        (world.seed, world.agent): [] for world in begun
+    }
     for world in ended:
         worlds[world.seed, world.agent].append(world)
     able: dict[int, dict[int, Options]] = {seed: {} for seed in seeds}
@@ -125,11 +133,14 @@ def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Opt
 
 
 def courses(
-    scenario: Scenario, able: Mapping[int, Mapping[int, Options]], taken: Sequence[tuple[int, Scripts]]
+    scenario: Scenario,
+    able: Mapping[int, Mapping[int, Options]],
+    taken: Sequence[tuple[int, Scripts]],
 ) -> list[dict[int, Options]]:
     """Return the course of each agent that took some actions, by its place, as its only option.
 
-    `taken` are layouts' seeds, with the actions of each agent; `able` are the `options` of the layouts.
+    `taken` are layouts' seeds, with the actions of each agent;
+    `able` are the `options` of the layouts.
     """
     begun = [rehearsals(scenario, seed) for seed, _ in taken]
     for worlds, (_, scripts) in zip(begun, taken, strict=True):
@@ -170,7 +181,9 @@ def _options(layout: Layout, worlds: Sequence[Rehearsal], frames: int) -> Option
 
 
 def _courses(going: list[Rehearsal]) -> list[Rehearsal]:
-    """Return a world for each course that the actions of agents can lead to, until each is decided."""
+    """Return a world for each course that the actions of agents can lead to,
+    until each is decided.
+    """
     p, ended = going[0].scenario.parameters, list[Rehearsal]()
     for step in range(p.decisions):
         lockstep.advance(going, [p.due_frame(step) + p.lag_frames] * len(going))
@@ -200,7 +213,8 @@ class Search:
     """A search for the options of all agents that go together and have the least cost."""
 
     able: Sequence[Options]  # of each agent
-    unfit: set[tuple[int, ...]] = field(default_factory=set)  # choices that do not keep their promise
+    # choices that do not keep their promise
+    unfit: set[tuple[int, ...]] = field(default_factory=set)
     rows: dict[tuple[int, int, int], Bools] = field(default_factory=dict)
     nodes: int = 0
     best: tuple[int, ...] | None = None
@@ -240,7 +254,9 @@ class Search:
             self.nodes += 1
             after = [mask & self._row(agent, n, agent + 1 + k) for k, mask in enumerate(left[1:])]
             if all(mask.any() for mask in after):
-                bound_s = its_s + sum(self._least_s(agent + 1 + k, mask) for k, mask in enumerate(after))
+                bound_s = its_s + sum(
+                    self._least_s(agent + 1 + k, mask) for k, mask in enumerate(after)
+                )
                 if bound_s < self.cost_s:
                     self._choose((*chosen, n), its_s, after)
 
@@ -271,9 +287,15 @@ def together(own: Options, n: int, other: Options) -> Bools:
 
 
 def near(
-    some: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats, margin_m: float, counts: Bools
+    some: Floats,
+    sizes_m: Floats,
+    others: Floats,
+    their_sizes_m: Floats,
+    margin_m: float,
+    counts: Bools,
 ) -> Bools:
-    """Return whether any of some vehicles (1, F, A, 3) comes as near to any of the others (n, F, B, 3), (n,).
+    """Return whether any of some vehicles (1, F, A, 3) comes as near to any of the others (n, F, B,
+    3), (n,).
 
     Only frames that count, (n, F), do.
     """
@@ -290,18 +312,24 @@ def near(
 def plans(
     scenario: Scenario, able: Mapping[int, Mapping[int, Options]]
 ) -> tuple[dict[int, tuple[Plan, World]], set[int]]:
-    """Return the best plan for all agents of each layout that keeps its promise, by the layout's seed.
+    """Return the best plan for all agents of each layout that keeps its promise,
+    by the layout's seed.
 
-    `able` are the `options`. With a plan comes the world after all have acted so. Layouts without one are
-    left out; of these, the seeds in which the search did not end, so that there may be one, come last.
+    `able` are the `options`. With a plan comes the world after all have acted so. Layouts without
+    one are left out; of these, the seeds in which the search did not end, so that there may be one,
+    come last.
     """
     found, unended = dict[int, tuple[Plan, World]](), set[int]()
     searches = {seed: Search(list(of.values())) for seed, of in able.items()}
     for _ in range(MOST_PLANS):
-        best = {seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))}
+        best = {
+            seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))
+        }
         unended |= {seed for seed in searches.keys() - best.keys() if not searches[seed].ended}
         worlds = played(scenario, best)
-        found |= {seed: (best[seed], worlds[seed]) for seed in best if kept(best[seed], worlds[seed])}
+        found |= {
+            seed: (best[seed], worlds[seed]) for seed in best if kept(best[seed], worlds[seed])
+        }
         searches = {seed: searches[seed] for seed in best if seed not in found}
     return found, unended | searches.keys()
 
@@ -322,7 +350,9 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
-    """Return the world of each layout after all of its agents have acted as planned, by the layout's seed."""
+    """Return the world of each layout after all of its agents have acted as planned,
+    by the layout's seed.
+    """
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
     while going := [world for world in worlds.values() if not world.ended]:
         take_turn(going, [plans_by_seed[world.seed].turn(world.step) for world in going])
@@ -332,7 +362,8 @@ def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, W
 def kept(it: Plan, world: World) -> bool:
     """Return whether all agents of a world have arrived when the plan says, and no others."""
     return all(
-        journey.outcome.time_s == it.arrives_s[agent] if journey.outcome.success
+        journey.outcome.time_s == it.arrives_s[agent]
+        if journey.outcome.success
         else journey.outcome.result == "time_out" and np.isinf(it.arrives_s[agent])
         for agent, journey in world.journeys.items()
-    )  # fmt: skip
+    )

@@ -1,13 +1,13 @@
 """Simulate worlds of one scenario together: a frame of all of them is one pass over arrays.
 
-Other traffic keeps its route and speed; the ego follows its target within physical limits. The arithmetic is
-that of highway-env, operation by operation, with the rules of `simulator`, so worlds end up the same to the
-last bit: NumPy computes a number in an array as it does alone, and `vecdot` sums as `dot` does. A test drives
-both side by side. Environments, and two vehicles that touch, are left to highway-env, and how an episode ends
-to `World`.
+Other traffic keeps its route and speed; the ego follows its target within physical limits. The
+arithmetic is that of highway-env, operation by operation, with the rules of `simulator`, so worlds
+end up the same to the last bit: NumPy computes a number in an array as it does alone, and `vecdot`
+sums as `dot` does. A test drives both side by side. Environments, and two vehicles that touch, are
+left to highway-env, and how an episode ends to `World`.
 
-Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer vehicles,
-the other columns stand for vehicles in lanes of their own, which affect nobody.
+Arrays are (B, V): worlds, and the vehicles of each by number, the ego first. If a world has fewer
+vehicles, the other columns stand for vehicles in lanes of their own, which affect nobody.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,7 +37,9 @@ AT_ONCE = 128  # more worlds do not fit into the processor's cache
 
 
 def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
-    """Simulate some worlds of one scenario, each until its frame, or until its episode is decided."""
+    """Simulate some worlds of one scenario, each until its frame,
+    or until its episode is decided.
+    """
     going = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
@@ -89,12 +91,17 @@ def _together(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
 
 
 def _measure(
-    worlds: "Sequence[World]", agents: tuple[Ints, ...], begun: Ints, poses: Floats, sizes_m: Floats,
+    worlds: "Sequence[World]",
+    agents: tuple[Ints, ...],
+    begun: Ints,
+    poses: Floats,
+    sizes_m: Floats,
     before_mps: Floats,
-) -> None:  # fmt: skip
+) -> None:
     """Record what some frames were for each agent, (n,), that was under way when they began.
 
-    `poses` (B, F, V, 4) are of frames after `begun`, (B,); `before_mps` (n,) are the agents' speeds before.
+    `poses` (B, F, V, 4) are of frames after `begun`, (B,);
+    `before_mps` (n,) are the agents' speeds before.
     """
     rows, places = agents
     hz = worlds[0].scenario.parameters.simulation_hz
@@ -103,11 +110,18 @@ def _measure(
     if places.any():  # each agent comes first in its own
         order = np.tile(np.arange(poses.shape[2]), (len(rows), 1))
         order[np.arange(len(rows)), places], order[:, 0] = 0, places
-        poses, sizes_m = poses[rows[:, None], :, order].swapaxes(1, 2), sizes_m[rows[:, None], order]
+        poses, sizes_m = (
+            poses[rows[:, None], :, order].swapaxes(1, 2),
+            sizes_m[rows[:, None], order],
+        )
         ended_s = [np.inf if j.outcome.time_s is None else j.outcome.time_s for j in journeys]
         ends = np.minimum(ends, np.rint(np.array(ended_s) * hz) - begun[rows]).astype(int)
-        np.copyto(poses, np.nan, where=(np.arange(poses.shape[1]) >= ends[:, None])[..., None, None])
-    gaps_m = least_gaps_m(poses, sizes_m, np.array([j.outcome.least_gap_m for j in journeys])).tolist()
+        np.copyto(
+            poses, np.nan, where=(np.arange(poses.shape[1]) >= ends[:, None])[..., None, None]
+        )
+    gaps_m = least_gaps_m(
+        poses, sizes_m, np.array([j.outcome.least_gap_m for j in journeys])
+    ).tolist()
     conflicts = observe([j.conflicts for j in journeys], poses, sizes_m, begun[rows] + 1, hz)
     speeds_mps = np.concatenate([before_mps[:, None], poses[:, :, 0, 3]], axis=1)
     for n, journey in enumerate(journeys):
@@ -116,7 +130,9 @@ def _measure(
 
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of a network as arrays; highway-env computes those that are neither straight nor an arc."""
+    """The lanes of a network as arrays; highway-env computes those that are neither straight nor an
+    arc.
+    """
 
     number: dict[Lane, int]  # number of each lane
     names: list[Lane]  # lane of each number
@@ -133,7 +149,9 @@ class Lanes:
     others: dict[int, Any]  # highway-env's lane of each number that is neither
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return the positions along and to the right of lanes (...), m, like `local_coordinates`."""
+        """Return the positions along and to the right of lanes (...), m,
+        like `local_coordinates`.
+        """
         away = xy - self.base[lane]
         along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
         arcs = self.arc[lane]
@@ -174,21 +192,27 @@ def _lanes(road: Callable[[], Road]) -> Lanes:
 
     def each(name: str, blank: Any, kind: type) -> Floats:
         values = [
-            getattr(lane, name) if its is kind else blank for lane, its in zip(lanes, kinds, strict=True)
+            getattr(lane, name) if its is kind else blank
+            for lane, its in zip(lanes, kinds, strict=True)
         ]
         return np.array(values, dtype=float)
 
     nowhere = np.zeros(2)
     return Lanes(
-        {name: n for n, name in enumerate(named)}, list(named),
+        {name: n for n, name in enumerate(named)},
+        list(named),
         each("start", nowhere, StraightLane) + each("center", nowhere, CircularLane),
-        each("direction", nowhere, StraightLane), each("direction_lateral", nowhere, StraightLane),
-        each("heading", 0.0, StraightLane), np.array([lane.length for lane in lanes], dtype=float),
-        np.array([lane.width for lane in lanes], dtype=float), np.array([k is CircularLane for k in kinds]),
-        each("radius", 1.0, CircularLane), each("start_phase", 0.0, CircularLane),
+        each("direction", nowhere, StraightLane),
+        each("direction_lateral", nowhere, StraightLane),
+        each("heading", 0.0, StraightLane),
+        np.array([lane.length for lane in lanes], dtype=float),
+        np.array([lane.width for lane in lanes], dtype=float),
+        np.array([k is CircularLane for k in kinds]),
+        each("radius", 1.0, CircularLane),
+        each("start_phase", 0.0, CircularLane),
         each("direction", 1.0, CircularLane),
         {n: lanes[n] for n, kind in enumerate(kinds) if kind not in (StraightLane, CircularLane)},
-    )  # fmt: skip
+    )
 
 
 class Fleet:
@@ -210,7 +234,9 @@ class Fleet:
         self.lane = np.zeros(shape, dtype=int)
         self.lane_now = np.tile(-1 - np.arange(most), (len(worlds), 1))  # lanes of no other vehicle
         self.xy, self.impact = np.zeros((*shape, 2)), np.zeros((*shape, 2))
-        self.pushed, self.crashed, self.stood, self.braking = (np.zeros(shape, bool) for _ in range(4))
+        self.pushed, self.crashed, self.stood, self.braking = (
+            np.zeros(shape, bool) for _ in range(4)
+        )
         self.drives, self.going = (np.zeros(shape, bool) for _ in range(2))
         self.heading, self.speed, self.target = (np.zeros(shape) for _ in range(3))
         self.steering, self.acceleration = np.zeros(shape), np.zeros(shape)
@@ -231,13 +257,17 @@ class Fleet:
                 spawn = world.vehicles[n].spawn
                 self.drives[b, n] = True
                 self.seat[b, n] = seats.index((spawn.approach, spawn.route)) if n else -1
-            self.going[b, [n for n, journey in world.journeys.items() if not journey.outcome.ended]] = True
+            self.going[
+                b, [n for n, journey in world.journeys.items() if not journey.outcome.ended]
+            ] = True
         self._index()
         ego = worlds[0].vehicles[0]
         self.limits, self.most_steering = ego.limits_mps2, ego.MAX_STEERING_ANGLE
 
     def _index(self) -> None:
-        """List who follows a target, and of these the agents that are under way: rows and places, (n,)."""
+        """List who follows a target, and of these the agents that are under way:
+        rows and places, (n,).
+        """
         self.driven, self.agents = np.nonzero(self.drives), np.nonzero(self.going)
 
     def _read(self, b: int, n: int, v: Any) -> None:
@@ -257,14 +287,18 @@ class Fleet:
 
     def keep(self, rows: Bools) -> None:
         """Keep some worlds."""
-        self.worlds = [world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept]
+        self.worlds = [
+            world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept
+        ]
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != "ways":
                 setattr(self, name, value[rows])
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Write a row back to its world; return the ids of vehicles that had crashed before this frame."""
+        """Write a row back to its world;
+        return the ids of vehicles that had crashed before this frame.
+        """
         world.frame = int(self.frame[row])
         names = self.lanes.names
         for n, v in enumerate(world.vehicles):
@@ -273,7 +307,10 @@ class Fleet:
             v.heading, v.speed = float(self.heading[at]), float(self.speed[at])
             v.crashed, v.braking = bool(self.crashed[at]), bool(self.braking[at])
             v.impact = self.impact[at].copy() if self.pushed[at] else None
-            v.action = {"steering": float(self.steering[at]), "acceleration": float(self.acceleration[at])}
+            v.action = {
+                "steering": float(self.steering[at]),
+                "acceleration": float(self.acceleration[at]),
+            }
             lane = names[self.lane[at]]
             if lane != v.target_lane_index:
                 behind = v.route.index(v.target_lane_index)
@@ -283,7 +320,9 @@ class Fleet:
         return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
 
     def step(self) -> Bools:
-        """Simulate a frame; return in which worlds something happened that `World.judge` must see, (B,)."""
+        """Simulate a frame; return in which worlds something happened that `World.judge` must see,
+        (B,).
+        """
         self.stood = self.crashed.copy()
         self._act()
         self._move()
@@ -385,7 +424,9 @@ class Fleet:
         self.lane_now = np.where(self.there, self.lane, self.lane_now)
 
     def _place_agents(self) -> Bools:
-        """Set the egos' lanes to the nearest of their ways; return which agents have road below, (n,)."""
+        """Set the egos' lanes to the nearest of their ways;
+        return which agents have road below, (n,).
+        """
         if self.ways.size:
             places = np.broadcast_to(self.xy[:, None, 0], (len(self.xy), len(self.ways), 2))
             _, off_m = self.lanes.coordinates(places, np.broadcast_to(self.ways, places.shape[:-1]))
@@ -394,14 +435,23 @@ class Fleet:
         along, lateral = self.lanes.coordinates(self.xy[self.agents], lane)
         room_m, length_m = AbstractLane.VEHICLE_LENGTH, self.lanes.length[lane]
         return np.asarray(
-            (np.abs(lateral) <= self.lanes.width[lane] / 2) & (-room_m <= along) & (along < length_m + room_m)
+            (np.abs(lateral) <= self.lanes.width[lane] / 2)
+            & (-room_m <= along)
+            & (along < length_m + room_m)
         )
 
     def _near(self) -> Ints:
-        """Return pairs of vehicles that may touch within the frame: world, number and number, (n, 3)."""
+        """Return pairs of vehicles that may touch within the frame:
+        world, number and number, (n, 3).
+        """
         x, y = self.xy[..., 0], self.xy[..., 1]
         dx, dy = x[:, None] - x[:, :, None], y[:, None] - y[:, :, None]
-        within = self.reach[:, :, None] + self.reach[:, None] + (self.speed * self.dt)[:, :, None] + NEAR_M
+        within = (
+            self.reach[:, :, None]
+            + self.reach[:, None]
+            + (self.speed * self.dt)[:, :, None]
+            + NEAR_M
+        )
         near = np.triu(dx * dx + dy * dy < within * within, 1)
         near &= self.there[:, :, None] & self.there[:, None]
         if not near.any():
@@ -418,7 +468,11 @@ class Fleet:
             vehicles = self.worlds[row].vehicles
             for k in (first, second):
                 v, at = vehicles[k], (row, k)
-                v.position, v.heading, v.speed = self.xy[at], float(self.heading[at]), float(self.speed[at])
+                v.position, v.heading, v.speed = (
+                    self.xy[at],
+                    float(self.heading[at]),
+                    float(self.speed[at]),
+                )
                 v.impact, v.crashed = None, False
             vehicles[first].handle_collisions(vehicles[second], self.dt)
             for k in (first, second):

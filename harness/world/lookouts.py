@@ -1,12 +1,14 @@
-"""Layouts with a declared number of witnesses: helpers with the danger in sight at the first decision.
+"""Layouts with a declared number of witnesses:
+helpers with the danger in sight at the first decision.
 
-Three lookouts have in sight wherever a danger may be; three cars in blind seats and the ego do not. All six
-are there whatever the number of witnesses is, and whether or not there is a danger: only the radio moves.
-With k witnesses, k lookouts and the first 3 - k blind seats help, in an order that is drawn; lookouts without
-a radio stay as traffic, and further blind seats stay empty.
+Three lookouts have in sight wherever a danger may be; three cars in blind seats and the ego do not.
+All six are there whatever the number of witnesses is, and whether or not there is a danger: only
+the radio moves. With k witnesses, k lookouts and the first 3 - k blind seats help, in an order that
+is drawn; lookouts without a radio stay as traffic, and further blind seats stay empty.
 
-So that this holds without telling anything, a layout is drawn again, as a whole, until the sensors find it so
-with a phantom of the danger of each sector in turn, drawn as the danger would be, there or not.
+So that this holds without telling anything, a layout is drawn again, as a whole, until the sensors
+find it so with a phantom of the danger of each sector in turn, drawn as the danger would be, there
+or not.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +35,8 @@ class Draft:
     """One draw of an episode's start."""
 
     layout: Layout  # with the lookouts as helpers, and nobody in the blind seats
-    phantoms: tuple[Spawn, ...]  # the danger of each sector, as it would be; it stands for who has its id
+    # the danger of each sector, as it would be; it stands for who has its id
+    phantoms: tuple[Spawn, ...]
     seats: tuple[Spawn, ...]  # cars in blind seats; empty if the draws name none
 
 
@@ -62,8 +65,8 @@ def placed(
 def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
     """Return the number of witnesses that a layout is drawn with; None where none is declared.
 
-    `each` goes by the seed, so seeds in a row are balanced and no draw decides. `drawn` has a draw of its
-    own, so the seed's number tells nothing.
+    `each` goes by the seed, so seeds in a row are balanced and no draw decides. `drawn` has a draw
+    of its own, so the seed's number tells nothing.
     """
     counts = len(LOOKOUTS) + 1
     if parameters.witnesses == "any":
@@ -76,17 +79,24 @@ def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
 
 
 def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
-    """Return a layout's `witnesses` and `danger_radio` for a row of a table; None where none is declared."""
+    """Return a layout's `witnesses` and `danger_radio` for a row of a table;
+    None where none is declared.
+    """
     p = scenario.parameters
     radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
     return {"witnesses": witnesses(scenario.name, p, seed), "danger_radio": radio}
 
 
 def queue(
-    draws: Draws, ids: dict[str, str], ego: Spawn, gaps_m: tuple[tuple[float, float], ...],
+    draws: Draws,
+    ids: dict[str, str],
+    ego: Spawn,
+    gaps_m: tuple[tuple[float, float], ...],
     speed_mps: tuple[float, float],
-) -> tuple[Spawn, ...]:  # fmt: skip
-    """Return cars in blind seats one behind another on the ego's path; gaps are from centre to centre."""
+) -> tuple[Spawn, ...]:
+    """Return cars in blind seats one behind another on the ego's path;
+    gaps are from centre to centre.
+    """
     mps, arc_m, cars = draws.between("seats_speed", speed_mps), ego.arc_m, []
     for name, bounds in zip(draws.seats, gaps_m, strict=False):
         arc_m -= draws.between(name, bounds)
@@ -95,7 +105,9 @@ def queue(
 
 
 def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = DANGER) -> bool:
-    """Return whether a vehicle that does not help sends beacons: the danger, or another by its id."""
+    """Return whether a vehicle that does not help sends beacons:
+    the danger, or another by its id.
+    """
     draw = noise.uniforms((1,), scenario, seed, "radio", vehicle)[0]
     return bool(draw < parameters.radio_share)
 
@@ -123,11 +135,13 @@ def _witnessed(
     return Layout.arranged([*spawns, *seats], danger, danger_id, made.layout.buildings)
 
 
-def _fits(scenario: Scenario, made: Draft, phantom: Spawn, seed: int, parameters: Parameters) -> bool:
+def _fits(
+    scenario: Scenario, made: Draft, phantom: Spawn, seed: int, parameters: Parameters
+) -> bool:
     """Return whether exactly the lookouts have a phantom of the danger in sight.
 
-    They have it with all blind seats taken, and nobody else has it with no other one taken: so it holds
-    whichever seats are.
+    They have it with all blind seats taken, and nobody else has it with no other one taken:
+    so it holds whichever seats are.
     """
     there = [*(s for s in made.layout.spawns if s.id != phantom.id), phantom]
     full = _state(scenario, made.layout, [*there, *made.seats], seed)

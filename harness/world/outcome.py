@@ -17,8 +17,12 @@ Result = Literal["running", "cleared", "late", "collision", "time_out", "off_roa
 Rating = Literal["success", "late", "unsafe", "stuck"]
 # Every result of an episode that has ended, in one of the four words in which outcomes are counted.
 RATINGS: Mapping[str, Rating] = {
-    "cleared": "success", "late": "late", "collision": "unsafe", "off_road": "unsafe", "time_out": "stuck",
-}  # fmt: skip
+    "cleared": "success",
+    "late": "late",
+    "collision": "unsafe",
+    "off_road": "unsafe",
+    "time_out": "stuck",
+}
 
 ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
@@ -27,15 +31,18 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 class Outcome:
     """How an episode ended for the ego."""
 
-    # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure: `time_out`
-    # (never), `late` (too long after the full-view driver) or `off_road`; `running` while undecided
+    # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
+    # `time_out` (never), `late` (too long after the full-view driver) or `off_road`; `running`
+    # while undecided
     result: Result = "running"
     time_s: float | None = None  # when it was decided; None while running
     partner: str | None = None  # id of the vehicle that the ego collided with
     # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe)
     striker: str | None = None
-    fault: str | None = None  # who should have given way, or drove into the other's back: `ego` or `other`
-    least_gap_m: float = 1000.0  # smallest distance so far between the ego's outline and any other vehicle's
+    # who should have given way, or drove into the other's back: `ego` or `other`
+    fault: str | None = None
+    # smallest distance so far between the ego's outline and any other vehicle's
+    least_gap_m: float = 1000.0
     other_crashes: int = 0  # number of vehicles that crashed without the ego
 
     @property
@@ -52,7 +59,12 @@ class Outcome:
 
         How long is too long depends on whether the layout has a danger (`Parameters.allowance_s`).
         """
-        if not self.success or not reference.success or self.time_s is None or reference.time_s is None:
+        if (
+            not self.success
+            or not reference.success
+            or self.time_s is None
+            or reference.time_s is None
+        ):
             return self
         late = self.time_s - reference.time_s > parameters.allowance_s(danger) + ROUNDING_S
         return replace(self, result="late") if late else self
@@ -74,7 +86,9 @@ class End(Struct, frozen=True, array_like=True):
 
 
 def rating(failure: str, parameters: Parameters) -> Rating | None:
-    """Return the word for an episode that failed like this, empty for a success; None where `limits` is 1."""
+    """Return the word for an episode that failed like this, empty for a success;
+    None where `limits` is 1.
+    """
     return None if parameters.limits == 1 else RATINGS[failure or "cleared"]
 
 
@@ -91,14 +105,18 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
         contact = overlap.centroid
     strikers = []
     for name, v in (("ego", ego), ("other", other)):
-        ahead = (contact.x - v.x_m) * np.cos(v.heading_rad) + (contact.y - v.y_m) * np.sin(v.heading_rad)
+        ahead = (contact.x - v.x_m) * np.cos(v.heading_rad) + (contact.y - v.y_m) * np.sin(
+            v.heading_rad
+        )
         if ahead > v.length_m / 2 - 1.0:
             strikers.append(name)
     return "both" if len(strikers) == 2 else strikers[0] if strikers else "neither"
 
 
 def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path]) -> str:
-    """Return who is at fault: the one behind in a rear-end collision, or else the one with less priority."""
+    """Return who is at fault: the one behind in a rear-end collision,
+    or else the one with less priority.
+    """
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
         ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)

@@ -1,4 +1,6 @@
-"""The parameters that every scenario has: times, limits of the ego, and what vehicles know of each other."""
+"""The parameters that every scenario has:
+times, limits of the ego, and what vehicles know of each other.
+"""
 
 import math
 from dataclasses import asdict, dataclass, fields
@@ -14,8 +16,8 @@ from harness.world.ambient import AMBIENTS, DAY, Ambient
 BeaconRule = Literal["fixed", "cam"]
 MOST_DECISIONS, MOST_SPEEDS = 10, 20
 MOST_FRAMES = 20_000  # in an episode; each takes time and memory
-# What a parameter may be at least and at most, by the unit at the end of its name. Places, and times that are
-# offsets, may lie before their origin.
+# What a parameter may be at least and at most, by the unit at the end of its name. Places, and
+# times that are offsets, may lie before their origin.
 BOUNDS = {
     "noise_m": (0.0, 100.0), "noise_mps": (0.0, 100.0), "offset_s": (-100.0, 100.0),
     "_s": (0.0, MOST_FRAMES), "_m": (-1000.0, 1000.0), "_mps": (0.0, 200.0), "_mps2": (0.0, 200.0),
@@ -42,14 +44,15 @@ class Parameters:
     acceleration_mps2: float = 3.0  # hardest acceleration
     decisions: int = 6  # number of decisions in an episode
     decision_period_s: float = 1.0  # seconds between two decisions
-    # seconds from seeing to acting, below the period, in decision trees and for reference drivers: the
-    # paper's inference. Until then the ego keeps to its last action
+    # seconds from seeing to acting, below the period, in decision trees and for reference drivers:
+    # the paper's inference. Until then the ego keeps to its last action
     decision_lag_s: float = 0.145
     simulation_hz: int = 50  # frames a second
     time_limit_s: float = 10.0  # an ego that has not reached its goal by then has failed
-    delay_allowance_s: float = 1.0  # how much later than the full-view driver an ego may reach its goal
-    # the same in a layout without a danger, where `limits` is 2: half of what one needless SLOWER costs
-    # (`benchmarks/caution.py`)
+    # how much later than the full-view driver an ego may reach its goal
+    delay_allowance_s: float = 1.0
+    # the same in a layout without a danger, where `limits` is 2: half of what one needless SLOWER
+    # costs (`benchmarks/caution.py`)
     harmless_allowance_s: float = 0.25
     # whether the ego and the helpers know each other's true state instead of beacons
     perfect_knowledge: bool = False
@@ -66,15 +69,16 @@ class Parameters:
     beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
     beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
     ambient: str = DAY  # light and weather, one of `harness.world.ambient`
-    # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these in turn, by
-    # the layout seed modulo 4; `drawn` evenly from these; or `any`, as many as the scene happens to give
+    # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these
+    # in turn, by the layout seed modulo 4; `drawn` evenly from these; or `any`, as many as the
+    # scene happens to give
     witnesses: str = "any"
     radio_share: float = 0.0  # probability that a vehicle which does not help sends beacons, too
-    # version of the rule that says which delay is a failure (`harness.world.outcome`), and of the reference
-    # planner, by whose time it is one
+    # version of the rule that says which delay is a failure (`harness.world.outcome`), and of the
+    # reference planner, by whose time it is one
     limits: int = 1
-    # version of what sensors make of a vehicle that they do not report: it hides who is behind it (1), or
-    # hides nothing (2), so that nothing tells of it
+    # version of what sensors make of a vehicle that they do not report: it hides who is behind it
+    # (1), or hides nothing (2), so that nothing tells of it
     perception: int = 1
 
     def __post_init__(self) -> None:
@@ -84,26 +88,45 @@ class Parameters:
             "decisions": (1 <= self.decisions <= MOST_DECISIONS, f"from 1 to {MOST_DECISIONS}"),
             "decision_period_s": (self.decision_period_s > 0, "seconds above 0"),
             "simulation_hz": (0 < self.simulation_hz <= 1000, "from 1 to 1000"),
-            "time_limit_s": (0 < total_frames <= MOST_FRAMES, f"above 0, and {MOST_FRAMES} frames at most"),
+            "time_limit_s": (
+                0 < total_frames <= MOST_FRAMES,
+                f"above 0, and {MOST_FRAMES} frames at most",
+            ),
             "ambient": (self.ambient in AMBIENTS, " or ".join(AMBIENTS)),
-            "beacon_rule": (self.beacon_rule in get_args(BeaconRule), " or ".join(get_args(BeaconRule))),
+            "beacon_rule": (
+                self.beacon_rule in get_args(BeaconRule),
+                " or ".join(get_args(BeaconRule)),
+            ),
             "perfect_knowledge": (isinstance(self.perfect_knowledge, bool), "true or false"),
-            "beacon_hz": (0 < self.beacon_hz <= self.simulation_hz, f"above 0, at most {self.simulation_hz}"),
+            "beacon_hz": (
+                0 < self.beacon_hz <= self.simulation_hz,
+                f"above 0, at most {self.simulation_hz}",
+            ),
             "beacon_delay_s": (0 <= self.beacon_delay_s <= 1, "seconds from 0 to 1"),
             "beacon_loss": (0 <= self.beacon_loss < 1, "a probability from 0, below 1"),
             "beacon_noise_rad": (0 <= self.beacon_noise_rad <= 7, "from 0 to 7"),
             "witnesses": (self.witnesses in WITNESSES, " or ".join(WITNESSES)),
-            **{name: (getattr(self, name) in VERSIONS, "1 or 2") for name in ("limits", "perception")},
+            **{
+                name: (getattr(self, name) in VERSIONS, "1 or 2")
+                for name in ("limits", "perception")
+            },
         }
         for field in fields(self):
             value = getattr(self, field.name)
-            least, most = next((BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None))
+            least, most = next(
+                (BOUNDS[unit] for unit in BOUNDS if field.name.endswith(unit)), (None, None)
+            )
             if least is not None and bounds.get(field.name, (True, ""))[0]:
-                fits = all(least <= each <= most for each in (value if isinstance(value, tuple) else [value]))
+                fits = all(
+                    least <= each <= most
+                    for each in (value if isinstance(value, tuple) else [value])
+                )
                 bounds[field.name] = fits, f"from {least:g} to {most:g}"
         for name, (fits, allowed) in bounds.items():
             if not fits:
-                raise UserError(f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}")
+                raise UserError(
+                    f"scenario: {name} is {printable(getattr(self, name))}; it must be {allowed}"
+                )
         beacon_radio(self.beacon_channel)
 
     @property
@@ -111,7 +134,9 @@ class Parameters:
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
-        """Return all parameters as plain values; those of `LATER` only if they differ from that value."""
+        """Return all parameters as plain values;
+        those of `LATER` only if they differ from that value.
+        """
         return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 
     @property
@@ -120,18 +145,24 @@ class Parameters:
         return frames(self.decision_lag_s, self.simulation_hz)
 
     def allowance_s(self, danger: str | None) -> float:
-        """Return how much later than the full-view driver an ego may be, in a layout with this danger."""
+        """Return how much later than the full-view driver an ego may be,
+        in a layout with this danger.
+        """
         return self.delay_allowance_s if danger or self.limits == 1 else self.harmless_allowance_s
 
     def due_frame(self, step: int) -> int:
-        """Return the frame in which a decision is due; after the last decision, that of the time limit."""
+        """Return the frame in which a decision is due;
+        after the last decision, that of the time limit.
+        """
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
         return round(due_s * self.simulation_hz)
 
 
 @dataclass(frozen=True)
 class Witnessed(Parameters):
-    """The parameters of a scenario with lookouts, by default as in `v2v-safety-2`: cooperation can fail."""
+    """The parameters of a scenario with lookouts, by default as in `v2v-safety-2`:
+    cooperation can fail.
+    """
 
     witnesses: str = "each"
     radio_share: float = 0.25
@@ -143,13 +174,15 @@ class Witnessed(Parameters):
 class Shared(Parameters):
     """The parameters of a scenario whose helpers have goals of their own (`Scenario.seats`)."""
 
-    # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them agents. Which
-    # ones do belongs to the layout, and those of a lower share are among those of a higher one
+    # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them
+    # agents. Which ones do belongs to the layout, and those of a lower share are among those of a
+    # higher one
     agent_share: float = 0.0
-    # whether agents decide at the same times (`together`), or each at times of its own, in quarters of a
-    # period after the others (`apart`); which belongs to the layout
+    # whether agents decide at the same times (`together`), or each at times of its own, in quarters
+    # of a period after the others (`apart`); which belongs to the layout
     clock: str = "together"
-    # time for whoever gave way to go on, and decisions for it: fewer would make a deadlock of every stop
+    # time for whoever gave way to go on, and decisions for it: fewer would make a deadlock of every
+    # stop
     decisions: int = 10
     time_limit_s: float = 14.0
     limits: int = 2
@@ -158,7 +191,9 @@ class Shared(Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.clock not in CLOCKS:
-            raise UserError(f"scenario: clock is {printable(self.clock)}; it must be {' or '.join(CLOCKS)}")
+            raise UserError(
+                f"scenario: clock is {printable(self.clock)}; it must be {' or '.join(CLOCKS)}"
+            )
 
 
 # Parameters that were added later, with the values of the earlier behaviour.
@@ -171,7 +206,9 @@ LATER = (
 
 @lru_cache(maxsize=64)
 def beacon_radio(text: str) -> Physical | None:
-    """Return the radio that `beacon_channel` names; None if it is empty. Raises UserError if it is wrong."""
+    """Return the radio that `beacon_channel` names; None if it is empty.
+    Raises UserError if it is wrong.
+    """
     if not text:
         return None
     name, *settings = text.split("+")
@@ -196,9 +233,12 @@ SUITES: dict[str, dict[str, Any]] = {
 
 # Parameters that change neither the vehicles nor their driving, but only what is known of them.
 DIALS = tuple(
-    field.name for field in fields(Parameters) if field.name.startswith(("beacon_", "perfect_", "ambient"))
+    field.name
+    for field in fields(Parameters)
+    if field.name.startswith(("beacon_", "perfect_", "ambient"))
 )
-# Further ones that a name may set: what counts, and where the scenario has lookouts, who has a radio.
+# Further ones that a name may set: what counts, and where the scenario has lookouts, who has a
+# radio.
 SETTABLE = (*DIALS, "limits", "perception")
 WITNESSED = (*SETTABLE, "witnesses", "radio_share")
 SHARED = (*SETTABLE, "agent_share", "clock")

@@ -1,12 +1,13 @@
 """The reference planner of `local-view` and `full-view`, which looks ahead along the ego's ways.
 
-It knows only the scene graph. It plays every sequence of meta-actions over the next decisions, then FASTER,
-against the conflicts of the graph at constant speed, and takes the first action of the sequence that passes
-the conflict zone soonest without meeting anyone. A vehicle that is seen to brake is assumed to brake until it
-stands. The planner does not guess what it cannot see, so occlusion has a cost.
+It knows only the scene graph. It plays every sequence of meta-actions over the next decisions, then
+FASTER, against the conflicts of the graph at constant speed, and takes the first action of the
+sequence that passes the conflict zone soonest without meeting anyone. A vehicle that is seen to
+brake is assumed to brake until it stands. The planner does not guess what it cannot see, so
+occlusion has a cost.
 
-Under `limits` 1 it plays only changes to ways that lie beside its own now, so that a driver who overtakes
-never comes back in what it plays. Under 2 it plays the way back, too.
+Under `limits` 1 it plays only changes to ways that lie beside its own now, so that a driver who
+overtakes never comes back in what it plays. Under 2 it plays the way back, too.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,8 @@ CALM = {"IDLE": 0, "FASTER": 1, "SLOWER": 2, "LANE_RIGHT": 3, "LANE_LEFT": 4}
 HORIZON = 4  # decisions that are played through; later ones are assumed to be FASTER
 LOOK_AHEAD_S = 9.0  # conflicts are looked for this far into the future
 MARGIN_M = 0.5  # added to every outline, for noise and for errors of the motion model
-RESPONSE_S = 0.6  # time constant of the ego's speed controller (highway-env's TAU_ACC), and of its steering
+# time constant of the ego's speed controller (highway-env's TAU_ACC), and of its steering
+RESPONSE_S = 0.6
 EMERGENCY_MPS2 = 6.0  # assumed deceleration of a vehicle that is seen to brake
 LATERAL_MPS2 = 7.0  # lateral acceleration that dry tyres hold in a bend
 AWAY_S = 0.5  # cost of ending beside the ego's own way
@@ -63,14 +65,17 @@ class Rollouts:
 
     @cached_property
     def speed_mps(self) -> Floats:
-        return np.asarray(np.diff(self.travelled_m, axis=1, prepend=self.travelled_m[:, :1]) / STEP_S)
+        return np.asarray(
+            np.diff(self.travelled_m, axis=1, prepend=self.travelled_m[:, :1]) / STEP_S
+        )
 
     @cached_property
     def fastest_mps(self) -> float:
         return float(self.speed_mps.max())
 
 
-# Speed, its target, decisions left, ways on either side, and how many ways to the right the ego's own one is.
+# Speed, its target, decisions left, ways on either side, and how many ways to the right the ego's
+# own one is.
 Start = tuple[float, float, int, tuple[int, int], int]
 
 
@@ -97,15 +102,26 @@ def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
     ]
     tried = _rollouts(scenario.actions, starts, p)
     return [
-        _chosen(scenario, graph, at_m, ways["own"], _sequences(scenario.actions, *start[2:], p), tried[start])
+        _chosen(
+            scenario,
+            graph,
+            at_m,
+            ways["own"],
+            _sequences(scenario.actions, *start[2:], p),
+            tried[start],
+        )
         for graph, (_, at_m), ways, start in zip(graphs, places, beside, starts, strict=True)
     ]
 
 
 def _chosen(
-    scenario: Scenario, graph: SceneGraph, at_m: float, own: PathKey, sequences: Sequences,
+    scenario: Scenario,
+    graph: SceneGraph,
+    at_m: float,
+    own: PathKey,
+    sequences: Sequences,
     tried: Rollouts,
-) -> str:  # fmt: skip
+) -> str:
     """Return the first action of the best sequence, for an ego at an arc length of its own way."""
     p, road = scenario.parameters, scenario.road()
     # The goal lies well behind the conflict points, so that a late burst of speed counts too.
@@ -127,10 +143,13 @@ def _chosen(
 
 def _too_fast(way: Path, at_m: float, tried: Rollouts, under_way: Bools | bool) -> Bools:
     """Return whether each motion takes a bend faster than tyres hold, (motions,)."""
-    if tried.fastest_mps**2 * way.sharpest <= LATERAL_MPS2:  # most ways are straight; the look-up costs
+    # most ways are straight; the look-up costs
+    if tried.fastest_mps**2 * way.sharpest <= LATERAL_MPS2:
         return np.zeros(len(tried.travelled_m), dtype=np.bool_)
     places = np.searchsorted(way.arc_m, at_m + tried.travelled_m).clip(0, len(way.arc_m) - 1)
-    return np.asarray(((tried.speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1))
+    return np.asarray(
+        ((tried.speed_mps**2 * way.bends[places] > LATERAL_MPS2) & under_way).any(axis=1)
+    )
 
 
 def _way(road: Road, ego: Ego) -> PathKey:
@@ -141,10 +160,11 @@ def _way(road: Road, ego: Ego) -> PathKey:
 def _sequences(
     actions: tuple[str, ...], left: int, sides: tuple[int, int], home: int, parameters: Parameters
 ) -> Sequences:
-    """Return every sequence that `left` decisions and the ways on either side allow; a shared value.
+    """Return every sequence that `left` decisions and the ways on either side allow;
+    a shared value.
 
-    Under `limits` 2 a sequence that ends beside the ego's own way, `home` ways to the right of the present
-    one, may also come back by a decision after `HORIZON`: an overtaking takes longer.
+    Under `limits` 2 a sequence that ends beside the ego's own way, `home` ways to the right of the
+    present one, may also come back by a decision after `HORIZON`: an overtaking takes longer.
     """
     returns = parameters.limits > 1 and any(sides)
     known = [a for a in actions if a in CALM and (a not in SIDE or returns or sides[SIDE[a] > 0])]
@@ -171,7 +191,9 @@ def _sequences(
 
 
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
-    """Return the levels by which each decision of sequences changes the target speed, (n, decisions)."""
+    """Return the levels by which each decision of sequences changes the target speed, (n,
+    decisions).
+    """
     return np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
 
 
@@ -191,7 +213,8 @@ def _rollouts(
             _, place = np.unique(travelled[:, -1], return_inverse=True)
             both = place * len(place) + tried.shift
             _, first, motion = np.unique(both, return_index=True, return_inverse=True)
-            if not np.array_equal(travelled[first][motion], travelled):  # others come as far in the end
+            # others come as far in the end
+            if not np.array_equal(travelled[first][motion], travelled):
                 first = motion = np.arange(len(travelled))
             right_m = None if tried.right_m is None else tried.right_m[first]
             rollouts[start] = Rollouts(travelled[first], right_m, motion)
@@ -201,11 +224,12 @@ def _rollouts(
 def travelled_m(
     moves: Ints, speeds_mps: Floats, targets_mps: Floats, left: int, parameters: Parameters
 ) -> Floats:
-    """Return the distance travelled (m) from each start by each sequence, (starts, sequences, steps).
+    """Return the distance travelled (m) from each start by each sequence,
+    (starts, sequences, steps).
 
-    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to the
-    present speed, and IDLE keeps the target. `moves` are levels of each decision, (sequences, decisions); a
-    start has a speed and a target speed, and `left` decisions remain.
+    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to
+    the present speed, and IDLE keeps the target. `moves` are levels of each decision, (sequences,
+    decisions); a start has a speed and a target speed, and `left` decisions remain.
     """
     levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
@@ -220,7 +244,9 @@ def travelled_m(
             nearest = np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int)
             level = np.clip(nearest + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = ((target - speed) / RESPONSE_S).clip(-parameters.braking_mps2, parameters.acceleration_mps2)
+        change = ((target - speed) / RESPONSE_S).clip(
+            -parameters.braking_mps2, parameters.acceleration_mps2
+        )
         distance = distance + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[k] = distance
@@ -228,12 +254,16 @@ def travelled_m(
 
 
 def _right_m(ends: Ints, parameters: Parameters) -> Floats:
-    """Return the ego's distance to the right, (n, steps), from its way after each decision, (n, k)."""
+    """Return the ego's distance to the right, (n, steps),
+    from its way after each decision, (n, k).
+    """
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
     right = np.empty((len(ends), steps))
     now = np.zeros(len(ends))
     for k in range(steps):
-        now = now + (ends[:, min(k // every, ends.shape[1] - 1)] * LANE_M - now) * STEP_S / RESPONSE_S
+        now = (
+            now + (ends[:, min(k // every, ends.shape[1] - 1)] * LANE_M - now) * STEP_S / RESPONSE_S
+        )
         right[:, k] = now
     return right
 
@@ -250,14 +280,17 @@ class Motion:
 
 
 def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
-    """Predict the vehicles that the ego could meet: they keep path and speed, and their place in a queue."""
+    """Predict the vehicles that the ego could meet:
+    they keep path and speed, and their place in a queue.
+    """
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph.ego)
     way = road.paths[key]
     type_of: dict[str, str] = {node.id: node.type for node in graph.nodes}
     type_of[graph.viewer] = graph.itself.type or "car"
     motions, queue = [], dict[str, Motion]()
-    for conflict in sorted(graph.conflicts, key=lambda c: -c.ego.arc_m):  # the first in a queue first
+    # the first in a queue first
+    for conflict in sorted(graph.conflicts, key=lambda c: -c.ego.arc_m):
         kind, ego, other = conflict.kind, conflict.ego, conflict.other
         size = SIZES_M.get(type_of.get(conflict.vehicle, ""), SIZES_M["car"])
         its_m = _travelled_m(other, time_s)
@@ -283,7 +316,9 @@ def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
 
 
 def _travelled_m(other: Arrival, time_s: Floats) -> Floats:
-    """Return the distance that a vehicle travels at its speed, or while it brakes until it stands."""
+    """Return the distance that a vehicle travels at its speed,
+    or while it brakes until it stands.
+    """
     if not other.braking:
         return np.asarray(other.speed_mps * time_s)
     until_s = np.minimum(time_s, other.speed_mps / EMERGENCY_MPS2)
@@ -295,8 +330,8 @@ def least_gap(
 ) -> Floats:
     """Return the smallest gap (m) to another vehicle while the ego is under way, (motions,).
 
-    Below 0 they meet. A gap wider than `within_m` may be infinite, since only moments are looked at in which
-    both are near.
+    Below 0 they meet. A gap wider than `within_m` may be infinite,
+    since only moments are looked at in which both are near.
     """
     (own, own_reach), (away, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
     (x, y), off_m = _middles(tried, motion.way, motion.begin_m)
@@ -319,7 +354,9 @@ def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
     Shared: do not write to it.
     """
     spacing_m, off_m = float(way.arc_m[1]), way.uneven_m
-    point = np.rint((begin_m + tried.travelled_m) / spacing_m).astype(int).clip(0, len(way.arc_m) - 1)
+    point = (
+        np.rint((begin_m + tried.travelled_m) / spacing_m).astype(int).clip(0, len(way.arc_m) - 1)
+    )
     x, y = way.columns[0][point], way.columns[1][point]
     if tried.right_m is None:
         return (x, y), spacing_m + off_m
@@ -331,14 +368,18 @@ def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
 
 @lru_cache(maxsize=64)
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Return discs that cover a vehicle: their positions on its long axis, shared, and their radius."""
+    """Return discs that cover a vehicle:
+    their positions on its long axis, shared, and their radius.
+    """
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count
     return places, float(np.hypot(length_m / count / 2, width_m / 2))
 
 
 def _discs(path: Path, arc_m: Floats, away_m: Floats, right_m: Floats | None = None) -> Point:
-    """Return x and y (discs, ...) of a vehicle's discs at arc lengths (...) of a path, or to its right."""
+    """Return x and y (discs, ...) of a vehicle's discs at arc lengths (...) of a path,
+    or to its right.
+    """
     x, y, heading = path.places(arc_m)
     cos, sin = np.cos(heading), np.sin(heading)
     if right_m is not None:

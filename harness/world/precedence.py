@@ -1,15 +1,16 @@
 """Rules of the road between vehicles that keep them: who goes first where two paths meet.
 
-`right-hand` is Article 18.4 of the Convention on Road Traffic (Vienna 1968): where nothing is signed, one
-gives way to who comes from the right. `first-come` lets go first who would be there first, and of two who
-come within `TIE_S` the one with the lower id. Under both, who can no longer stop goes first.
+`right-hand` is Article 18.4 of the Convention on Road Traffic (Vienna 1968): where nothing is
+signed, one gives way to who comes from the right. `first-come` lets go first who would be there
+first, and of two who come within `TIE_S` the one with the lower id. Under both, who can no longer
+stop goes first.
 
-Where two roads merge, nobody comes from the right, and under `right-hand` the one with right of way goes
-first; of two who come head-on, the one who is sooner in the middle; of two who stand, the one with the lower
-id: four who wait for each other would wait for ever.
+Where two roads merge, nobody comes from the right, and under `right-hand` the one with right of way
+goes first; of two who come head-on, the one who is sooner in the middle; of two who stand, the one
+with the lower id: four who wait for each other would wait for ever.
 
-Whoever bears the id of an ego or of a helper is expected to keep the rule. That is too much where some of
-them decide nothing (`agent_share` below 1).
+Whoever bears the id of an ego or of a helper is expected to keep the rule. That is too much where
+some of them decide nothing (`agent_share` below 1).
 """
 
 from collections.abc import Callable, Mapping
@@ -22,8 +23,10 @@ from harness.world.scenario import Scenario
 from harness.world.scene_graph import Conflict, EgoArrival, SceneGraph
 from harness.world.state import SIZES_M
 
-KEEPING = ("v1", "v2", "v3", "v4")  # ids of the ego and of whom it asks (`harness.world.scenario.Draws.ids`)
-TIE_S = 0.2  # arrivals nearer to each other in time are at once, for each knows the other's with an error
+# ids of the ego and of whom it asks (`harness.world.scenario.Draws.ids`)
+KEEPING = ("v1", "v2", "v3", "v4")
+# arrivals nearer to each other in time are at once, for each knows the other's with an error
+TIE_S = 0.2
 GAP_S = 0.5  # who gives way leaves the other so long, since it may be slower than it seems
 STANDS_MPS = 0.5  # who is slower stands
 HEAD_ON = -0.9  # cosine between headings below which two come head-on
@@ -54,9 +57,11 @@ def _turn_rad(road: Road, conflict: Conflict) -> float:
 
 def _sooner(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
     own_s, other_s = (
-        np.inf if arrival.time_s is None else arrival.time_s for arrival in (conflict.ego, conflict.other)
+        np.inf if arrival.time_s is None else arrival.time_s
+        for arrival in (conflict.ego, conflict.other)
     )
-    if np.cos(_turn_rad(road, conflict)) < HEAD_ON:  # they meet in the middle, wherever each has to wait
+    # they meet in the middle, wherever each has to wait
+    if np.cos(_turn_rad(road, conflict)) < HEAD_ON:
         path, at = (
             road.paths[conflict.sector, conflict.route],
             road.crossings[conflict.sector, conflict.route],
@@ -75,15 +80,16 @@ def _lower(graph: SceneGraph, conflict: Conflict) -> bool:
 
 # Whether the ego goes before the other vehicle of a conflict.
 RULES: Mapping[str, Callable[[Road, SceneGraph, Conflict], bool]] = {
-    "right-hand": _from_the_right, "first-come": _sooner,
-}  # fmt: skip
+    "right-hand": _from_the_right,
+    "first-come": _sooner,
+}
 
 
 def under(rule: str, scenario: Scenario, graph: SceneGraph) -> SceneGraph:
     """Return a graph of the ego in which others keep a rule.
 
-    It is without the conflicts with those who give way to the ego. Those to whom it gives way come at their
-    speed, and also at the highest, and also a little later: they need not mind the ego.
+    It is without the conflicts with those who give way to the ego. Those to whom it gives way come
+    at their speed, and also at the highest, and also a little later: they need not mind the ego.
     """
     p, road = scenario.parameters, scenario.road()
     top_mps, conflicts = p.target_speeds_mps[-1], list[Conflict]()

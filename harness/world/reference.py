@@ -22,31 +22,41 @@ BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `su
 
 
 def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, str]]:
-    """Return the meta-action of each world's driver for each of its agents under way, by their places.
+    """Return the meta-action of each world's driver for each of its agents under way,
+    by their places.
 
     The worlds are of one scenario.
     """
     deciding = [
-        (n, agent) for n, world in enumerate(worlds)
-        for agent, journey in world.journeys.items() if not journey.outcome.ended
-    ]  # fmt: skip
+        (n, agent)
+        for n, world in enumerate(worlds)
+        for agent, journey in world.journeys.items()
+        if not journey.outcome.ended
+    ]
     actions: list[dict[int, str]] = [{} for _ in worlds]
     for scenario, at_seat in places_by(worlds[n].seat(agent) for n, agent in deciding).items():
         places = [deciding[at] for at in at_seat]
-        states = {(n, agent): worlds[n].state(agent) for n, agent in places if drivers[n] in LOOKING}
+        states = {
+            (n, agent): worlds[n].state(agent) for n, agent in places if drivers[n] in LOOKING
+        }
         truthful = [at for at in states if drivers[at[0]] == PRIVILEGED]
         others = [at for at in states if drivers[at[0]] != PRIVILEGED]
         seen = scene_graphs(scenario, [(states[at], states[at].ego.id) for at in others])
         graphs = dict(zip(others, seen, strict=True))
-        graphs |= zip(truthful, truth_graphs(scenario, [states[at] for at in truthful]), strict=True)
-        asked = [(drivers[n], graphs.get((n, agent)), graphs.get((n, agent))) for n, agent in places]
+        graphs |= zip(
+            truthful, truth_graphs(scenario, [states[at] for at in truthful]), strict=True
+        )
+        asked = [
+            (drivers[n], graphs.get((n, agent)), graphs.get((n, agent))) for n, agent in places
+        ]
         for (n, agent), action in zip(places, choices(scenario, asked), strict=True):
             actions[n][agent] = action
     return actions
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
-    """Let each world's driver take all remaining decisions of each agent; return the ego's outcomes.
+    """Let each world's driver take all remaining decisions of each agent;
+    return the ego's outcomes.
 
     The worlds are of one scenario.
     """
@@ -56,7 +66,9 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
     """Do what `finish` says; return each world's actions of each agent, by its place."""
-    taken: list[dict[int, list[str]]] = [{agent: [] for agent in world.journeys} for world in worlds]
+    taken: list[dict[int, list[str]]] = [
+        {agent: [] for agent in world.journeys} for world in worlds
+    ]
     while going := [n for n, world in enumerate(worlds) if not world.ended]:
         driven = [worlds[n] for n in going]
         actions = decide(driven, [drivers[n] for n in going])
@@ -68,7 +80,9 @@ def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, lis
 
 
 def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:
-    """Let the agents of each world act, by their places, after the lag, and simulate to the next decision."""
+    """Let the agents of each world act, by their places, after the lag,
+    and simulate to the next decision.
+    """
     p = worlds[0].scenario.parameters
     lockstep.advance(worlds, [p.due_frame(world.step) + p.lag_frames for world in worlds])
     for world, chosen in zip(worlds, actions, strict=True):
@@ -86,13 +100,18 @@ def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
-    """Drive episodes with every driver; one that clears too long after the full-view driver is `late`."""
+    """Drive episodes with every driver;
+    one that clears too long after the full-view driver is `late`.
+    """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     ended = iter(finish(worlds, DRIVERS * len(seeds)))
     outcomes = [{driver: next(ended) for driver in DRIVERS} for _ in seeds]
     dangers = [world.layout.danger for world in worlds[:: len(DRIVERS)]]
     return [
-        {driver: out.judged(of[PRIVILEGED], danger, scenario.parameters) for driver, out in of.items()}
+        {
+            driver: out.judged(of[PRIVILEGED], danger, scenario.parameters)
+            for driver, out in of.items()
+        }
         for of, danger in zip(outcomes, dangers, strict=True)
     ]
 
@@ -105,12 +124,16 @@ def drive_apart(
 
 
 def in_chunks(
-    drives: Callable[[Sequence[int]], list[T]], seeds: Sequence[int], together: int, workers: Workers,
+    drives: Callable[[Sequence[int]], list[T]],
+    seeds: Sequence[int],
+    together: int,
+    workers: Workers,
     progress: Callable[[int], None],
-) -> list[T]:  # fmt: skip
+) -> list[T]:
     """Return what comes of some layouts, so many of which are driven together, on workers."""
     chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
-    sizes = iter(map(len, chunks))  # all but the last have one size, so the order of completion is no matter
+    # all but the last have one size, so the order of completion is no matter
+    sizes = iter(map(len, chunks))
     parts = spread(
         drives,
         chunks,
@@ -134,11 +157,15 @@ def check(
 def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
     """Return rates of results (Wilson, n is episodes), collisions by fault, and crashes of others.
 
-    Where some episodes are `dangerous` and some are not, also success in either, and the mean of both.
+    Where some episodes are `dangerous` and some are not, also success in either,
+    and the mean of both.
     """
     by_danger: dict[str, Estimate] = {}
     if any(dangerous) and not all(dangerous):
-        success, has_danger = np.array([float(outcome.success) for outcome in outcomes]), np.array(dangerous)
+        success, has_danger = (
+            np.array([float(outcome.success) for outcome in outcomes]),
+            np.array(dangerous),
+        )
         halves = [rate_interval(success[of_half]) for of_half in (has_danger, ~has_danger)]
         by_danger = dict(zip(BY_DANGER, (mean_of(halves), *halves), strict=True))
     rates = {

@@ -1,9 +1,10 @@
 """What an agent's decisions cost it, had the others done exactly what they did.
 
-An agent's courses are those of `joint`: its first `HORIZON` decisions are free, then it takes `FASTER`. The
-others take the actions that they took, whatever it does: who would have reacted does not, and who was hit by
-it drives on. So the times of the others stay, and a second that it loses is one that all lose together. What
-it could have been is exact, but for other traffic, which brakes for it and for nobody else.
+An agent's courses are those of `joint`: its first `HORIZON` decisions are free, then it takes
+`FASTER`. The others take the actions that they took, whatever it does: who would have reacted does
+not, and who was hit by it drives on. So the times of the others stay, and a second that it loses is
+one that all lose together. What it could have been is exact, but for other traffic, which brakes
+for it and for nobody else.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,8 @@ class Regret:
 
     best_decisions: float  # share of decisions after which an agent can arrive as soon as before
     gave_away: (
-        float  # share of agents after one of whose decisions they could no longer arrive, but before it
+        # share of agents after one of whose decisions they could no longer arrive, but before it
+        float
     )
     regret_s: float  # how much later the others arrive at the soonest after their decisions, mean
 
@@ -30,8 +32,8 @@ class Regret:
 def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regret:
     """Return what decisions of a layout's agents cost.
 
-    `able` is what each can do and `courses` the one that each took, by its place. Decisions count while their
-    agent can still arrive.
+    `able` is what each can do and `courses` the one that each took, by its place.
+    Decisions count while their agent can still arrive.
     """
     delays, spent_s = list[Floats](), list[float]()
     for agent, its in able.items():
@@ -49,13 +51,17 @@ def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regre
 
 
 def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floats:
-    """Return when an agent can arrive at the soonest, before its first decision and after each one, in s.
+    """Return when an agent can arrive at the soonest,
+    before its first decision and after each one, in s.
 
-    inf for never. The decisions are the first `HORIZON` of its course. How it went on is one of its options.
+    inf for never. The decisions are the first `HORIZON` of its course.
+    How it went on is one of its options.
     """
     arrives_s, its_s = (np.where(passes(of, others), of.arrives_s, np.inf) for of in (able, course))
     first = list(course.actions[0][:HORIZON])
-    like = [[list(actions[:k]) == first[:k] for actions in able.actions] for k in range(len(first) + 1)]
+    like = [
+        [list(actions[:k]) == first[:k] for actions in able.actions] for k in range(len(first) + 1)
+    ]
     return np.array([arrives_s[rows].min(initial=its_s[0]) for rows in np.array(like, dtype=bool)])
 
 

@@ -1,7 +1,7 @@
 """A road as a set of paths: where vehicles can drive, where paths cross, and what surrounds them.
 
-Frame: metres, x to the east, y to the *south* (highway-env's screen frame), headings in radians from +x
-towards +y.
+Frame: metres, x to the east, y to the *south* (highway-env's screen frame),
+headings in radians from +x towards +y.
 """
 
 import math
@@ -38,7 +38,8 @@ class Path:
     route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
     points: Floats  # evenly spaced points, (n, 2) m
     arc_m: Floats  # distance of each point along the path, (n,)
-    # arc lengths at which a section ends and the next begins; paths of one approach share the first section
+    # arc lengths at which a section ends and the next begins; paths of one approach share the first
+    # section
     ends_m: tuple[float, ...]
     roles: tuple[str, ...]  # name of each section in a scene graph
     lanes: tuple[Lane, ...]  # lane of each section
@@ -46,13 +47,20 @@ class Path:
 
     @classmethod
     def along(
-        cls, network: Any, approach: str, route: str, lanes: Sequence[Lane], roles: Sequence[str],
-        priority: int, origin_m: tuple[float, float] = (0.0, 0.0), reach_m: float = math.inf,
-    ) -> "Path":  # fmt: skip
+        cls,
+        network: Any,
+        approach: str,
+        route: str,
+        lanes: Sequence[Lane],
+        roles: Sequence[str],
+        priority: int,
+        origin_m: tuple[float, float] = (0.0, 0.0),
+        reach_m: float = math.inf,
+    ) -> "Path":
         """Build a path along the middle of consecutive lanes of highway-env.
 
-        Only the part of a lane within `reach_m` of the origin of the road's frame counts, but at least one
-        point.
+        Only the part of a lane within `reach_m` of the origin of the road's frame counts,
+        but at least one point.
         """
         middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
@@ -60,7 +68,16 @@ class Path:
         ends = arc[np.cumsum([len(middle) for middle in middles])[:-1]]
         even = np.linspace(0.0, arc[-1], math.ceil(arc[-1] / STEP_M) + 1)
         points = np.column_stack([np.interp(even, arc, along) for along in corners.T])
-        return cls(approach, route, points, even, tuple(ends.tolist()), tuple(roles), tuple(lanes), priority)
+        return cls(
+            approach,
+            route,
+            points,
+            even,
+            tuple(ends.tolist()),
+            tuple(roles),
+            tuple(lanes),
+            priority,
+        )
 
     @cached_property
     def columns(self) -> Floats:
@@ -88,7 +105,9 @@ class Path:
 
     @cached_property
     def uneven_m(self) -> float:
-        """Largest distance of a point from where it would be if all were as far apart as the first two."""
+        """Largest distance of a point from where it would be if all were as far apart as the first
+        two.
+        """
         return float(np.abs(self.arc_m - self.arc_m[1] * np.arange(len(self.arc_m))).max())
 
     @cached_property
@@ -96,10 +115,13 @@ class Path:
         """Largest change of the heading from one point to the next."""
         return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
 
-    # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene share most.
+    # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene
+    # share most.
     @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
-        """Return arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest point."""
+        """Return arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest
+        point.
+        """
         arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
         return arc, lateral, heading
 
@@ -113,7 +135,9 @@ class Path:
             nearest = np.rint(np.clip(steps, 0, len(self.points) - 1)).astype(int)
         # Of equally near points the first counts, whichever the search's rounding takes.
         beside = np.clip(nearest[:, None] + [-1, 0, 1], 0, len(self.points) - 1)
-        gaps = np.hypot(self.columns[0][beside] - x_m[:, None], self.columns[1][beside] - y_m[:, None])
+        gaps = np.hypot(
+            self.columns[0][beside] - x_m[:, None], self.columns[1][beside] - y_m[:, None]
+        )
         at = np.arange(len(nearest)), gaps.argmin(axis=1)
         point, gap = beside[at], gaps[at]
         heading = self.headings_rad[point]
@@ -143,7 +167,11 @@ class Path:
     def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Return x (m), y (m) and heading (rad) at arc lengths (...), as `at` does."""
         x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
-        return x, y, self.headings_rad[np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1)]
+        return (
+            x,
+            y,
+            self.headings_rad[np.searchsorted(self.arc_m, arc_m).clip(0, len(self.arc_m) - 1)],
+        )
 
     def points_at(self, arc_m: Floats) -> Floats:
         """Return the positions (n, 2) m at arc lengths (n,)."""
@@ -186,10 +214,12 @@ class Crossing:
 class Ground:
     """The parts of a road that pictures show, in m to the east and to the *north*."""
 
-    outlines: tuple[Floats, ...]  # edges of the surface, (n, 2) each: the outer one, and those of islands
+    # edges of the surface, (n, 2) each: the outer one, and those of islands
+    outlines: tuple[Floats, ...]
     marks: tuple[Floats, ...]  # centre lines, (n, 2) each
     stops: tuple[Floats, ...]  # stop lines, (n, 2) each
-    boxes: tuple[Floats, ...]  # south-west and north-east corners (2, 2) of areas that labels must avoid
+    # south-west and north-east corners (2, 2) of areas that labels must avoid
+    boxes: tuple[Floats, ...]
 
 
 @dataclass(frozen=True)
@@ -202,23 +232,24 @@ class Road:
     ego: PathKey  # key of the ego's path
     # points where other paths meet the ego's, at which conflicts are looked for
     crossings: Mapping[PathKey, Crossing]
-    zone_m: tuple[float, float]  # position of the conflict zone; messages are weighted by the distance to it
+    # position of the conflict zone; messages are weighted by the distance to it
+    zone_m: tuple[float, float]
     # sectors that danger can come from, each with the points (k, 2) m that must be seen
     sectors: Mapping[str, Floats]
     # returns highway-env's network, always the same object, which must not be written to
     network: Callable[[], Any]
-    # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie side by side
-    # and are equally long
+    # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie
+    # side by side and are equally long
     ways: tuple[PathKey, ...] = ()
-    # form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as in the
-    # frozen dataset `occluded-intersection-v2`
+    # form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as
+    # in the frozen dataset `occluded-intersection-v2`
     form: Literal[1, 2] = 2
     origin_m: tuple[float, float] = (0.0, 0.0)  # position of the origin in highway-env's own frame
-    # returns, for the scenario's parameters, the arc length of the ego's path at which the episode ends;
-    # vehicles beyond do not matter. None if the goal is not a place on its path
+    # returns, for the scenario's parameters, the arc length of the ego's path at which the episode
+    # ends; vehicles beyond do not matter. None if the goal is not a place on its path
     goal_m: Callable[[Any], float] | None = None
-    # returns the ground for a picture that reaches so many metres from the origin; None if it is that of the
-    # network's lanes
+    # returns the ground for a picture that reaches so many metres from the origin; None if it is
+    # that of the network's lanes
     ground: Callable[[float], Ground] | None = None
 
     def ground_within(self, far_m: float) -> Ground:
@@ -226,7 +257,8 @@ class Road:
         return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
-        """Return the way that the ego is on, `own`, and those to its `left` and `right` if there are any.
+        """Return the way that the ego is on, `own`,
+        and those to its `left` and `right` if there are any.
 
         With an arc length, only ways that are in a separate lane at that place.
         """
@@ -245,7 +277,9 @@ class Road:
         }
 
     def project(self, keys: Sequence[PathKey], x_m: Floats, y_m: Floats) -> Floats:
-        """Return what `Path.project` does for points, each on a path of its own, all (n,), as (3, n)."""
+        """Return what `Path.project` does for points, each on a path of its own, all (n,),
+        as (3, n).
+        """
         projected, places = np.empty((3, len(keys))), defaultdict[PathKey, list[int]](list)
         for n, key in enumerate(keys):
             places[key].append(n)
@@ -255,12 +289,16 @@ class Road:
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
-        """Sections (path and number) that several paths of one approach share; an indicator tells which."""
+        """Sections (path and number) that several paths of one approach share;
+        an indicator tells which.
+        """
         of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
         for key, path in self.paths.items():
             for section, lane in enumerate(path.lanes):
                 of_lane.setdefault((path.approach, lane), []).append((key, section))
-        return frozenset(place for places in of_lane.values() if len(places) > 1 for place in places)
+        return frozenset(
+            place for places in of_lane.values() if len(places) > 1 for place in places
+        )
 
     @cached_property
     def ego_path(self) -> Path:
@@ -280,7 +318,9 @@ class Road:
 def paths_along(
     network: Any, ways: Mapping[PathKey, tuple[Sequence[Lane], Sequence[str], int]]
 ) -> dict[PathKey, Path]:
-    """Build paths by approach and route, each of consecutive lanes, with their roles and its right of way."""
+    """Build paths by approach and route, each of consecutive lanes,
+    with their roles and its right of way.
+    """
     return {
         key: Path.along(network, *key, lanes, roles, priority)
         for key, (lanes, roles, priority) in ways.items()
@@ -316,15 +356,20 @@ def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple
 
     net = RoadNetwork()
     for start, end, begin_m, end_m, y_m, lines in lanes:
-        net.add_lane(start, end, StraightLane([begin_m, y_m], [end_m, y_m], width_m, line_types=lines))
+        net.add_lane(
+            start, end, StraightLane([begin_m, y_m], [end_m, y_m], width_m, line_types=lines)
+        )
     return net
 
 
-def to_the_left(begin: tuple[float, float], end: tuple[float, float], width_m: float) -> tuple[Any, Any]:
-    """Build a shift to the left from two arcs of highway-env, the first to the left and the second back.
+def to_the_left(
+    begin: tuple[float, float], end: tuple[float, float], width_m: float
+) -> tuple[Any, Any]:
+    """Build a shift to the left from two arcs of highway-env,
+    the first to the left and the second back.
 
-    Both ends (metres) head east, and the end lies farther north. Unlike those of highway-env's `SineLane`,
-    the arcs' longitudinal coordinate is their length.
+    Both ends (metres) head east, and the end lies farther north. Unlike those of highway-env's
+    `SineLane`, the arcs' longitudinal coordinate is their length.
     """
     from highway_env.road.lane import CircularLane, LineType
 
@@ -352,11 +397,14 @@ def lanes_of(network: Any) -> dict[Lane, Any]:
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
-    """Build the ground of highway-env's lanes up to `far_m`: their surface, and the lines within it."""
+    """Build the ground of highway-env's lanes up to `far_m`:
+    their surface, and the lines within it.
+    """
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
     strips = [
-        LineString(_middle(lane, origin_m)).buffer(lane.width / 2 + 0.05, cap_style="flat") for lane in lanes
+        LineString(_middle(lane, origin_m)).buffer(lane.width / 2 + 0.05, cap_style="flat")
+        for lane in lanes
     ]
     surface = shapely.union_all(strips).buffer(1.0).buffer(-1.0).intersection(view)
     pieces = [piece for piece in shapely.get_parts(surface) if piece.geom_type == "Polygon"]
@@ -371,10 +419,12 @@ def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> It
         if lane.line_types[side] == STRIPED:
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
             edge_m = (side - 0.5) * lane.width
-            line = LineString([lane.position(s, edge_m) for s in along] - np.array(origin_m)).intersection(
-                view
+            line = LineString(
+                [lane.position(s, edge_m) for s in along] - np.array(origin_m)
+            ).intersection(view)
+            yield from (
+                np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1
             )
-            yield from (np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1)
 
 
 def _boxes(strips: Sequence[Any], view: Any) -> Iterator[Floats]:

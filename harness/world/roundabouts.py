@@ -1,4 +1,6 @@
-"""Roundabouts of one lane with four arms, as roads; traffic goes round from an arm to that on its right."""
+"""Roundabouts of one lane with four arms, as roads;
+traffic goes round from an arm to that on its right.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +16,10 @@ from harness.world.road import Lane, Path
 LANE_WIDTH_M = 4.0
 ARM_M = 80.0  # length of the straight before and behind the arcs
 ARMS = "senw"  # south, east, north and west: the way cars go round
-RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")  # as in highway-env: entries and exits in order
-NAMES = ("own", "right", "oncoming", "left")  # of the arms, from an agent's own on, the way cars go round
+# as in highway-env: entries and exits in order
+RING = ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")
+# of the arms, from an agent's own on, the way cars go round
+NAMES = ("own", "right", "oncoming", "left")
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,8 @@ class Roundabout:
 
     ring_m: float  # radius of the middle of the ring's lane
     entry_m: float  # radius of the arcs by which cars enter and leave
-    beside_m: float  # from an arm's centre line to the middle of its lanes, beside the splitter island
+    # from an arm's centre line to the middle of its lanes, beside the splitter island
+    beside_m: float
 
     @property
     def arc_y_m(self) -> float:
@@ -52,7 +57,9 @@ class Roundabout:
         streets = RoadNetwork()
         for quarters, c in enumerate(ARMS):
             turn = -math.pi / 2 * quarters
-            rotate = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]).round(12)
+            rotate = np.array(
+                [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+            ).round(12)
 
             def at(x: float, y: float, rotate: Floats = rotate) -> Floats:
                 turned: Floats = rotate @ np.array([x, y])
@@ -60,7 +67,9 @@ class Roundabout:
 
             def arc(side: int, begin: float, end: float, at: Any = at, turn: float = turn) -> Any:
                 centre = at(side * (beside + entry), arc_y)
-                return CircularLane(centre, entry, turn + begin, turn + end, True, line_types=(edge, edge))
+                return CircularLane(
+                    centre, entry, turn + begin, turn + end, True, line_types=(edge, edge)
+                )
 
             far = arc_y + ARM_M
             way_in = StraightLane(at(beside, far), at(beside, arc_y), line_types=(edge, edge))
@@ -71,20 +80,24 @@ class Roundabout:
             streets.add_lane(f"{c}xs", f"{c}xr", way_out)
         for n, (begin, end) in enumerate(zip(RING, RING[1:] + RING[:1], strict=True)):
             start_rad, end_rad = self.ring_rad(n), self.ring_rad(n + 1)
-            lane = CircularLane((0.0, 0.0), self.ring_m, start_rad, end_rad, False, line_types=(none, edge))
+            lane = CircularLane(
+                (0.0, 0.0), self.ring_m, start_rad, end_rad, False, line_types=(none, edge)
+            )
             streets.add_lane(begin, end, lane)
         return streets
 
     def path(
         self, approach: str, route: str, begin: str, end: str, priority: int, own: str = ARMS[0]
     ) -> Path:
-        """Build the path from the arm of `begin`, by the ring, to the arm of `end` (arms by first letter).
+        """Build the path from the arm of `begin`, by the ring,
+        to the arm of `end` (arms by first letter).
 
         Sections are named as an agent from the arm `own` sees them.
         """
         first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
         nodes = [
-            RING[k % len(RING)] for k in range(first, last + 1 if last > first else last + len(RING) + 1)
+            RING[k % len(RING)]
+            for k in range(first, last + 1 if last > first else last + len(RING) + 1)
         ]
         lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
         lanes += [(a, b, 0) for a, b in pairwise(nodes)]
@@ -93,10 +106,15 @@ class Roundabout:
         return Path.along(self.network(), approach, route, lanes, roles, priority)
 
     def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
-        """Return three boxes (west, north, east, south) whose corners lie on a circle around the origin."""
+        """Return three boxes (west, north, east, south) whose corners lie on a circle around the
+        origin.
+        """
         boxes = []
         for degrees in (22.5, 45.0, 67.5):
-            x, y = radius_m * math.cos(math.radians(degrees)), radius_m * math.sin(math.radians(degrees))
+            x, y = (
+                radius_m * math.cos(math.radians(degrees)),
+                radius_m * math.sin(math.radians(degrees)),
+            )
             boxes.append((-x, -y, x, y))
         return boxes
 

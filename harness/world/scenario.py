@@ -1,4 +1,6 @@
-"""The interface of a scenario: parameters, layout, road, goal. Other code takes a scenario as an argument."""
+"""The interface of a scenario: parameters, layout, road, goal.
+Other code takes a scenario as an argument.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import InitVar, dataclass, field
@@ -15,7 +17,9 @@ from harness.world.state import Building, Kind, Part
 
 @dataclass(frozen=True)
 class Draws:
-    """Random draws of one layout. Each quantity has its own, so one parameter does not change another's."""
+    """Random draws of one layout. Each quantity has its own,
+    so one parameter does not change another's.
+    """
 
     scenario: str
     seed: int
@@ -30,9 +34,11 @@ class Draws:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def ids(self, names: Collection[str]) -> dict[str, str]:
-        """Draw ids, after those of the ego and three helpers, so that an id tells nothing about its vehicle.
+        """Draw ids, after those of the ego and three helpers,
+        so that an id tells nothing about its vehicle.
 
-        Absent vehicles have ids, too, so a gap between two ids tells nothing either; so have `seats`.
+        Absent vehicles have ids, too, so a gap between two ids tells nothing either;
+        so have `seats`.
         """
         names = (*names, *self.seats)
         order = noise.generator(self.scenario, self.seed, "ids").permutation(len(names)).tolist()
@@ -67,19 +73,26 @@ class Layout:
 
     @classmethod
     def arranged(
-        cls, spawns: Iterable[Spawn], danger: str | None, danger_id: str, buildings: Iterable[Building] = ()
+        cls,
+        spawns: Iterable[Spawn],
+        danger: str | None,
+        danger_id: str,
+        buildings: Iterable[Building] = (),
     ) -> "Layout":
-        """Return a layout with vehicles in the order of their ids; without a danger nobody is `danger_id`."""
+        """Return a layout with vehicles in the order of their ids;
+        without a danger nobody is `danger_id`.
+        """
         order = sorted(spawns, key=lambda spawn: int(spawn.id[1:]))
         return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
 
 
 @dataclass(frozen=True)
 class Seat:
-    """The view of an agent that is not the ego: a scene in which it is, on the same network and in its frame.
+    """The view of an agent that is not the ego:
+    a scene in which it is, on the same network and in its frame.
 
-    The scenario has the same name and actions, and whatever parameters the shared one has; road, goal and
-    words are the agent's.
+    The scenario has the same name and actions, and whatever parameters the shared one has;
+    road, goal and words are the agent's.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
@@ -96,23 +109,27 @@ class Scenario:
     actions: tuple[str, ...]
     parameters: Parameters  # its parameters
     road: Callable[[], Road]  # returns the road, always the same object
-    layout: Callable[[int, Any], Layout]  # draws the start of a seed's episode, `(seed, parameters)`
-    # tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called after every
-    # frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's own frame (..., V,
-    # 2), the ego first, NaN where a world has fewer, and `approaches` theirs (..., V)
+    # draws the start of a seed's episode, `(seed, parameters)`
+    layout: Callable[[int, Any], Layout]
+    # tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called
+    # after every frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's
+    # own frame (..., V, 2), the ego first, NaN where a world has fewer, and `approaches` theirs
+    # (..., V)
     cleared: Callable[[Floats, Texts, Any], Bools]
-    # texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be hidden by".
-    # Templates read `words.<name>`
+    # texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be
+    # hidden by". Templates read `words.<name>`
     words: Mapping[str, str]
     brake_lamps: bool = False  # whether vehicles have brake lamps
     prompt: str = "v4"  # default prompt version
     # why scenes with left and right swapped are not valid scenes; None if they are
     one_sided: str | None = "nothing says that a mirrored scene is one of it"
     dials: tuple[str, ...] = SETTABLE  # parameters that a name may set: `NAME:beacon_loss=0.3`
-    # returns the seats of vehicles with goals of their own, by the path that they begin on, always the same
-    # object; `cleared` of a seat's scenario is asked about its agent alone. None if only the ego has a goal
+    # returns the seats of vehicles with goals of their own, by the path that they begin on, always
+    # the same object; `cleared` of a seat's scenario is asked about its agent alone. None if only
+    # the ego has a goal
     seats: Callable[[], Mapping[PathKey, Seat]] | None = None
-    # subclass of `World` whose episodes an environment simulates; None for the harness's own simulator
+    # subclass of `World` whose episodes an environment simulates; None for the harness's own
+    # simulator
     world: type[Any] | None = None
     # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
@@ -123,12 +140,16 @@ class Scenario:
 
     @property
     def is_environment(self) -> bool:
-        """Whether an environment simulates the episodes; then the harness knows no layout and no danger."""
+        """Whether an environment simulates the episodes;
+        then the harness knows no layout and no danger.
+        """
         return self.world is not None
 
     @property
     def prompt_words(self) -> dict[str, str]:
-        """Texts for prompts: `words`, and the `speeds` that actions step through, the highest first."""
+        """Texts for prompts: `words`, and the `speeds` that actions step through,
+        the highest first.
+        """
         speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
         return {**self.words, "speeds": speeds}
 
@@ -141,7 +162,9 @@ class Scenario:
 
 
 def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
-    """Return a class of worlds that a function starts. It warns: the class is what a scenario states now."""
+    """Return a class of worlds that a function starts. It warns:
+    the class is what a scenario states now.
+    """
 
     def resumed(cls: Any, *taken: Any) -> Any:
         from harness.world.environments.world import EnvironmentWorld
@@ -150,8 +173,9 @@ def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
 
     warn(
         "Scenario(start=f) is now Scenario(world=Class), whose `begun` is f; it works until 0.4.0",
-        FutureWarning, stacklevel=4,
-    )  # fmt: skip
+        FutureWarning,
+        stacklevel=4,
+    )
     return type("Started", (), {"begun": staticmethod(start), "resumed": classmethod(resumed)})
 
 

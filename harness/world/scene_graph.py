@@ -1,8 +1,9 @@
 """The nouns of a scene graph: what one viewer knows of a scene, in its own frame.
 
-The frame has metres forward and to the left, and headings in degrees counter-clockwise. Lanes, sectors and
-conflicts are named from the *ego's* seat for every viewer, since helpers judge what the ego should do.
-`harness.world.perception.graph` makes a graph of a state. A member that is `UNSET` is not in the file.
+The frame has metres forward and to the left, and headings in degrees counter-clockwise. Lanes,
+sectors and conflicts are named from the *ego's* seat for every viewer, since helpers judge what the
+ego should do. `harness.world.perception.graph` makes a graph of a state. A member that is `UNSET`
+is not in the file.
 """
 
 from typing import Annotated, Any, Literal
@@ -71,7 +72,9 @@ class EgoArrival(Closed, frozen=True):
 
 
 class Arrival(EgoArrival, frozen=True):
-    """How far another vehicle is from a conflict, how fast it is, and whether it is seen to brake."""
+    """How far another vehicle is from a conflict, how fast it is,
+    and whether it is seen to brake.
+    """
 
     speed_mps: Number
     braking: bool | UnsetType | None = UNSET
@@ -137,12 +140,16 @@ class SceneGraph(Closed, frozen=True):
         return tuple(Sector(sector.sector, 1.0, False, ()) for sector in self.sectors)
 
     def blinded(self) -> "SceneGraph":
-        """Return the graph of a viewer without sensors, who knows only itself and the ego's beacon."""
+        """Return the graph of a viewer without sensors,
+        who knows only itself and the ego's beacon.
+        """
         unseen = tuple(Sector(sector.sector, 0.0, True, ()) for sector in self.sectors)
         return msgspec.structs.replace(self, nodes=(), conflicts=(), sectors=unseen)
 
     def plain(self) -> dict[str, Any]:
-        """Return what templates read: mappings and lists without the members that are not in the file."""
+        """Return what templates read: mappings and lists without the members that are not in the
+        file.
+        """
         plain: dict[str, Any] = msgspec.to_builtins(self, order="sorted")
         for node in plain["nodes"]:
             node["sensors"] = list(node["sensors"])

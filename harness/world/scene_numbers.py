@@ -12,10 +12,15 @@ BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
 
 def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]:
-    """Yield a scene graph's numbers with names, the same names for every graph of a road; None if unknown."""
+    """Yield a scene graph's numbers with names, the same names for every graph of a road;
+    None if unknown.
+    """
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
         yield f"ego {name}", getattr(graph.ego, name)
-    for lane in (*sorted({role for path in road.paths.values() for role in path.roles}), "off-lane"):
+    for lane in (
+        *sorted({role for path in road.paths.values() for role in path.roles}),
+        "off-lane",
+    ):
         nodes = [node for node in graph.nodes if node.lane == lane]
         node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
         yield f"{lane}: vehicles", float(len(nodes))

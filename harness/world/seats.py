@@ -1,7 +1,8 @@
 """Seats: a scene as it is for one of its agents, in whose own eyes it is the ego.
 
-What an agent sees, is asked, aims at and is judged by is that of an ego, in the scenario of its seat. So with
-several agents nothing but the names of vehicles' parts and of paths differs between them.
+What an agent sees, is asked, aims at and is judged by is that of an ego, in the scenario of its
+seat. So with several agents nothing but the names of vehicles' parts and of paths differs between
+them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,40 +19,53 @@ from harness.world.state import VehicleState, WorldState
 
 
 def agent_share(scenario: Scenario) -> float:
-    """Return the share of the vehicles beside the ego that decide; 0 where only an ego has a goal."""
+    """Return the share of the vehicles beside the ego that decide;
+    0 where only an ego has a goal.
+    """
     return getattr(scenario.parameters, "agent_share", 0.0)
 
 
 def refuse_agents(scenario: Scenario, what: str) -> None:
-    """Raise UserError if vehicles beside the ego decide in a scenario, and in `what` the ego alone does."""
+    """Raise UserError if vehicles beside the ego decide in a scenario,
+    and in `what` the ego alone does.
+    """
     if share := agent_share(scenario):
         raise UserError(
-            f"{printable(scenario.name)}: agent_share is {share:g}, and {what} has one ego that decides; "
+            f"{printable(scenario.name)}: agent_share is {share:g}, and {what} has one ego that "
+            "decides; "
             "leave it out, or use `harness drive`"
         )
 
 
 @lru_cache(maxsize=64)
 def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
-    """Return the seats of a scenario by the path that an agent is on; none if only the ego has a goal.
+    """Return the seats of a scenario by the path that an agent is on;
+    none if only the ego has a goal.
 
     Their scenarios have its parameters.
     """
     seats = scenario.seats() if scenario.seats else {}
     p = scenario.parameters
-    return {key: replace(at, scenario=replace(at.scenario, parameters=p)) for key, at in seats.items()}
+    return {
+        key: replace(at, scenario=replace(at.scenario, parameters=p)) for key, at in seats.items()
+    }
 
 
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
-    """Return the places of a layout's agents, the ego's first, and the layout with those who are none.
+    """Return the places of a layout's agents, the ego's first,
+    and the layout with those who are none.
 
-    With a share of 0, helpers decide nothing, but answer. With a greater one, whoever could be an agent and
-    is none is other traffic.
+    With a share of 0, helpers decide nothing, but answer.
+    With a greater one, whoever could be an agent and is none is other traffic.
     """
     share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
         return layout, (0,)
-    able = [n for n, s in enumerate(layout.spawns) if s.part == "helper" and (s.approach, s.route) in seats]
+    able = [
+        n
+        for n, s in enumerate(layout.spawns)
+        if s.part == "helper" and (s.approach, s.route) in seats
+    ]
     draws = noise.uniforms((len(layout.spawns),), scenario.name, seed, "agents")
     agents = (0, *(n for n in able if draws[n] < share))
     spawns = tuple(
@@ -73,7 +87,9 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
     times = offsets(scenario)
     if len(times) == 1:
         return 0
-    return times[int(noise.uniforms((1 + agent,), scenario.name, seed, "clocks")[agent] * len(times))]
+    return times[
+        int(noise.uniforms((1 + agent,), scenario.name, seed, "clocks")[agent] * len(times))
+    ]
 
 
 def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
@@ -90,7 +106,9 @@ def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
 
 
 def seated(scenario: Scenario, state: WorldState, agent: int) -> WorldState:
-    """Return a state as it is for an agent, by its place: it is the ego, and the ego is a helper."""
+    """Return a state as it is for an agent, by its place:
+    it is the ego, and the ego is a helper.
+    """
     names = seat_of(scenario, state.vehicles[agent]).names
 
     def renamed(v: VehicleState, part: str) -> VehicleState:

@@ -1,4 +1,6 @@
-"""Geometry of the radio links between the ego and its helpers: distances, and obstacles between antennas."""
+"""Geometry of the radio links between the ego and its helpers:
+distances, and obstacles between antennas.
+"""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -23,15 +25,20 @@ def site(
 ) -> Site:
     """Return the links at some decision points, (n, ...), with those of roadside units.
 
-    Each point is a state with the ids of the ego and its helpers, in this order. An antenna is at the centre
-    of its vehicle. If a building and a vehicle stand between two antennas, the building counts. Units have
-    their positions from `zone_m`, the centroid of the conflict zone.
+    Each point is a state with the ids of the ego and its helpers, in this order. An antenna is at
+    the centre of its vehicle. If a building and a vehicle stand between two antennas, the building
+    counts. Units have their positions from `zone_m`, the centroid of the conflict zone.
     """
     looks = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
     among = _site([(state, ego, helpers) for state, (ego, *helpers) in looks])
     of_units = {
         unit: replace(
-            _site([(state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_) for state, all_ in looks]),
+            _site(
+                [
+                    (state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_)
+                    for state, all_ in looks
+                ]
+            ),
             first_m=unit.antenna_m,
         )
         for unit in units
@@ -39,7 +46,9 @@ def site(
     return replace(among, units=of_units)
 
 
-def _site(points: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]]) -> Site:
+def _site(
+    points: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]],
+) -> Site:
     """Return the links from one end, a vehicle or a place, to some vehicles."""
     n, most = len(points), max((len(targets) for _, _, targets in points), default=0)
     xy_m = np.full((n, 1 + most, 2), np.nan)
@@ -62,19 +71,26 @@ def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tup
     """Return what stands between two ends, and the height of the tallest vehicle between them."""
     origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
     vehicles = [v for v in state.vehicles if v not in (a, b)]
-    corners = [*(v.corners() for v in vehicles), *(building.corners() for building in state.buildings)]
+    corners = [
+        *(v.corners() for v in vehicles),
+        *(building.corners() for building in state.buildings),
+    ]
     if not corners:
         return CLEAR, 0.0
     t, _ = meetings(origin, line, np.array(corners))
     met: list[bool] = (t.reshape(-1, 4).min(axis=1) < 1).tolist()
-    tallest = max((HEIGHTS_M[v.kind] for v, there in zip(vehicles, met, strict=False) if there), default=0.0)
+    tallest = max(
+        (HEIGHTS_M[v.kind] for v, there in zip(vehicles, met, strict=False) if there), default=0.0
+    )
     if any(met[len(vehicles) :]):
         return BUILDING, tallest
     return (VEHICLE if tallest else CLEAR), tallest
 
 
 def corner(a: VehicleState, b: VehicleState) -> Floats:
-    """Return the distances of two vehicles to the crossing of their headings' lines, (2,) m; NaN if none."""
+    """Return the distances of two vehicles to the crossing of their headings' lines, (2,) m;
+    NaN if none.
+    """
     sine = np.sin(b.heading_rad - a.heading_rad)
     if abs(sine) < np.sin(LEAST_ANGLE_RAD):
         return np.full(2, np.nan)

@@ -1,7 +1,8 @@
 """Vehicles on highway-env's roads, without its environments: what a world holds between two frames.
 
-Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits. Their
-`speed_control` says what `lockstep` simulates; highway-env's own frame of them is what it is compared with.
+Other traffic keeps its route and speed; the ego is highway-env's `MDPVehicle` with physical limits.
+Their `speed_control` says what `lockstep` simulates; highway-env's own frame of them is what it is
+compared with.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -20,11 +21,13 @@ from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, VehicleState
 
 NEAR_M = 1e-6  # more than the rounding of a distance; farther apart, highway-env finds no collision
-NOBODY_DRAWS = np.random.RandomState(0)  # never drawn from; highway-env would seed its own by the clock
+# never drawn from; highway-env would seed its own by the clock
+NOBODY_DRAWS = np.random.RandomState(0)
 DECIMALS = 6  # decimals of a state's metres, radians and m/s
 LAMPS_MPS2 = 1.0  # brake lamps are on above this deceleration
 BRAKES_OFF_HZ = 20.0  # rate at which a vehicle that brakes by itself releases the brake at the end
-FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)  # above this speed highway-env limits acceleration
+# above this speed highway-env limits acceleration
+FAST_MPS = min(Vehicle.MAX_SPEED, -Vehicle.MIN_SPEED)
 
 
 class _OnRoute:
@@ -86,7 +89,8 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
     """Follows a target speed within physical limits (highway-env's own controller has no limit)."""
 
     limits_mps2 = (-8.0, 3.0)
-    ways: Mapping[Lane, str] = MappingProxyType({})  # the lanes that it may change between, and their routes
+    # the lanes that it may change between, and their routes
+    ways: Mapping[Lane, str] = MappingProxyType({})
 
     def act(self, action: str | None = None) -> None:
         """Drive on, or take a meta-action; changing lane changes the route."""
@@ -111,7 +115,9 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
 
 
 def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
-    """Return highway-env's road with a layout's vehicles on it, the ego first; agents by their place."""
+    """Return highway-env's road with a layout's vehicles on it, the ego first;
+    agents by their place.
+    """
     road, static = new_road(scenario), scenario.road()
     for n, spawn in enumerate(layout.spawns):
         path = static.paths[spawn.approach, spawn.route]
@@ -120,14 +126,22 @@ def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)
         along = spawn.arc_m - (0.0, *path.ends_m)[section]
         road.vehicles.append(
             vehicle_on(
-                road, scenario, spawn, section, lane.position(along, 0.0), lane.heading_at(along), n in agents
+                road,
+                scenario,
+                spawn,
+                section,
+                lane.position(along, 0.0),
+                lane.heading_at(along),
+                n in agents,
             )
         )
     return road
 
 
 def copied(road: Any) -> Any:
-    """Return a road with copies of its vehicles; attributes that are written in place are copied, too."""
+    """Return a road with copies of its vehicles;
+    attributes that are written in place are copied, too.
+    """
     new = copy(road)
     new.vehicles = [copy(v) for v in road.vehicles]
     for v in new.vehicles:
@@ -141,9 +155,14 @@ def new_road(scenario: Scenario) -> Any:
 
 
 def vehicle_on(
-    road: Any, scenario: Scenario, spawn: Spawn, section: int, position: Sequence[float], heading: float,
+    road: Any,
+    scenario: Scenario,
+    spawn: Spawn,
+    section: int,
+    position: Sequence[float],
+    heading: float,
     agent: bool,
-) -> ControlledVehicle:  # fmt: skip
+) -> ControlledVehicle:
     """Create a vehicle on a section of its path; an `agent` follows a target speed."""
     p, static = scenario.parameters, scenario.road()
     route = list(static.paths[spawn.approach, spawn.route].lanes)
@@ -173,9 +192,13 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
 def state_of(
     v: ControlledVehicle, lamps: bool = False, origin_m: tuple[float, float] = (0.0, 0.0)
 ) -> VehicleState:
-    """Return a vehicle's state, rounded to the micrometre, since the last bits depend on the machine."""
+    """Return a vehicle's state, rounded to the micrometre,
+    since the last bits depend on the machine.
+    """
     s = v.spawn
     numbers = (*(v.position - origin_m), v.heading, v.speed)
     x_m, y_m, heading_rad, speed_mps = (round(float(number), DECIMALS) + 0.0 for number in numbers)
     pose, lit = (x_m, y_m, heading_rad, speed_mps), lamps and bool(v.braking)
-    return VehicleState(s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit, s.radio)
+    return VehicleState(
+        s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit, s.radio
+    )

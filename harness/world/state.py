@@ -1,4 +1,6 @@
-"""Records of a scene: vehicles, buildings, beacons, and the state of the whole world at one time."""
+"""Records of a scene: vehicles, buildings, beacons,
+and the state of the whole world at one time.
+"""
 
 from functools import lru_cache
 from typing import Annotated
@@ -13,7 +15,11 @@ from harness.world.fields import Kind as Kind
 from harness.world.fields import Part as Part
 
 # Length and width; a van has those of SUMO's delivery van.
-SIZES_M: dict[str, tuple[float, float]] = {"car": (5.0, 2.0), "van": (6.5, 2.16), "truck": (10.0, 2.6)}
+SIZES_M: dict[str, tuple[float, float]] = {
+    "car": (5.0, 2.0),
+    "van": (6.5, 2.16),
+    "truck": (10.0, 2.6),
+}
 HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 
 
@@ -73,7 +79,9 @@ def rectangle(
     length_m: float | Floats,
     width_m: float | Floats,
 ) -> Floats:
-    """Return the corners of rectangles (...), (..., 4, 2) m: front left first, then clockwise from above."""
+    """Return the corners of rectangles (...), (..., 4, 2) m:
+    front left first, then clockwise from above.
+    """
     cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
     along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
     right = np.multiply.outer(width_m, [-1.0, 1.0, 1.0, -1.0]) / 2
@@ -87,7 +95,9 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
     Each has x, y and heading, (n, 3), and length and width, (n, 2).
     """
     (dx, dy), apart = (others - poses)[:, :2].T, np.full(len(poses), -np.inf)
-    cos, sin, its_cos, its_sin = (turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin))
+    cos, sin, its_cos, its_sin = (
+        turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin)
+    )
     dot, cross = np.abs(cos * its_cos + sin * its_sin), np.abs(cos * its_sin - sin * its_cos)
     for c, s, (length, width), (its_length, its_width) in (
         (cos, sin, sizes_m.T, their_sizes_m.T),
@@ -126,10 +136,11 @@ class Beacon(Closed, frozen=True, omit_defaults=True):
     speed_mps: Number  # speed along the heading
     target_speed_mps: Number | None  # target of the ego's speed controller; None for other senders
     heard_by: tuple[VehicleId, ...]  # ids of the receivers that receive it
-    # under the rule `cam`, the interval until the next one if the vehicle does not move enough to send
-    # earlier; else None
+    # under the rule `cam`, the interval until the next one if the vehicle does not move enough to
+    # send earlier; else None
     interval_s: Number | None = None
-    # number of consecutive beacons that were sent because that interval was over; None where there is none
+    # number of consecutive beacons that were sent because that interval was over; None where there
+    # is none
     unmoved: Count | None = None
 
 
@@ -138,14 +149,15 @@ class WorldState(Closed, frozen=True):
 
     scenario: str  # name of the scenario
     episode_seed: Seed  # seed of the episode's layout
-    step: Count  # index of the decision about to be taken; equals the number of actions taken so far
+    # index of the decision about to be taken; equals the number of actions taken so far
+    step: Count
     time_s: Number  # simulated time since the start of the episode
     target_speed_mps: Number  # target of the ego's speed controller
     # vehicles in spawn order, the ego first
     vehicles: Annotated[tuple[VehicleState, ...], Meta(min_length=1)]
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
-    # the last one that each receiver has, and those under way, by sender and time; empty under perfect
-    # knowledge
+    # the last one that each receiver has, and those under way, by sender and time; empty under
+    # perfect knowledge
     beacons: tuple[Beacon, ...] = ()
 
     @property
@@ -175,7 +187,9 @@ class Snapshot(Closed, frozen=True):
 
 
 class ActionsTaken(Closed, frozen=True):
-    """What leads an environment from its seed to here again: the frame and the name of each action."""
+    """What leads an environment from its seed to here again:
+    the frame and the name of each action.
+    """
 
     frame: Count
     taken: tuple[tuple[Count, Annotated[str, Meta(max_length=200)]], ...]

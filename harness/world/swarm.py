@@ -1,4 +1,6 @@
-"""What comes of several agents together, and what they are compared with: each alone on the road."""
+"""What comes of several agents together, and what they are compared with:
+each alone on the road.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -45,7 +47,9 @@ def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
 def on_seat(
     scenario: Scenario, layout: Layout, agent: int, others: Sequence[int] = ()
 ) -> tuple[Scenario, Layout]:
-    """Return an agent's own scenario, and the layout in it with nobody but the agent and some others."""
+    """Return an agent's own scenario,
+    and the layout in it with nobody but the agent and some others.
+    """
     spawns, its = [layout.spawns[n] for n in (agent, *others)], scenario
     if agent:
         seat = seat_of(scenario, spawns[0])
@@ -59,21 +63,27 @@ def on_seat(
 
 
 def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
-    """Return how each agent of a world that has ended fared; `alone_s` has when each would arrive alone."""
+    """Return how each agent of a world that has ended fared;
+    `alone_s` has when each would arrive alone.
+    """
     outcomes = {agent: journey.outcome for agent, journey in world.journeys.items()}
     ids = {agent: world.vehicles[agent].spawn.id for agent in outcomes}
     return tuple(
         End(
-            ids[agent], o.result, o.time_s,
+            ids[agent],
+            o.result,
+            o.time_s,
             round((o.time_s or 0.0) - alone_s[agent], 3) if o.success else None,
-            o.partner, o.partner in ids.values(),
+            o.partner,
+            o.partner in ids.values(),
         )
         for agent, o in outcomes.items()
-    )  # fmt: skip
+    )
 
 
 def gravest(journeys: Mapping[int, Journey]) -> int | None:
-    """Return the place of the agent whose failure is the episode's: the gravest, and of those the first.
+    """Return the place of the agent whose failure is the episode's:
+    the gravest, and of those the first.
 
     None if nobody has failed.
     """

@@ -45,7 +45,9 @@ class Journey:
         return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
 
     def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
-        """Record some frames: its speed before the first and in each, its least gap so far, its conflicts."""
+        """Record some frames: its speed before the first and in each,
+        its least gap so far, its conflicts.
+        """
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
         self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
         slows_mps2 = (speeds_mps[:-1] - speeds_mps[1:]) * hz
@@ -119,18 +121,26 @@ class World:
     def snapshot(self) -> Snapshot | ActionsTaken:
         """Return what `thaw` needs besides `state()` to continue exactly as this world would."""
         vehicles = self.road.vehicles
-        return Snapshot(self.frame, tuple(map(self._section, vehicles)), int(vehicles[0].speed_index))
+        return Snapshot(
+            self.frame, tuple(map(self._section, vehicles)), int(vehicles[0].speed_index)
+        )
 
     def _section(self, v: Any) -> int:
-        """Return the section of its path that a vehicle is in; its route has only the remaining lanes."""
+        """Return the section of its path that a vehicle is in;
+        its route has only the remaining lanes.
+        """
         road, left = self.scenario.road(), v.route.index(v.target_lane_index)
         if road.form == 1:  # counted from where the route now begins; the next frame corrects it
             return int(left)
         return len(road.paths[v.spawn.approach, v.spawn.route].lanes) - len(v.route) + int(left)
 
     @classmethod
-    def thaw(cls, scenario: Scenario, state: WorldState, snapshot: Snapshot | ActionsTaken) -> "World":
-        """Restore the world that `state` and `snapshot` were taken from, if its episode was undecided."""
+    def thaw(
+        cls, scenario: Scenario, state: WorldState, snapshot: Snapshot | ActionsTaken
+    ) -> "World":
+        """Restore the world that `state` and `snapshot` were taken from,
+        if its episode was undecided.
+        """
         return (scenario.world or World).resumed(scenario, state, snapshot)
 
     @classmethod
@@ -148,13 +158,20 @@ class World:
         ego.speed_index = snapshot.speed_index
         ego.target_speed = ego.index_to_speed(ego.speed_index)
         if snapshot.frame:
-            # highway-env ends every frame with collisions, which push touching vehicles apart in the next.
+            # highway-env ends every frame with collisions, which push touching vehicles apart in
+            # the next.
             for n, vehicle in enumerate(vehicles):
                 for other in vehicles[n + 1 :]:
                     vehicle.handle_collisions(other, 1 / scenario.parameters.simulation_hz)
         layout = replace(layout, buildings=state.buildings)
         return cls(
-            scenario, state.episode_seed, layout, road, state.step, snapshot.frame, beacons=state.beacons
+            scenario,
+            state.episode_seed,
+            layout,
+            road,
+            state.step,
+            snapshot.frame,
+            beacons=state.beacons,
         )
 
     def state(self, agent: int = 0) -> WorldState:
@@ -170,7 +187,8 @@ class World:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
 
     def act(self, action: str) -> None:
-        """Take an action by name after the scenario's lag, and simulate until the next decision is due.
+        """Take an action by name after the scenario's lag,
+        and simulate until the next decision is due.
 
         After the scenario's last decision, the action is held until the episode is decided.
         """
@@ -210,8 +228,8 @@ class World:
     def passed(self, poses: Floats) -> None:
         """Record the beacons of the last frames.
 
-        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the origin of the
-        scenario's road.
+        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4),
+        from the origin of the scenario's road.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
 
@@ -229,11 +247,17 @@ class World:
         """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
         p, radios = self.scenario.parameters, self.answering
         ids = [self.vehicles[n].spawn.id for n in radios]
-        announce, sent = [n for n, v in enumerate(self.vehicles) if v.spawn.radio], tuple[Beacon, ...]()
+        announce, sent = (
+            [n for n, v in enumerate(self.vehicles) if v.spawn.radio],
+            tuple[Beacon, ...](),
+        )
         if len(self.journeys) > 1:  # everybody with a radio hears everybody
             announce = [*radios, *announce]
         else:
-            loss, target_mps = beacons.losses(p, self.state, ids, poses), float(self.vehicles[0].target_speed)
+            loss, target_mps = (
+                beacons.losses(p, self.state, ids, poses),
+                float(self.vehicles[0].target_speed),
+            )
             sent = beacons.broadcast(
                 p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
             )
@@ -259,7 +283,9 @@ class World:
 
     def seat(self, agent: int) -> Scenario:
         """Return the scenario as it is for an agent."""
-        return seat_of(self.scenario, self.vehicles[agent].spawn).scenario if agent else self.scenario
+        return (
+            seat_of(self.scenario, self.vehicles[agent].spawn).scenario if agent else self.scenario
+        )
 
     @property
     def answering(self) -> list[int]:
@@ -268,13 +294,18 @@ class World:
 
     def _cleared(self, agent: int) -> bool:
         """Return whether an agent has reached its goal."""
-        xy_m, names = np.array([v.position for v in self.vehicles]), [v.spawn.approach for v in self.vehicles]
+        xy_m, names = (
+            np.array([v.position for v in self.vehicles]),
+            [v.spawn.approach for v in self.vehicles],
+        )
         if not agent:
             return bool(self.scenario.cleared(xy_m, np.array(names), self.scenario.parameters))
         spawn = self.vehicles[agent].spawn
         seat = seat_of(self.scenario, spawn)
         name, _ = seat.names[spawn.approach, spawn.route]
-        return bool(seat.scenario.cleared(xy_m[[agent]], np.array([name]), self.scenario.parameters))
+        return bool(
+            seat.scenario.cleared(xy_m[[agent]], np.array([name]), self.scenario.parameters)
+        )
 
     def judge(self, standing: Set[str]) -> None:
         """Decide what the last frame has decided; `standing` had crashed before, by id."""

@@ -1,4 +1,6 @@
-"""Runs whose every text is an attack, and the attacks: each way into markup with each thing to do there."""
+"""Runs whose every text is an attack, and the attacks:
+each way into markup with each thing to do there.
+"""
 
 from run_on_disk import configure, made_up
 
@@ -71,7 +73,9 @@ class Attacker:
 
 
 def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
-    """Make a run: its manifest says nothing but payload n, its answers and decisions say all in turn."""
+    """Make a run: its manifest says nothing but payload n,
+    its answers and decisions say all in turn.
+    """
     mine, said, dangers = PAYLOADS[n], Attacker(n), {}
     world = FrozenScenes(
         name=mine, sha256=dataset.sha256, nodes=3, episodes=3, limit=None, delay_allowance_s=1.0,

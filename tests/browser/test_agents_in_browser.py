@@ -23,7 +23,9 @@ pytestmark = pytest.mark.exhaustive
 
 def test_one_clicks_from_vehicle_to_vehicle_of_a_step(tmp_path, opened):
     source = LiveSource(50_001, 1, "all-way-crossing:agent_share=1")
-    spec = replace(live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,)), source=source)
+    spec = replace(
+        live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,)), source=source
+    )
     run(spec, tmp_path / "run")
     (tmp_path / "report.html").write_text(render(gather([tmp_path / "run"]), full=True))
     page = opened(tmp_path / "report.html", "#decisions")
@@ -37,7 +39,10 @@ def test_one_clicks_from_vehicle_to_vehicle_of_a_step(tmp_path, opened):
     wait(page)
     expect(page.locator("#decision p strong")).to_have_text("v2 decides")
     agents = page.locator("#decision table[data-csv=agents] tbody tr")
-    actions = {row.locator("td, th").nth(0).inner_text(): row.locator("td, th").last for row in agents.all()}
+    actions = {
+        row.locator("td, th").nth(0).inner_text(): row.locator("td, th").last
+        for row in agents.all()
+    }
     assert list(actions) == ["v1", "v2", "v3", "v4"]
     for agent, cell in actions.items():
         action = cell.inner_text().split()[0]
@@ -63,7 +68,9 @@ def test_each_agent_is_shown_with_its_model_and_the_plans_that_were_heard(tmp_pa
     page = opened(tmp_path / "report.html", "#decisions")
     page.locator("#list tbody tr").nth(1).locator("a").click()
     wait(page)
-    expect(page.locator("#decision p", has_text="v2 decides with cruise · v4 · json;")).to_be_visible()
+    expect(
+        page.locator("#decision p", has_text="v2 decides with cruise · v4 · json;")
+    ).to_be_visible()
     agents = page.locator("#decision table[data-csv=agents] tbody tr")
     assert [row.locator("small").first.inner_text() for row in agents.all()][:2] == [
         "proxy · v4 · json", "cruise · v4 · json"

@@ -1,4 +1,6 @@
-"""Pages without a script: none is wider than a telephone, and what is wide in them scrolls inside itself."""
+"""Pages without a script: none is wider than a telephone,
+and what is wide in them scrolls inside itself.
+"""
 
 import pytest
 
@@ -32,7 +34,9 @@ def pages(small, tmp_path_factory):
     cells = [f"{value}.0 [{value}.0, 100.0]" for value in range(10)]
     table = Table("A table of ten columns", [*map(str, range(10))], [cells])
     data = f"data:image/svg+xml,{DRAWN}"
-    study = Section(f"A study of {LONG}", [LONG], tables=[table], pictures={"figure": (data, WIDTH_REM)})
+    study = Section(
+        f"A study of {LONG}", [LONG], tables=[table], pictures={"figure": (data, WIDTH_REM)}
+    )
     (folder / "study.html").write_text(document([study]))
     (folder / "compare.html").write_text(render(compare(pair(*runs)), (), 10, lambda run: None))
     return {"study": folder / "study.html", "compare": folder / "compare.html"}
@@ -67,5 +71,7 @@ def test_a_wide_figure_is_drawn_so_that_it_can_be_read(browser, pages):
     page = browser.new_page(viewport=NARROW)
     page.goto(pages["study"].as_uri())
     rem = page.evaluate("parseFloat(getComputedStyle(document.documentElement).fontSize)")
-    assert page.locator("figure img").bounding_box()["width"] == pytest.approx(0.6 * WIDTH_REM * rem, abs=1)
+    assert page.locator("figure img").bounding_box()["width"] == pytest.approx(
+        0.6 * WIDTH_REM * rem, abs=1
+    )
     page.close()

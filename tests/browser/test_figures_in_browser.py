@@ -47,7 +47,9 @@ def studies(small, tmp_path_factory):
         "paper": ["paper"],
     }  # fmt: skip
     for name, typed in commands.items():
-        done = CliRunner().invoke(app, ["study", *map(str, typed), "--out", str(folder / name), "--quiet"])
+        done = CliRunner().invoke(
+            app, ["study", *map(str, typed), "--out", str(folder / name), "--quiet"]
+        )
         assert done.exit_code == 0, (name, done.exception)
     return {name: folder / name for name in commands}
 

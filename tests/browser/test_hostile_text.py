@@ -1,8 +1,9 @@
-"""Hostile text in every place that a model, a prompt, a file or its name can write to: nothing of it runs.
+"""Hostile text in every place that a model, a prompt, a file or its name can write to:
+nothing of it runs.
 
-Each payload stands alone in every field: one report is of as many runs as there are payloads, another of one
-run under as many conditions; in answers they come in turn. A third is of a run for each way into markup, with
-another deed each, and of all that is written otherwise.
+Each payload stands alone in every field: one report is of as many runs as there are payloads,
+another of one run under as many conditions; in answers they come in turn. A third is of a run for
+each way into markup, with another deed each, and of all that is written otherwise.
 """
 
 import csv
@@ -99,11 +100,15 @@ def test_every_payload_is_shown_as_the_text_it_is(attacked):
     _, text = attacked
     shown = Page(text).text
     assert all(" ".join(visible(payload).split()) in shown for payload in PAYLOADS)
-    answers = [a for d in details(text).values() for run in d["runs"] if run for a in run["answers"]]
+    answers = [
+        a for d in details(text).values() for run in d["runs"] if run for a in run["answers"]
+    ]
     for field in ("raw", "detail", "error", "status", "finish_reason"):
         said = {a[field] for a in answers}
         # What an engine says of an error has the names of files without their folders.
-        payloads = set(map(places.text, PAYLOADS)) if field in ("detail", "error") else set(PAYLOADS)
+        payloads = (
+            set(map(places.text, PAYLOADS)) if field in ("detail", "error") else set(PAYLOADS)
+        )
         assert said <= payloads
         assert len(said) == (len(payloads) if len(gathered(text)) > 1 else len(answers))
 
@@ -125,7 +130,8 @@ def test_nothing_runs_in_the_overview_nor_in_any_decision(browser, attacked):
     wait(page)
     assert page.evaluate(TOUCH, "#report") > 10
     foreign = page.evaluate(FOREIGN)
-    # Every fourth run: a scene's four answers say eleven payloads each, so that every field still says all.
+    # Every fourth run: a scene's four answers say eleven payloads each, so that every field still
+    # says all.
     scene, runs = next(iter(details(text))), len(gathered(text))
     for n in range(0, runs, 4) if runs > 1 else range(0, len(PAYLOADS), 12):
         where = {"scene": scene, "run": str(n % runs), "condition": PAYLOADS[n if runs == 1 else 0]}
@@ -145,6 +151,8 @@ def test_a_copied_cell_is_no_formula_in_a_spreadsheet(opened, attacked):
     page = opened(file)
     page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
     page.locator("#matrix > div.scroll + button").click()
-    cells = [cell for row in csv.reader(page.evaluate("window.copied").splitlines()) for cell in row]
+    cells = [
+        cell for row in csv.reader(page.evaluate("window.copied").splitlines()) for cell in row
+    ]
     assert any("cmd|" in cell for cell in cells)
     assert not any(cell.startswith(("=", "@", "+c", "-2+")) for cell in cells)

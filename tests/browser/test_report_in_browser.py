@@ -100,8 +100,12 @@ def test_the_answer_that_lost_an_episode_is_two_clicks_away(opened, report, inde
     losing.click()
     expect(page.locator("#decision h1")).to_contain_text("Decision")
     where = dict(parse_qsl(page.evaluate("location.hash.slice(1)")))
-    said = f"{where['condition']}: {told.split()[2].rstrip(',')} ✗ the answer that lost this episode"
-    expect(page.locator("#decision .verdict.bad").filter(has_text=where["condition"])).to_contain_text(said)
+    said = (
+        f"{where['condition']}: {told.split()[2].rstrip(',')} ✗ the answer that lost this episode"
+    )
+    expect(
+        page.locator("#decision .verdict.bad").filter(has_text=where["condition"])
+    ).to_contain_text(said)
 
 
 @pytest.mark.exhaustive
@@ -142,7 +146,9 @@ def test_the_picture_follows_the_conflict_and_shades_what_is_hidden(opened, repo
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("size", "beside"), [(WIDE, 4), (NARROW, 1)])
-def test_the_cameras_pictures_have_boxes_that_can_be_switched_off(opened, report, index, size, beside):
+def test_the_cameras_pictures_have_boxes_that_can_be_switched_off(
+    opened, report, index, size, beside
+):
     page = opened(report, f"#scene={index['scenes'][1][0]}", size)
     frames, boxes = page.locator(".frame"), page.locator(".frame .label")
     assert frames.count() == 4
@@ -172,7 +178,8 @@ def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, schem
     assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
     picture(page, f"report-390-{scheme}")
     run = index["runs"][0]
-    lost = run["ended"].index("u") // (len(run["conditions"]) * len(run["seeds"]))  # has the longest verdict
+    # has the longest verdict
+    lost = run["ended"].index("u") // (len(run["conditions"]) * len(run["seeds"]))
     page = opened(report, f"#scene={index['scenes'][lost][0]}", NARROW, scheme)
     assert page.locator("#decision .verdict.bad").is_visible()
     assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
@@ -183,7 +190,8 @@ def test_on_a_phone_nothing_is_wider_than_the_phone(opened, report, index, schem
 def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index):
     page = opened(report.parent / ONE / "report.html", f"#scene={index['scenes'][1][0]}")
     assert page.get_by_text("Not in this page").inner_text() == (
-        "Not in this page: the camera pictures; the prompts, which the model does not read. harness view "
+        "Not in this page: the camera pictures; the prompts, which the model does not read. "
+        "harness view "
         "shows them; harness report RUN --full writes a page that has them."
     )
     assert page.locator(".cameras, .answer details").count() == 0
@@ -197,18 +205,25 @@ def test_filters_leave_the_decisions_that_have_what_is_asked(opened, report, ind
     run = index["runs"][0]
     every = len(run["conditions"]) * len(run["seeds"])
     reached = [
-        any(run["acted"][n * every + c * len(run["seeds"])] != "-" for c in range(len(run["conditions"])))
+        any(
+            run["acted"][n * every + c * len(run["seeds"])] != "-"
+            for c in range(len(run["conditions"]))
+        )
         for n in range(len(index["scenes"]))
     ]
     assert count(page) == sum(reached), "another run may come to other decision points"
-    sectors = [danger for (*_, danger), there in zip(index["scenes"], reached, strict=True) if there]
+    sectors = [
+        danger for (*_, danger), there in zip(index["scenes"], reached, strict=True) if there
+    ]
     for sector in set(sectors):
         choose(page, "danger", sector or "none")
         assert count(page) == sectors.count(sector)
     page.get_by_role("button", name="Clear").click()
     choose(page, "run", "2")
     masks = index["runs"][2]["statuses"]
-    [*failed] = (k for k, s in enumerate(index["statuses"]) if k > 1 and any(mask >> k & 1 for mask in masks))
+    [*failed] = (
+        k for k, s in enumerate(index["statuses"]) if k > 1 and any(mask >> k & 1 for mask in masks)
+    )
     assert failed
     for k in failed:
         choose(page, "status", index["statuses"][k])
@@ -249,7 +264,10 @@ def test_answers_of_runs_stand_side_by_side_and_are_found_where_they_differ(open
     differ = [
         n
         for n in range(len(index["scenes"]))
-        if any(letter != "-" for letter in first["acted"][n * every : (n + 1) * every : len(first["seeds"])])
+        if any(
+            letter != "-"
+            for letter in first["acted"][n * every : (n + 1) * every : len(first["seeds"])]
+        )
         and len({run["said"][n] for run in (first, *others)} - {"-"}) > 1
     ]
     assert 0 < count(page) == len(differ)
@@ -260,7 +278,9 @@ def test_answers_of_runs_stand_side_by_side_and_are_found_where_they_differ(open
     runs = [read(report.parent / f"{model}-{prompt}") for model, prompt in RUNS]
     answers = [a for run in runs for a in run.answers_by_scene.get(scene, ()) if a.role == "ego"]
     for own, answer in zip(row.locator(".own").all(), answers, strict=True):
-        likeliest = runs[0].actions[int(np.argmax(answer.intent))] if answer.intent else "not readable"
+        likeliest = (
+            runs[0].actions[int(np.argmax(answer.intent))] if answer.intent else "not readable"
+        )
         assert own.inner_text().startswith(likeliest)
         assert own.locator("small").inner_text().startswith(" ".join(answer.raw.split())[:40])
 
@@ -332,7 +352,9 @@ def test_the_matrix_is_sorted_by_a_click_on_a_head(opened, report):
 
     def column():
         cells = table.locator("tbody tr td:nth-child(6)")
-        return [float(x) for x in cells.evaluate_all("cells => cells.map(cell => cell.dataset.value)")]
+        return [
+            float(x) for x in cells.evaluate_all("cells => cells.map(cell => cell.dataset.value)")
+        ]
 
     before = column()
     table.get_by_role("button", name=re.compile("^success")).click()
@@ -348,7 +370,9 @@ def test_a_table_is_copied_as_csv(opened, report):
     page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
     page.locator("#matrix > div.scroll + button").click()
     lines = page.evaluate("window.copied").strip().split("\r\n")
-    assert lines[0].startswith('"run","condition","balanced success","with a danger","without","success"')
+    assert lines[0].startswith(
+        '"run","condition","balanced success","with a danger","without","success"'
+    )
     assert len(lines) == 1 + 4 * 3
     page.locator("#chart-replies button").click()
     assert page.evaluate("window.copied").startswith('"run","condition","reply","count"')
@@ -391,7 +415,9 @@ def test_it_prints_light_and_without_controls(opened, report):
     assert paper(page) == "rgb(255, 255, 255)"
     assert not page.locator("nav").is_visible()
     assert not page.locator("#list form").is_visible()
-    assert page.locator(".sortable th button").first.is_visible(), "the heads of columns are on paper, too"
+    assert page.locator(".sortable th button").first.is_visible(), (
+        "the heads of columns are on paper, too"
+    )
     printed = page.pdf()
     assert printed.startswith(b"%PDF")
     assert len(printed) > 50_000

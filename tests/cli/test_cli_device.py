@@ -1,4 +1,6 @@
-"""`harness model device`: what fits the window by declared or real tokens; a profile beside times."""
+"""`harness model device`: what fits the window by declared or real tokens;
+a profile beside times.
+"""
 
 import json
 from collections.abc import Callable
@@ -31,7 +33,9 @@ def test_written_json_does_not_fit_200_ms_on_an_orin_and_a_read_out_does(
     harness: Callable[..., Said],
 ) -> None:
     """300 / 2687.9 + 40 / 50.7 s; joules at 60 W, which is an upper bound."""
-    code, out, _ = harness("model", "device", "show", "agx-orin", "--device-model", "qwen3-4b", "--json")
+    code, out, _ = harness(
+        "model", "device", "show", "agx-orin", "--device-model", "qwen3-4b", "--json"
+    )
     readout, written = json.loads(out)["fits"]
     assert code == 0
     seconds = 300 / 2687.9 + np.array([1, 40]) / 50.7
@@ -94,7 +98,9 @@ def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Sai
     code, out, _ = harness(
         "model", "device", "check", "agx-orin", alone, "--device-model", "qwen3-4b", "--json"
     )
-    assert [each["stated"] for each in json.loads(out) if each["what"] == "decode_tokens_per_s"] == [50.7] * 2
+    assert [
+        each["stated"] for each in json.loads(out) if each["what"] == "decode_tokens_per_s"
+    ] == [50.7] * 2
 
 
 def test_every_profile_is_listed(harness: Callable[..., Said]) -> None:
@@ -111,7 +117,9 @@ def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path
     device = devices.load("laptop-cpu")
     with pytest.raises(UserError, match="has no token counts"):
         answers_of(told)
-    with pytest.raises(UserError, match="no answer that was asked alone and timed; run it with --batch-size"):
+    with pytest.raises(
+        UserError, match="no answer that was asked alone and timed; run it with --batch-size"
+    ):
         held(device, device.rows[0], told)
 
 
@@ -119,9 +127,18 @@ def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path
     ("options", "says"),
     [
         (("show", "desk"), "unknown device profile 'desk'; known: agx-orin, "),
-        (("show", "thor", "--window-ms", "0"), "--window-ms 0 is out of range; give more than 0, to 60000"),
-        (("show", "thor", "--window-ms", "nan"), "--window-ms nan is out of range; give more than 0"),
-        (("show", "thor", "--prompt-tokens", "0"), "--prompt-tokens 0 is out of range; give 1 to 1000000"),
+        (
+            ("show", "thor", "--window-ms", "0"),
+            "--window-ms 0 is out of range; give more than 0, to 60000",
+        ),
+        (
+            ("show", "thor", "--window-ms", "nan"),
+            "--window-ms nan is out of range; give more than 0",
+        ),
+        (
+            ("show", "thor", "--prompt-tokens", "0"),
+            "--prompt-tokens 0 is out of range; give 1 to 1000000",
+        ),
         (("show", "thor", "--device-model", "3b"), "unknown model of device profile thor '3b'"),
         (
             ("show", "agx-orin", "--device-model", "0b"),
@@ -131,7 +148,9 @@ def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path
         (("check", "thor", "nowhere"), "nowhere"),
     ],
 )
-def test_mistakes_are_one_line(options: tuple[str, ...], says: str, harness: Callable[..., Said]) -> None:
+def test_mistakes_are_one_line(
+    options: tuple[str, ...], says: str, harness: Callable[..., Said]
+) -> None:
     code, out, err = harness("model", "device", *options)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert says in err
@@ -152,4 +171,7 @@ def test_the_law_of_weights_is_off_by_less_than_a_factor_of_1_6() -> None:
 
 def test_declared_tokens_are_read_out_or_written() -> None:
     told = declared(300, 40)
-    assert {kind: n.tolist() for kind, n in told.output.items()} == {"readout": [1.0], "written": [40.0]}
+    assert {kind: n.tolist() for kind, n in told.output.items()} == {
+        "readout": [1.0],
+        "written": [40.0],
+    }

@@ -25,9 +25,18 @@ def run(tmp_path: Path) -> Path:
         if row["viewer"] == "v1":
             row["raw"] = HOSTILE
         if row["viewer"] == "v2":
-            row |= {"verdict": "failed", "status": "no_json", "intent": None, "mass": None, "message": None}
+            row |= {
+                "verdict": "failed",
+                "status": "no_json",
+                "intent": None,
+                "mass": None,
+                "message": None,
+            }
         if row["viewer"] == "v3":
-            row |= {"repairs": ("code_fence", "prose"), "extension": {"why": HOSTILE, "gaps": [0.5]}}
+            row |= {
+                "repairs": ("code_fence", "prose"),
+                "extension": {"why": HOSTILE, "gaps": [0.5]},
+            }
         if row["viewer"] == "v4":
             row |= {"viewer": "v1", "heard": ("v2", "v4"), "role": "merge"}
 
@@ -35,8 +44,22 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., Said]) -> None:
-    """Texts of models, names of conditions; numbers are what they were, and so are the run's own files."""
-    texts = ["=1+1", "+1-1", "-cmd|' /C calc'!A0", "@SUM(1)", "\t=1", "\r=1", "-0.5", "+7", "a=1", "", "'=1"]
+    """Texts of models, names of conditions;
+    numbers are what they were, and so are the run's own files.
+    """
+    texts = [
+        "=1+1",
+        "+1-1",
+        "-cmd|' /C calc'!A0",
+        "@SUM(1)",
+        "\t=1",
+        "\r=1",
+        "-0.5",
+        "+7",
+        "a=1",
+        "",
+        "'=1",
+    ]
     said = iter(texts)
 
     def spoil(row: Row) -> None:
@@ -99,7 +122,9 @@ def test_jsonl_has_an_object_a_decision(
     assert [path.name for path in Path("text").iterdir()] == ["decisions.jsonl"]
 
 
-def test_junit_has_a_case_an_episode_and_condition(tmp_path: Path, harness: Callable[..., Said]) -> None:
+def test_junit_has_a_case_an_episode_and_condition(
+    tmp_path: Path, harness: Callable[..., Said]
+) -> None:
     def end(row: Row) -> None:
         if row["condition"] == "6g" and row["episode"] in (1, 2):
             failed = row["episode"] == 1 or row["seed"] == 1
@@ -115,12 +140,17 @@ def test_junit_has_a_case_an_episode_and_condition(tmp_path: Path, harness: Call
     assert list(cases) == [(of[name], f"episode {n}") for name in of for n in range(4)]
     failed = {where: case.get("message") for where, case in cases.items() if case is not None}
     assert failed == {
-        (of["6g"], "episode 1"): r"2 of 2 seeds: col\x1blision with seed 0, col\x1blision with seed 1",
+        (
+            of["6g"],
+            "episode 1",
+        ): r"2 of 2 seeds: col\x1blision with seed 0, col\x1blision with seed 1",
         (of["6g"], "episode 2"): r"1 of 2 seeds: col\x1blision with seed 1",
     }
 
 
-def test_csv_in_pieces_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_csv_in_pieces_is_the_same(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     decisions = read(run).decisions
     whole = export.decisions_csv(decisions, tmp_path / "whole.csv").read_bytes()
     monkeypatch.setattr(export, "AT_ONCE", 3)
@@ -152,7 +182,9 @@ def test_bad_options_are_one_line(
     assert said in err
 
 
-def test_a_folder_that_is_no_run_or_broken_is_one_line(run: Path, harness: Callable[..., Said]) -> None:
+def test_a_folder_that_is_no_run_or_broken_is_one_line(
+    run: Path, harness: Callable[..., Said]
+) -> None:
     code, out, err = harness("run", "export", "nowhere", "--csv")
     assert (code, out) == (2, "")
     assert "nowhere is no finished run: it has no run.json" in err

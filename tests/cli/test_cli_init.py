@@ -1,4 +1,6 @@
-"""`harness init`: a project whose own prompts, cards and datasets are found beside those that ship."""
+"""`harness init`: a project whose own prompts,
+cards and datasets are found beside those that ship.
+"""
 
 import json
 import os
@@ -22,7 +24,9 @@ Harness = Callable[..., Said]
 def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     code, out, err = harness("init", "project")
     assert (code, err) == (0, "")
-    assert out.startswith("made project; next: cd there, `harness eval --model swarm-tiny --prompt mine`; ")
+    assert out.startswith(
+        "made project; next: cd there, `harness eval --model swarm-tiny --prompt mine`; "
+    )
     monkeypatch.chdir(tmp_path / "project")
     return tmp_path / "project"
 
@@ -30,7 +34,9 @@ def project(harness: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 @pytest.mark.exhaustive
 def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    lines = [line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")]
+    lines = [
+        line for line in (project / "README.md").read_text().splitlines() if line.startswith("$ ")
+    ]
     assert len(lines) == 4
     for line in lines:
         _, program, *args = shlex.split(line)
@@ -40,7 +46,9 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
         assert (program, code, err) == ("harness", 0, "")
     report = project / "reports/swarm-tiny-mine-occluded-intersection-v3"
     assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
-    code, out, err = harness("eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json")
+    code, out, err = harness(
+        "eval", "--prompt", "mine", "--dataset", "mine", "--seeds", "0", "--json"
+    )
     assert (code, err) == (0, "")
     assert json.loads(out)["manifest"]["world"]["path"] == str(project / "datasets/mine")
 
@@ -77,7 +85,9 @@ def test_weights_lie_beside_its_card(harness: Harness, project: Path) -> None:
 def test_a_name_that_ships_is_refused(harness: Harness, project: Path) -> None:
     (project / "prompts/mine").rename(project / "prompts/v2")
     assert harness("eval", "--prompt", "v2") == (
-        2, "", "harness: prompts/v2 is in this project and ships with the harness; give yours another name\n",
+        2, "", 
+            "harness: prompts/v2 is in this project and ships with the harness; give yours "
+            "another name\n",
     )  # fmt: skip
     (project / "models/my-model.toml").rename(project / "models/proxy.toml")
     assert harness("eval", "--prompt", "v1")[2].startswith(
@@ -102,7 +112,11 @@ def test_each_line_of_its_settings_can_be_switched_on(project: Path) -> None:
     assert switched > 6
     file.write_text(text)
     every = settings.read(file, settings.FrozenSettings, {})
-    assert (every.answer, every.tag, every.helpers.model) == ("constrained", ("first",), "swarm-tiny")
+    assert (every.answer, every.tag, every.helpers.model) == (
+        "constrained",
+        ("first",),
+        "swarm-tiny",
+    )
     assert (usual.answer, usual.tag, usual.helpers.model) == ("json", (), None)
     assert usual.condition == every.condition == ("single-local", "6g")
 
@@ -115,7 +129,10 @@ def test_a_prompt_is_released_in_its_project(harness: Harness, project: Path) ->
     assert (resources.folder("prompts") / "released.toml").read_bytes() == shipped
     ego = project / "prompts/mine/ego.j2"
     ego.write_text(ego.read_text() + "\n")
-    assert "prompt mine was released and its text has changed" in harness("eval", "--prompt", "mine")[2]
+    assert (
+        "prompt mine was released and its text has changed"
+        in harness("eval", "--prompt", "mine")[2]
+    )
 
 
 def test_a_card_with_a_mistake_is_what_a_doctor_tells(harness: Harness, project: Path) -> None:
@@ -138,7 +155,11 @@ def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_pa
     (tmp_path / "file").touch()
     for name in ("full", "file"):
         said = harness("init", name)
-        assert said == (2, "", f"harness: {name} is not empty; give a new folder, or an empty one\n")
+        assert said == (
+            2,
+            "",
+            f"harness: {name} is not empty; give a new folder, or an empty one\n",
+        )
     assert os.listdir(tmp_path / "full") == ["x\x1b"]
     code, out, err = harness("init", "file/below")
     assert (code, out) == (2, "")

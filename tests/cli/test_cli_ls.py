@@ -76,11 +76,16 @@ def test_success_is_that_of_the_condition_in_the_headline_over_episodes(folder: 
     [frozen] = [one for one in runs(folder) if one.name == "frozen"]
     lines = (folder / "frozen/summary.csv").read_text().splitlines()
     rates = [
-        line.split(",") for line in lines if ",balanced_success_rate," in line and line.endswith(",episodes")
+        line.split(",")
+        for line in lines
+        if ",balanced_success_rate," in line and line.endswith(",episodes")
     ]
     [best] = [row for row in rates if row[4] == compared(read(folder / "frozen"))[0]]
     assert len(rates) == 3
-    assert (frozen.condition, frozen.success, frozen.low, frozen.high) == (best[4], *map(float, best[6:9]))
+    assert (frozen.condition, frozen.success, frozen.low, frozen.high) == (
+        best[4],
+        *map(float, best[6:9]),
+    )
 
 
 def test_a_condition_that_the_page_warns_of_is_the_best_in_no_list(folder: Path) -> None:
@@ -154,9 +159,18 @@ def test_an_unfinished_run_says_that_the_same_command_goes_on(
         ("run.json", "\udcff"),
         ("summary.csv", None),
         ("summary.csv", ""),
-        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,x,,,episodes\n"),
-        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,-5,,,episodes\n"),
-        ("summary.csv", "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,.9,.8,2,episodes\n"),
+        (
+            "summary.csv",
+            "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,x,,,episodes\n",
+        ),
+        (
+            "summary.csv",
+            "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,-5,,,episodes\n",
+        ),
+        (
+            "summary.csv",
+            "condition,metric,value,ci_low,ci_high,interval\n6g,success_rate,.9,.8,2,episodes\n",
+        ),
         ("summary.csv", "\udcff"),
     ],
 )
@@ -230,7 +244,9 @@ def test_a_folder_that_is_deleted_while_it_is_read_is_not_listed(
         assert {each.name for each in runs(folder)} == {"frozen", "frozen/sweep-tau"}
 
 
-def test_no_folder_is_one_line_and_an_empty_one_says_so(harness: Callable[..., Said], tmp_path: Path) -> None:
+def test_no_folder_is_one_line_and_an_empty_one_says_so(
+    harness: Callable[..., Said], tmp_path: Path
+) -> None:
     code, out, err = harness("run", "ls")
     assert (code, out) == (2, "")
     assert err.startswith("harness: reports is no folder; give one that holds runs")
@@ -248,12 +264,16 @@ def kinds_of_studies() -> set[str]:
         for room in rooms
         for file in room.rglob("*.py")
         for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Study"
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "Study"
     ]
     return {str(call.args[0].value) for call in calls if isinstance(call.args[0], ast.Constant)}
 
 
-def test_every_study_that_is_made_is_listed_and_refuses_the_folder_of_another(tmp_path: Path) -> None:
+def test_every_study_that_is_made_is_listed_and_refuses_the_folder_of_another(
+    tmp_path: Path,
+) -> None:
     kinds = kinds_of_studies()
     assert {"sweep", "trust", "schedule"} <= kinds
     known = dict(kinds_of_study())

@@ -44,7 +44,9 @@ def test_a_table_says_status_repairs_and_distribution(parse: Parse) -> None:
 
 
 def test_json_has_the_intent_by_action_and_the_helpers_message(parse: Parse) -> None:
-    _, out, _ = parse(str(COMPLETIONS / "y_strict_helper_distribution.txt"), "--role", "helper", "--json")
+    _, out, _ = parse(
+        str(COMPLETIONS / "y_strict_helper_distribution.txt"), "--role", "helper", "--json"
+    )
     parsed = json.loads(out)
     assert parsed["verdict"] == "strict"
     assert parsed["intent"] == {"SLOWER": 0.5, "IDLE": 0.4, "FASTER": 0.1}
@@ -57,8 +59,18 @@ def test_json_has_the_intent_by_action_and_the_helpers_message(parse: Parse) -> 
     [
         ("v4", "ego", '{"maneuver": "IDLE", "confidence": 0.8}', "label_only"),
         ("v9", "ego", '{"maneuver": "IDLE", "confidence": 0.8}', "strict"),
-        ("v5", "ego", 'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}', "strict"),
-        ("v4", "ego", 'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}', "recovered"),
+        (
+            "v5",
+            "ego",
+            'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}',
+            "strict",
+        ),
+        (
+            "v4",
+            "ego",
+            'So: {"action_distribution": {"SLOWER": 1, "IDLE": 0, "FASTER": 0}}',
+            "recovered",
+        ),
         ("mine", "ego", '{"sure": true, "maneuver": "IDLE", "confidence": 0.8}', "strict"),
         ("mine", "ego", '{"sure": 2, "maneuver": "IDLE", "confidence": 0.8}', "recovered"),
     ],
@@ -74,7 +86,8 @@ def test_a_prompt_says_what_was_asked_for(
     assert parsed["status"] == status
     assert parsed["extension"] == ({"sure": True} if "true" in text else None)
     rows = dict(
-        line.split(None, 1) for line in parse("-", "--prompt", version, stdin=text.encode())[1].splitlines()
+        line.split(None, 1)
+        for line in parse("-", "--prompt", version, stdin=text.encode())[1].splitlines()
     )
     assert rows.get("sure") == ("true" if "true" in text else None)
 
@@ -84,7 +97,10 @@ def test_a_failed_verdict_is_data_and_exits_with_zero(parse: Parse) -> None:
     code, out, _ = parse("-", "--finish-reason", "length", "--json", stdin=text)
     assert code == 0
     assert json.loads(out)["status"] == "truncated_json"
-    assert json.loads(parse("-", "--thinking", "--json", stdin=text)[1])["status"] == "truncated_reasoning"
+    assert (
+        json.loads(parse("-", "--thinking", "--json", stdin=text)[1])["status"]
+        == "truncated_reasoning"
+    )
 
 
 def test_bytes_that_are_no_utf8_are_replaced_and_said_so() -> None:
@@ -98,21 +114,31 @@ def test_bytes_that_are_no_utf8_are_replaced_and_said_so() -> None:
 
 def test_hostile_text_cannot_reach_the_terminal(parse: Parse) -> None:
     text = (
-        rb'{"evidence": "\u001b[31mred", "risk": "low", "recommended_maneuver": "\u001b[2J", "confidence": 1}'
+        rb'{"evidence": "\u001b[31mred", "risk": "low", "recommended_maneuver": "\u001b[2J", '
+        rb'"confidence": 1}'
     )
     assert "\x1b" not in parse("-", "--role", "helper", stdin=text)[1]
-    assert "\x1b" not in parse("-", "--role", "helper", stdin=text.replace(rb"\u001b[2J", b"IDLE"))[1]
+    assert (
+        "\x1b" not in parse("-", "--role", "helper", stdin=text.replace(rb"\u001b[2J", b"IDLE"))[1]
+    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["absent.txt"], "harness: cannot read completion file 'absent.txt': No such file or directory;"),
+        (
+            ["absent.txt"],
+            "harness: cannot read completion file 'absent.txt': No such file or directory;",
+        ),
         (["."], "harness: cannot read completion file '.': Is a directory;"),
-        (["-", "--role", "egg"], "harness: unknown role 'egg'; did you mean 'ego'? known: ego, helper"),
+        (
+            ["-", "--role", "egg"],
+            "harness: unknown role 'egg'; did you mean 'ego'? known: ego, helper",
+        ),
         (
             ["-", "--scenario", "roundabout-entri"],
-            "harness: unknown scenario 'roundabout-entri'; did you mean 'roundabout-entries'? known: ",
+            "harness: unknown scenario 'roundabout-entri'; did you mean 'roundabout-entries'? "
+            "known: ",
         ),
         (
             ["-", "--finish-reason", "lenght"],
@@ -120,7 +146,9 @@ def test_hostile_text_cannot_reach_the_terminal(parse: Parse) -> None:
         ),
     ],
 )
-def test_bad_input_is_one_line_and_exits_with_two(parse: Parse, arguments: list[str], line: str) -> None:
+def test_bad_input_is_one_line_and_exits_with_two(
+    parse: Parse, arguments: list[str], line: str
+) -> None:
     code, out, err = parse(*arguments)
     assert (code, out) == (2, "")
     assert err.startswith(line)
@@ -137,7 +165,9 @@ def test_a_pipe_is_read_where_the_shell_hands_it_over_and_refused_by_its_name(pa
     os.mkfifo("pipe")
     code, out, err = parse("pipe")
     assert (code, out, len(err.splitlines())) == (2, "", 1)
-    assert "it is no file, but a pipe or a device; give a text file, or - for what is piped in" in err
+    assert (
+        "it is no file, but a pipe or a device; give a text file, or - for what is piped in" in err
+    )
     reads, writes = os.pipe()
     os.write(writes, (COMPLETIONS / "y_recovered_fence_json.txt").read_bytes())
     os.close(writes)

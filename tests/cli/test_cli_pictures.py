@@ -45,7 +45,8 @@ def mine(tmp_path: Path) -> None:
     (tmp_path / "models/mine.toml").write_text(CARD.format(weights="a/b", patch_px=16))
 
 
-# -- how it looks --------------------------------------------------------------------------------------------
+# -- how it looks
+# --------------------------------------------------------------------------------------------
 
 
 def test_a_character_shows_the_means_of_two_parts_of_a_picture() -> None:
@@ -55,7 +56,9 @@ def test_a_character_shows_the_means_of_two_parts_of_a_picture() -> None:
     drawn = half_blocks(pixels)
     lines = drawn.split("\n")
     assert (len(lines), {line.plain for line in lines}) == (16, {"▀" * 64})
-    first, then = (next(s.style for s in line.spans if isinstance(s.style, Style)) for line in lines[:2])
+    first, then = (
+        next(s.style for s in line.spans if isinstance(s.style, Style)) for line in lines[:2]
+    )
     assert first.color
     assert first.bgcolor
     assert then.color
@@ -67,7 +70,9 @@ def test_a_character_shows_the_means_of_two_parts_of_a_picture() -> None:
 @pytest.mark.parametrize(
     ("size_px", "cells"), [((448, 224), (64, 16)), ((500, 250), (64, 16)), ((20, 10), (20, 5))]
 )
-def test_a_picture_of_any_size_has_its_shape(size_px: tuple[int, int], cells: tuple[int, int]) -> None:
+def test_a_picture_of_any_size_has_its_shape(
+    size_px: tuple[int, int], cells: tuple[int, int]
+) -> None:
     width, height = size_px
     lines = half_blocks(np.zeros((height, width, 3), dtype=np.uint8)).split("\n")
     assert (len(lines[0].plain), len(lines)) == cells
@@ -88,7 +93,11 @@ def test_a_terminal_with_colours_is_shown_the_picture_and_any_other_is_told_how(
         + seen.sha256[:8]
     )
     assert told == "not drawn: no terminal with colours here; --out FOLDER writes PNG files"
-    for name, value in (("FORCE_COLOR", "1"), ("COLORTERM", "truecolor"), ("TERM", "xterm-256color")):
+    for name, value in (
+        ("FORCE_COLOR", "1"),
+        ("COLORTERM", "truecolor"),
+        ("TERM", "xterm-256color"),
+    ):
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("NO_COLOR", raising=False)
     _, out, _ = harness(*show)
@@ -127,7 +136,8 @@ def test_what_says_json_has_the_digest_and_no_pixels(harness: Harness, small_pat
         }  # fmt: skip
 
 
-# -- how many tokens it has ----------------------------------------------------------------------------------
+# -- how many tokens it has
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("mine")
@@ -143,10 +153,24 @@ def test_a_picture_counts_in_every_prompt(
     assert (told["picture"]["tokens"], told["picture"]["checked"]) == (tokens, False)
     _, out, _ = harness("prompt", "check", *args)
     assert f"{tokens} tokens with {model}, its processor is not here to ask\n" in out
-    eval_v7 = ("eval", "--prompt", "v7", "--dataset", small_path, "--tokenizer", one_word, "--model", model)
+    eval_v7 = (
+        "eval",
+        "--prompt",
+        "v7",
+        "--dataset",
+        small_path,
+        "--tokenizer",
+        one_word,
+        "--model",
+        model,
+    )
     for image, counted in (("own", 2 + tokens), ("blank", 2 + tokens), ("none", 2)):
-        told = json.loads(harness(*eval_v7, "--limit", "1", "--image", image, "--dry-run", "--json")[1])
-        assert {(n["least"], n["most"]) for n in told["prompt_tokens"].values()} == {(counted, counted)}
+        told = json.loads(
+            harness(*eval_v7, "--limit", "1", "--image", image, "--dry-run", "--json")[1]
+        )
+        assert {(n["least"], n["most"]) for n in told["prompt_tokens"].values()} == {
+            (counted, counted)
+        }
 
 
 @pytest.mark.slow
@@ -168,21 +192,28 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
         there.chdir("mine")
         assert "128 tokens with agrees, as its processor says\n" in harness(*args, "agrees")[1]
         assert harness(*args, "differs") == (
-            1, "model 'differs': its processor makes 128 tokens of 448 x 224 pixels, and its card says 98; "
+            1, 
+                "model 'differs': its processor makes 128 tokens of 448 x 224 pixels, and its card "
+                "says 98; "
             "fix [vision]\n", "",
         )  # fmt: skip
 
 
-# -- what is refused -----------------------------------------------------------------------------------------
+# -- what is refused
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("show", "v7", "--scene", "00001-0", "--model", "qwen3-4b"), "--model qwen3-4b: prompt v7 shows a "
+        (("show", "v7", "--scene", "00001-0", "--model", "qwen3-4b"), 
+            "--model qwen3-4b: "
+            "prompt v7 shows a "
          "picture, and this model reads texts alone (its card has no [vision]); give another"),
         (("check", "v8", "--model", "proxy"), "--model proxy: prompt v8 shows a picture"),
-        (("check", "v2", "--model", "proxy"), "--model proxy: it reads no prompt; give a language model"),
+        (("check", "v2", "--model", "proxy"), 
+            "--model proxy: it reads no "
+            "prompt; give a language model"),
         (("show", "v2", "--scene", "00001-0", "--out", "x"), "--out: prompt v2 shows no picture"),
     ],
 )  # fmt: skip

@@ -16,9 +16,22 @@ DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
 
 
 @pytest.mark.slow
-def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], small_path: Path) -> None:
+def test_quiet_prints_nothing_and_writes_the_same(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
     once = ("eval", "--dataset", small_path, "--limit", "1", "--seeds", "0", "--out")
-    sweep = ("study", "sweep", "run", "--over", "tau", "--grid", "0.9", "--condition", "6g", "--out")
+    sweep = (
+        "study",
+        "sweep",
+        "run",
+        "--over",
+        "tau",
+        "--grid",
+        "0.9",
+        "--condition",
+        "6g",
+        "--out",
+    )
     for args in (once, ("drive", *DRIVE, "--condition", "6g", "--out"), sweep):
         name = args[1] if args[0] == "study" else args[0]
         code, out, err = harness(*args, "loud" if args is not once else "run")
@@ -34,7 +47,9 @@ def test_quiet_prints_nothing_and_writes_the_same(harness: Callable[..., Said], 
 
 
 @pytest.mark.slow
-def test_quiet_says_errors_and_what_json_asks_for(harness: Callable[..., Said], small_path: Path) -> None:
+def test_quiet_says_errors_and_what_json_asks_for(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
     code, out, err = harness("eval", "--model", "proxi", "--quiet")
     assert (code, out) == (2, "")
     assert err.startswith("harness: unknown model 'proxi'")
@@ -44,10 +59,18 @@ def test_quiet_says_errors_and_what_json_asks_for(harness: Callable[..., Said], 
 
 def completed(line: str) -> list[str]:
     """What bash is offered at the end of a line."""
-    asked = {"_HARNESS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    asked = {
+        "_HARNESS_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(line.count(" ")),
+    }
     code = "import sys, harness.cli; sys.argv = ['harness']; harness.cli.main()"
     done = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env={**os.environ, **asked},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return done.stdout.split()
 
@@ -58,4 +81,6 @@ def test_a_shell_completes_commands_and_options() -> None:
     assert completed("harness eval --qu") == ["--quiet"]
     assert completed("harness study cl") == ["closed-loop"]
     assert completed("harness run hi") == ["history"]
-    assert completed("harness campaign cl") == ["closed-loop"], "the old spelling is understood, and silent"
+    assert completed("harness campaign cl") == ["closed-loop"], (
+        "the old spelling is understood, and silent"
+    )

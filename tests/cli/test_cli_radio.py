@@ -45,7 +45,9 @@ def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], n
     reach = told["reception"]
     for sight in ("clear", "vehicle", "building"):
         assert reach[sight] == sorted(reach[sight], reverse=True), "the farther the less"
-    for clear, vehicle, building in zip(*(reach[s] for s in ("clear", "vehicle", "building")), strict=True):
+    for clear, vehicle, building in zip(
+        *(reach[s] for s in ("clear", "vehicle", "building")), strict=True
+    ):
         assert clear >= vehicle - 1e-6
         assert vehicle >= building - 1e-6
 
@@ -67,7 +69,9 @@ def test_show_has_both_percentiles_of_a_tables_latency(
             f'[parameters]\nfile = "{name}.csv"\n'
         )
     lines = [line.split("  ") for line in harness("radio", "show", "spread")[1].splitlines()]
-    rows_of = {line[0]: [cell.strip() for cell in line[1:] if cell] for line in lines if len(line) > 3}
+    rows_of = {
+        line[0]: [cell.strip() for cell in line[1:] if cell] for line in lines if len(line) > 3
+    }
     assert rows_of["latency p50 / p95, ms"][0] == "in sight"
     assert rows_of["50 m"] == ["20.0 / 55.0"] * 3
     told = json.loads(harness("radio", "show", "spread", "--json")[1])["latency_ms"]
@@ -85,7 +89,9 @@ def test_show_says_where_settings_leave_what_the_source_tried(harness: Callable[
 
 
 @pytest.mark.slow
-def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: Callable[..., Said]) -> None:
+def test_check_draws_messages_on_the_curve_and_holds_it_against_others(
+    harness: Callable[..., Said],
+) -> None:
     rows = '10,0.97,"power_dbm=20,rate_hz=20",they\n100,0.5,"power_dbm=20,rate_hz=20",they\n10,0.9,,they\n'
     Path("theirs.csv").write_text(f"distance_m,reception,configuration,source\n{rows}")
     code, out, err = harness(
@@ -107,7 +113,9 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(harness: 
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(
     harness: Callable[..., Said], name: str
 ) -> None:
-    """The mean wait is about 1 / (rate x reception); less where little arrives, as shadowing has spells."""
+    """The mean wait is about 1 / (rate x reception);
+    less where little arrives, as shadowing has spells.
+    """
     told = json.loads(harness("radio", "check", name, "-n", "2000", "--json")[1])
     assert 0.05 < told["busy_ratio"] < 0.5
     for wait in told["waits"]:
@@ -122,7 +130,9 @@ def test_check_says_how_long_a_receiver_waits_for_the_next_packet(
 
 @pytest.mark.slow
 def test_who_sends_often_is_heard_sooner(harness: Callable[..., Said]) -> None:
-    often = json.loads(harness("radio", "check", "mode4:rate_hz=50", "-n", "500", "--json")[1])["waits"][0]
+    often = json.loads(harness("radio", "check", "mode4:rate_hz=50", "-n", "500", "--json")[1])[
+        "waits"
+    ][0]
     assert 0.02 < often["mean_s"]["value"] < 0.05
 
 
@@ -132,8 +142,12 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         "density_per_km": "200", "rate_hz": "20", "power_dbm": "20", "t2_slots": "20", "transmissions": "2",
     }  # fmt: skip
     configuration = ",".join(f"{key}={value}" for key, value in settings.items())
-    Path("nr.csv").write_text(f'distance_m,reception,configuration\n50,.9,"{configuration}"\n50,0.9,\n')
-    code, out, err = harness("radio", "check", "mode2", "-n", "200", "--against", "nr.csv", "--json")
+    Path("nr.csv").write_text(
+        f'distance_m,reception,configuration\n50,.9,"{configuration}"\n50,0.9,\n'
+    )
+    code, out, err = harness(
+        "radio", "check", "mode2", "-n", "200", "--against", "nr.csv", "--json"
+    )
     assert (code, err) == (0, "")
     own, usual = (curve["mean_difference"] for curve in json.loads(out)["curves"])
     there = json.loads(harness("radio", "show", f"mode2:{configuration}", "--json")[1])
@@ -146,7 +160,10 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
     [
         (("show", "mode5"), "unknown operating point 'mode5'; did you mean"),
         (("show", "mode4:density=3"), "did you mean one of density_coupled, density_per_km?"),
-        (("show", "mode4:density_per_km=-1"), "density_per_km = -1.0; allowed: a number from 0 to 10000"),
+        (
+            ("show", "mode4:density_per_km=-1"),
+            "density_per_km = -1.0; allowed: a number from 0 to 10000",
+        ),
         (("show", "single-local"), "has no channel; `harness radio list` shows"),
         (("check", "6g"), "loses the same at every distance"),
         (("check", "mode4", "--out", "x.gif"), "known: .pdf, .png, .svg"),
@@ -157,14 +174,20 @@ def test_a_curve_of_mode_2_has_settings_of_its_own(harness: Callable[..., Said])
         (("check", "mode4", "--against", "other.csv"), "did you mean 'rate_hz'"),
         (
             ("check", "mode4", "--against", "theirs.csv"),
-            "has no column distance_m or reception; its first line names Distance (m), PRR, and may name",
+            "has no column distance_m or reception; its first line names Distance (m), PRR, and "
+            "may name",
         ),
         (("check", "mode4", "--against", "named.csv"), "did you mean 'configuration'?"),
-        (("check", "mode4", "--against", "trace.xml"), "its first line names <fcd-export>, and may name"),
+        (
+            ("check", "mode4", "--against", "trace.xml"),
+            "its first line names <fcd-export>, and may name",
+        ),
         (("check", "mode4", "--against", "no.csv"), "no.csv: cannot be read as a table"),
     ],
 )
-def test_a_mistake_is_one_line(harness: Callable[..., Said], arguments: tuple[str, ...], says: str) -> None:
+def test_a_mistake_is_one_line(
+    harness: Callable[..., Said], arguments: tuple[str, ...], says: str
+) -> None:
     Path("bad.csv").write_text("distance_m,reception\n10,0.9\n20,1.9\n")
     Path("other.csv").write_text("distance_m,reception,configuration\n10,0.9,rat_hz=10\n")
     Path("theirs.csv").write_text("Distance (m),PRR\n20,1.0\n")
@@ -186,19 +209,37 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
     harness: Callable[..., Said], done: Path
 ) -> None:
-    over = ("--over", "density_per_km", "--grid", "100,1000", "--condition", "mode4", "--out", "swept")
+    over = (
+        "--over",
+        "density_per_km",
+        "--grid",
+        "100,1000",
+        "--condition",
+        "mode4",
+        "--out",
+        "swept",
+    )
     code, _, err = harness("study", "sweep", done, *over)
     assert (code, err) == (0, "")
     swept = pd.read_csv("swept/conditions.csv")
     run = pd.read_csv(done / "summary.csv")
-    of_run = run[(run.condition == "mode4:density_per_km=1000") & (run.metric == "success_rate")].value
-    at = swept[(swept.value_of_variable == 1000) if "value_of_variable" in swept else swept.value == 1000]
+    of_run = run[
+        (run.condition == "mode4:density_per_km=1000") & (run.metric == "success_rate")
+    ].value
+    at = swept[
+        (swept.value_of_variable == 1000) if "value_of_variable" in swept else swept.value == 1000
+    ]
     assert at[at.metric == "success_rate"]["mean"].tolist() == pytest.approx(of_run.tolist())
 
 
 @pytest.mark.slow
-def test_a_run_warns_of_a_radio_that_its_source_never_tried(harness: Callable[..., Said], done: Path) -> None:
-    said = "mode4:density_per_km=1000: density_per_km = 1000 is outside what its model was held against"
+def test_a_run_warns_of_a_radio_that_its_source_never_tried(
+    harness: Callable[..., Said], done: Path
+) -> None:
+    said = (
+        "mode4:density_per_km=1000: density_per_km = 1000 is outside what its model was held "
+        "against"
+    )
     assert harness("report", done, "--out", "page.html")[0] == 0
     assert said in Path("page.html").read_text()
 
@@ -216,15 +257,24 @@ def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     )
     mine.write_text(text)
     run = evaluate(spec_of(small, points=(named_point("mine"),)), tmp_path / "run").out
-    assert harness("study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")[0] == 0
+    assert (
+        harness("study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")[
+            0
+        ]
+        == 0
+    )
     mine.write_text(text.replace("50", "60"))
-    code, _, err = harness("study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine")
+    code, _, err = harness(
+        "study", "sweep", run, "--over", "rate_hz", "--grid", "10", "--condition", "mine"
+    )
     assert code == 2
     assert "channel profile mine has changed since; restore it or run again" in err
 
 
 @pytest.mark.slow
-def test_no_messages_is_a_control_of_a_physical_radio_too(harness: Callable[..., Said], done: Path) -> None:
+def test_no_messages_is_a_control_of_a_physical_radio_too(
+    harness: Callable[..., Said], done: Path
+) -> None:
     code, out, _ = harness(
         "study", "sweep", done, "--over", "loss", "--grid", "1", "--condition", "its-g5", "--json"
     )
@@ -251,7 +301,9 @@ class OfAPackage(ItsG5):
 def test_what_a_field_means_is_said_beside_it_above_it_or_in_the_docstring():
     shipped, package = attributes(ItsG5), attributes(OfAPackage)
     assert shipped["packet_bytes"] == "size of a background packet."
-    assert shipped["header_bytes"] == "bytes that the layers below add to a packet and to a message."
+    assert (
+        shipped["header_bytes"] == "bytes that the layers below add to a packet and to a message."
+    )
     assert package["header_bytes"] == "none, since nothing lies below."
     assert package["curve"] == shipped["curve"]
     assert "rate_hz" in shipped

@@ -26,7 +26,16 @@ def test_conditions_stand_side_by_side_and_times_may_be_the_papers(
     harness: Callable[..., Said], done: Path
 ) -> None:
     """On demand the helpers' 145 ms come after the ego's; serial replies of 25 ms each follow."""
-    options = ("--over", "window", "--grid", "400", "--condition", "v2x", "--condition", "v2x:on_demand=true")
+    options = (
+        "--over",
+        "window",
+        "--grid",
+        "400",
+        "--condition",
+        "v2x",
+        "--condition",
+        "v2x:on_demand=true",
+    )
     code, out, err = harness("study", "sweep", done, *options, "--latency", "paper", "--json")
     assert (code, err) == (0, "")
     table = pd.DataFrame(json.loads(out))

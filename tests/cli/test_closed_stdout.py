@@ -1,4 +1,6 @@
-"""A command whose reader has left, as `| head` does, ends without a word; one whose disk is full says so."""
+"""A command whose reader has left, as `| head` does, ends without a word;
+one whose disk is full says so.
+"""
 
 import subprocess
 import sys
@@ -18,7 +20,11 @@ TOO = (
 def started(here: Path, command: tuple[str, ...], **out: Any) -> "subprocess.Popen[str]":
     made_up(here / "run")
     return subprocess.Popen(
-        [sys.executable, "-m", "harness", *command], cwd=here, text=True, stderr=subprocess.PIPE, **out
+        [sys.executable, "-m", "harness", *command],
+        cwd=here,
+        text=True,
+        stderr=subprocess.PIPE,
+        **out,
     )
 
 

@@ -1,4 +1,6 @@
-"""What others wrote reaches a terminal escaped: nothing moves the cursor, colours or turns the text round."""
+"""What others wrote reaches a terminal escaped:
+nothing moves the cursor, colours or turns the text round.
+"""
 
 import os
 from collections.abc import Callable
@@ -27,7 +29,9 @@ def test_prompt_show(harness: Callable[..., Said], project: Path) -> None:
     assert all(line.isprintable() for line in out.splitlines())
 
 
-def test_doctor(harness: Callable[..., Said], project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor(
+    harness: Callable[..., Said], project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (project / f"models/{HOSTILE}.toml").write_text("engine = 3\n")
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(project / HOSTILE))
     program = project / "bin/nvidia-smi"

@@ -48,7 +48,9 @@ def test_a_wrong_file_stands_in_its_list(kind: str, project: Path, harness: Type
 
 
 @pytest.mark.slow
-def test_what_needs_another_file_does_not_fail(project: Path, harness: Typed, small_path: Path) -> None:
+def test_what_needs_another_file_does_not_fail(
+    project: Path, harness: Typed, small_path: Path
+) -> None:
     few = ("--limit", "1", "--seeds", "0", "--condition", "6g", "--quiet")
     assert harness("eval", "--dataset", small_path, *few, "--out", "run")[0] == 0
     for command in (
@@ -62,7 +64,9 @@ def test_what_needs_another_file_does_not_fail(project: Path, harness: Typed, sm
         assert code == 0 or "unknown" in said, said
 
 
-def test_a_wrong_file_of_suites_takes_no_shipped_suite_with_it(project: Path, harness: Typed) -> None:
+def test_a_wrong_file_of_suites_takes_no_shipped_suite_with_it(
+    project: Path, harness: Typed
+) -> None:
     from harness.dataset.suites import named
 
     (project / "datasets").mkdir()

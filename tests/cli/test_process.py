@@ -66,7 +66,10 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
     made_up(tmp_path / "run")
     for n in range(8):
         process = subprocess.Popen(
-            [*HARNESS, "run", "ls", "."], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            [*HARNESS, "run", "ls", "."],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
         )
         time.sleep(0.04 * (n + 1))
         process.send_signal(signal.SIGTERM)
@@ -75,7 +78,8 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
         assert said in (b"harness: terminated\n", b"")
 
 
-# -- consoles and streams -------------------------------------------------------------------------------
+# -- consoles and streams
+# -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -99,7 +103,8 @@ def test_a_console_that_lacks_a_character_gets_another(env: dict[str, str], tmp_
 
 
 @pytest.mark.parametrize(
-    "closed", [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.exhaustive) for number in range(3))]
+    "closed",
+    [(0, 1, 2), *(pytest.param((number,), marks=pytest.mark.exhaustive) for number in range(3))],
 )
 def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path) -> None:
     def close() -> None:
@@ -118,14 +123,19 @@ def test_a_run_without_streams_is_whole(closed: tuple[int, ...], tmp_path: Path)
 
 
 def test_what_nobody_hears_still_has_its_exit_code(tmp_path: Path) -> None:
-    done = ended("run", "ls", "nowhere", cwd=tmp_path, prepare=lambda: os.close(2), stdout=subprocess.PIPE)
+    done = ended(
+        "run", "ls", "nowhere", cwd=tmp_path, prepare=lambda: os.close(2), stdout=subprocess.PIPE
+    )
     assert (done.returncode, done.stdout) == (2, b""), "an error is no output"
 
 
-# -- surroundings ---------------------------------------------------------------------------------------
+# -- surroundings
+# ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [("run", "ls", "."), ("prompt", "list"), ("--help",)], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [("run", "ls", "."), ("prompt", "list"), ("--help",)], ids=" ".join
+)
 def test_a_folder_that_is_gone(command: tuple[str, ...], tmp_path: Path) -> None:
     here = tmp_path / "gone"
     here.mkdir()
@@ -154,12 +164,16 @@ def test_little_memory(megabytes: int, tmp_path: Path) -> None:
     assert done.stderr.count(b"\n") <= 1
 
 
-@pytest.mark.parametrize("error", ["MemoryError()", "ImportError('x.so: failed to map segment from object')"])
+@pytest.mark.parametrize(
+    "error", ["MemoryError()", "ImportError('x.so: failed to map segment from object')"]
+)
 def test_memory_that_runs_out_is_one_line(error: str, tmp_path: Path) -> None:
     """Wherever it does: here the first package that the command line imports cannot be loaded."""
     (tmp_path / "typer").mkdir()
     (tmp_path / "typer/__init__.py").write_text(f"raise {error}")
-    done = ended("run", "ls", cwd=tmp_path, env={"PYTHONPATH": f"{tmp_path}:{os.pathsep.join(sys.path)}"})
+    done = ended(
+        "run", "ls", cwd=tmp_path, env={"PYTHONPATH": f"{tmp_path}:{os.pathsep.join(sys.path)}"}
+    )
     said = b"harness: memory ran out; give this command more, or less to do\n"
     assert (done.returncode, done.stderr) == (2, said)
 
@@ -176,7 +190,9 @@ def test_a_date_of_the_environment_that_is_none(date: str, monkeypatch: pytest.M
         for kind in FORMATS:
             save(Figure(), data := io.BytesIO(), kind)
             written.setdefault(kind, set()).add(data.getvalue())
-    assert {kind: len(different) for kind, different in written.items()} == dict.fromkeys(FORMATS, 1)
+    assert {kind: len(different) for kind, different in written.items()} == dict.fromkeys(
+        FORMATS, 1
+    )
 
 
 @pytest.mark.parametrize(

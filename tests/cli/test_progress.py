@@ -32,7 +32,8 @@ def test_where_more_follows_the_time_left_is_the_least() -> None:
     assert pace(61.34, 0, 19.7, grows=True) == "61.3/s in 0:00:20"
     progress = Bar("asking proxy", 1206, grows=True)
     assert (
-        line(progress, [(0.0, 0), (10.0, 100)], 10.0) == "asking proxy 100/1206 10.0/s at least 0:01:51 left"
+        line(progress, [(0.0, 0), (10.0, 100)], 10.0)
+        == "asking proxy 100/1206 10.0/s at least 0:01:51 left"
     )
 
 

@@ -50,7 +50,9 @@ def test_a_default_is_read_as_typer_reads_it() -> None:
             assert read == parameter.process_value(typer.Context(command), default)
 
 
-def test_a_path_that_cannot_be_read_is_left_to_typer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_cannot_be_read_is_left_to_typer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("os.access", lambda path, mode: False)
     assert plain(Path, str(tmp_path)) is UNREAD
     assert plain(list[Path], [str(tmp_path)]) is UNREAD
@@ -63,14 +65,19 @@ def test_neither_pydantic_nor_an_array_is_loaded_for(args: list[str], tmp_path: 
     code = (
         f"import sys, harness.cli as c\nsys.argv = ['harness', *{args!r}]\n"
         "try:\n    c.main()\nexcept SystemExit as end:\n    assert not end.code\n"
-        "print([name for name in ('pydantic', 'numpy', 'rich') if name in sys.modules], file=sys.stderr)"
+        "print([name for name in ('pydantic', 'numpy', 'rich') if name in sys.modules], "
+        "file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
     assert (done.returncode, done.stderr) == (0, "[]\n")
 
 
 @pytest.mark.parametrize("group", ["", *groups()])
-def test_help_says_each_command_whole_in_eighty_columns(harness: Callable[..., Said], group: str) -> None:
+def test_help_says_each_command_whole_in_eighty_columns(
+    harness: Callable[..., Said], group: str
+) -> None:
     code, out, err = harness(*group.split(), "--help")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -82,15 +89,22 @@ def test_the_map_has_every_command_under_its_panel(harness: Callable[..., Said])
     shown = {head: {line.split()[0] for line in lines} for head, *lines in blocks if lines}
     for panel, words in panels().items():
         assert shown[f"{panel}:"] == set(words)
-    assert {name for names in panels().values() for name in names} == {path.split()[0] for path in commands()}
+    assert {name for names in panels().values() for name in names} == {
+        path.split()[0] for path in commands()
+    }
     assert sum(map(len, panels().values())) <= 15
 
 
 @pytest.mark.parametrize(("old", "new"), spellings().items())
-def test_an_old_spelling_works_and_says_the_new_one(harness: Callable[..., Said], old: str, new: str) -> None:
+def test_an_old_spelling_works_and_says_the_new_one(
+    harness: Callable[..., Said], old: str, new: str
+) -> None:
     code, out, err = harness(*old.split(), "--help")
     assert (code, out) == (0, harness(*new.split(), "--help")[1])
-    assert err == f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0\n"
+    assert (
+        err
+        == f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0\n"
+    )
 
 
 def test_a_short_spelling_is_for_good(harness: Callable[..., Said]) -> None:
@@ -107,12 +121,17 @@ def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[.
 @pytest.mark.parametrize(
     ("typed", "meant"),
     [
-        ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", "`harness study sweep`"),
+        ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", 
+            "`harness "
+            "study "
+            "sweep`"),
         ("study swep", "`harness study sweep`"), ("models", "`harness model`"),
         ("chanel", "`harness radio`"),
     ],
 )  # fmt: skip
-def test_a_slip_is_answered_with_what_was_meant(harness: Callable[..., Said], typed: str, meant: str) -> None:
+def test_a_slip_is_answered_with_what_was_meant(
+    harness: Callable[..., Said], typed: str, meant: str
+) -> None:
     code, out, err = harness(*typed.split())
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert f"No such command {typed.split()[-1]!r} (did you mean {meant}" in err
@@ -120,5 +139,7 @@ def test_a_slip_is_answered_with_what_was_meant(harness: Callable[..., Said], ty
 
 
 def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Said]) -> None:
-    said = set(re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("study", "trust", "--help")[1])))
+    said = set(
+        re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("study", "trust", "--help")[1]))
+    )
     assert {*ATTACKS, *(rule for rule in RULES if not reads_plans(rule))} <= said

@@ -15,7 +15,9 @@ from tiers import some
 EVAL = ("eval", "--model", "proxy", "--seeds", "0:1", "--out", "stopped")
 
 
-def started(*args: str, cwd: Path, limit: Callable[[], object] | None = None) -> "subprocess.Popen[str]":
+def started(
+    *args: str, cwd: Path, limit: Callable[[], object] | None = None
+) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "harness", *args], cwd=cwd, text=True, stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL, preexec_fn=limit,
@@ -30,7 +32,9 @@ def test_who_stops_a_command_hears_that_the_same_one_goes_on(
     tmp_path: Path, number: int, code: int, word: str
 ) -> None:
     # A shell starts what runs in the background with Ctrl-C ignored.
-    process = started(*EVAL, cwd=tmp_path, limit=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    process = started(
+        *EVAL, cwd=tmp_path, limit=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    )
     kept = tmp_path / "stopped/.work/answers.jsonl"
     while not kept.is_file() and process.poll() is None:
         time.sleep(0.01)
@@ -45,7 +49,16 @@ def test_who_stops_a_command_hears_that_the_same_one_goes_on(
 def test_a_stopped_trust_study_says_what_it_keeps(
     harness: Callable[..., tuple[int, str, str]], small_path: Path, tmp_path: Path
 ) -> None:
-    options = ("--dataset", small_path, "--condition", "6g", "--seeds", "0:1", "--out", tmp_path / "run")
+    options = (
+        "--dataset",
+        small_path,
+        "--condition",
+        "6g",
+        "--seeds",
+        "0:1",
+        "--out",
+        tmp_path / "run",
+    )
     assert harness("eval", "--model", "proxy", *options)[0] == 0
     typed = ("study", "trust", "run", "--out", "study")
     process = started(*typed, cwd=tmp_path)

@@ -71,9 +71,13 @@ def test_a_run_goes_on_under_other_tags_and_keeps_those_it_was_begun_with(
     assert compare(pair(done.out, plain.out)).settings == ()
 
 
-def test_a_run_whose_manifest_has_no_tags_is_listed_as_broken(small: Dataset, tmp_path: Path) -> None:
+def test_a_run_whose_manifest_has_no_tags_is_listed_as_broken(
+    small: Dataset, tmp_path: Path
+) -> None:
     out = run(spec_of(small), tmp_path / "old").out
     manifest = json.loads((out / "run.json").read_text())
     del manifest["tags"]
     (out / "run.json").write_text(json.dumps(manifest))
-    assert [(one.state, one.why, one.tags) for one in runs(tmp_path)] == [("broken", "run.json", ())]
+    assert [(one.state, one.why, one.tags) for one in runs(tmp_path)] == [
+        ("broken", "run.json", ())
+    ]

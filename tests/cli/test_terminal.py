@@ -17,7 +17,9 @@ def test_an_interval_that_nobody_knows_is_a_dash():
     assert (PERCENT.text(-1e-9), PERCENT.number(0.5, "+")) == ("0.0 %", "+50.0")
 
 
-def test_a_name_that_leaves_no_room_for_its_row_stands_above_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_leaves_no_room_for_its_row_stands_above_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Figures of 62 columns and a space before each leave 15."""
     cells = ("100.0 [43.9, 100.0]", "-33.3 [-79.2, 29.1]", "x" * 24)
     names = ("6g:loss=0.12345", "6g:messages=shuffled", "a" * 85)
@@ -31,7 +33,9 @@ def test_a_name_that_leaves_no_room_for_its_row_stands_above_it(capsys: pytest.C
     ]  # fmt: skip
 
 
-def test_columns_are_two_spaces_apart_where_names_have_room(capsys: pytest.CaptureFixture[str]) -> None:
+def test_columns_are_two_spaces_apart_where_names_have_room(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     rows = [("blind-merge", "1.0", "12"), ("日本", "-", "3")]
     table(("family", "6g:messages=shuffled,loss=0.25", "n"), rows)
     assert capsys.readouterr().out.splitlines() == [

@@ -15,13 +15,17 @@ def evaluated(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The proxy on four episodes, alone and under 6g, with two seeds; every helper is asked."""
     points = (POINTS["single-local"], POINTS["6g"])
     return evaluate(
-        spec_of(small, points=points, seeds=SEEDS, ask="all"), tmp_path_factory.mktemp("compare") / "run"
+        spec_of(small, points=points, seeds=SEEDS, ask="all"),
+        tmp_path_factory.mktemp("compare") / "run",
     ).out
 
 
 @pytest.fixture(scope="session")
 def worse_once(evaluated: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Under 6g one success of four is lost in every seed; alone nothing changes; nor do tests.""" ""
+    (
+        """Under 6g one success of four is lost in every seed; alone nothing changes; nor do tests."""
+        ""
+    )
     base = tmp_path_factory.mktemp("worse")
     one, other = (Path(shutil.copytree(evaluated, base / name)) for name in ("a", "b"))
     ends(one, "6g", [["", "", "", ""]] * 2)

@@ -1,4 +1,6 @@
-"""Which answers changed from one run to another: counted, the first one shown, and all side by side."""
+"""Which answers changed from one run to another:
+counted, the first one shown, and all side by side.
+"""
 
 import json
 import shutil
@@ -27,7 +29,9 @@ def test_texts_that_changed_are_counted_where_no_verdict_did(
 ) -> None:
     reworded(runs[1], "v2")
     every, mine = answers_of(runs[0]), [a for a in answers_of(runs[0]) if a.viewer == "v2"]
-    said = f"{len(mine)} of {len(every)} to the same questions changed, none of them in their verdict"
+    said = (
+        f"{len(mine)} of {len(every)} to the same questions changed, none of them in their verdict"
+    )
     out = " ".join(harness("compare", *runs)[1].split())
     assert f"answers: {said} first: {mine[0].id}, helper A strict: " in out
     assert f"all, side by side: --html FILE --show {len(mine)}" in out
@@ -43,7 +47,9 @@ def test_texts_that_changed_are_counted_where_no_verdict_did(
     page = unescape(Path("page.html").read_text())
     assert said in page
     for answer in mine:
-        shown = page.partition(f"<summary>{answer.id}, helper</summary>")[2].partition("</details>")[0]
+        shown = page.partition(f"<summary>{answer.id}, helper</summary>")[2].partition(
+            "</details>"
+        )[0]
         assert f"<pre>{answer.raw}<mark></mark></pre>" in shown
         assert f"<pre>{answer.raw}<mark> </mark></pre>" in shown
 
@@ -65,10 +71,14 @@ def test_python_has_all_of_them_side_by_side_and_a_short_repr(runs: tuple[Path, 
 def test_an_answer_to_another_question_is_said_and_not_counted(
     told: str, runs: tuple[Path, Path], harness: Harness
 ) -> None:
-    """Where only helpers were asked otherwise, the egos' answers still count; where all were, none does."""
+    """Where only helpers were asked otherwise, the egos' answers still count;
+    where all were, none does.
+    """
 
     def otherwise(*roles: str) -> Callable[[Row], object]:
-        return lambda row: row["role"] in roles and row.update({told: "1" * 64, "raw": f"{row['raw']} "})
+        return lambda row: (
+            row["role"] in roles and row.update({told: "1" * 64, "raw": f"{row['raw']} "})
+        )
 
     every = answers_of(runs[0])
     egos = sum(a.role == "ego" for a in every)
@@ -80,13 +90,18 @@ def test_an_answer_to_another_question_is_said_and_not_counted(
     assert f"answers: 0 of {egos} to the same questions changed; {rest}" in out
     change(runs[1], answer=otherwise("ego"))
     out = " ".join(harness("compare", *runs)[1].split())
-    assert f"answers: none can be compared: each of the {len(every)} questions that both runs have" in out
+    assert (
+        f"answers: none can be compared: each of the {len(every)} questions that both runs have"
+        in out
+    )
     assert "first:" not in out
 
 
 def test_a_verdict_that_changed_counts_where_the_text_did_not(runs: tuple[Path, Path]) -> None:
     one = answers_of(runs[0])[0]
-    change(runs[1], answer=lambda row: row["scene"] == one.scene and row.update(verdict="recovered"))
+    change(
+        runs[1], answer=lambda row: row["scene"] == one.scene and row.update(verdict="recovered")
+    )
     held = compare(pair(*runs)).held
     assert len(held.changed) == held.verdicts > 1
     assert {each.verdicts for each in held.changed} == {("strict", "recovered")}
@@ -99,13 +114,17 @@ def test_runs_without_a_question_in_common_say_so() -> None:
 
 def test_the_line_begins_a_little_before_the_texts_part() -> None:
     alike = "x" * 500
-    lines = words.first_changed(AnswerChanged("s/v1", "ego", f"{alike}one", f"{alike}two", ("strict",) * 2))
+    lines = words.first_changed(
+        AnswerChanged("s/v1", "ego", f"{alike}one", f"{alike}two", ("strict",) * 2)
+    )
     assert lines[1:] == [f"  A strict: …{'x' * 20}one", f"  B strict: …{'x' * 20}two"]
     nothing = words.first_changed(AnswerChanged("s/v1", "ego", "one", "", ("strict", "failed")))
     assert nothing[1:] == ["  A strict: one", "  B failed: nothing"]
 
 
-def test_where_there_is_no_interval_a_finding_says_so(runs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_where_there_is_no_interval_a_finding_says_so(
+    runs: tuple[Path, Path], tmp_path: Path
+) -> None:
     from changing import ends
 
     twin = Path(shutil.copytree(runs[1], tmp_path / "twin"))

@@ -84,7 +84,9 @@ def test_gates_decide_the_exit_code(
     assert [gate["gate"] for gate in told["gates"]] == gates
 
 
-@pytest.mark.parametrize(("gate", "code"), [("success_rate < -0.25", 0), ("success_rate <= -0.25", 1)])
+@pytest.mark.parametrize(
+    ("gate", "code"), [("success_rate < -0.25", 0), ("success_rate <= -0.25", 1)]
+)
 @pytest.mark.parametrize("form", [(), ("--markdown",)])
 def test_every_form_ends_with_the_exit_code_of_its_gates(
     form: tuple[str, ...], gate: str, code: int, worse_once: tuple[Path, Path], harness: Harness
@@ -105,7 +107,9 @@ def test_rounding_decides_no_gate(runs: tuple[Path, Path], harness: Harness) -> 
     assert harness("compare", *runs, "--fail-if", "entropy_nats > 0")[0] == 1
 
 
-def test_a_condition_with_colons_in_its_name_has_gates_too(runs: tuple[Path, Path], harness: Harness) -> None:
+def test_a_condition_with_colons_in_its_name_has_gates_too(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
     config = json.loads((runs[0] / "run.json").read_text())
     name = "6g:consensus=median,window_s=0.4"
     config["conditions"][1]["name"] = name
@@ -179,7 +183,10 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     scenes = list(dict.fromkeys(answer.scene for answer in answers_of(worse[0])))
     n = len(scenes)
     for part in (
-        "B: ", "proxy · prompt v2 · constrained", "4 episodes × 2 channel seeds of small", "differ in answer",
+        "B: ", "proxy · prompt v2 · constrained", 
+            "4 episodes × 2 "
+            "channel seeds of "
+            "small", "differ in answer",
         "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-100.0, +59.9] 1.000",
         "success: 0 gained, 2 lost of 8 episodes × seeds",
         "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",
@@ -190,8 +197,12 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
 
 
 @pytest.mark.slow
-def test_six_metrics_come_first_and_all_print_the_rest(worse: tuple[Path, Path], harness: Harness) -> None:
-    """The primary metrics, then what changed most clearly: entropy, and bits, alike in every episode."""
+def test_six_metrics_come_first_and_all_print_the_rest(
+    worse: tuple[Path, Path], harness: Harness
+) -> None:
+    """The primary metrics, then what changed most clearly:
+    entropy, and bits, alike in every episode.
+    """
 
     def differ(row: Row) -> None:
         row["entropy_nats"] += 0.5 + row["episode"] % 2 / 100
@@ -201,7 +212,9 @@ def test_six_metrics_come_first_and_all_print_the_rest(worse: tuple[Path, Path],
     metrics = json.loads(harness("compare", *worse, "--json")[1])["conditions"][1]["metrics"]
     for form in ((), ("--markdown",)):
         few, every = (harness("compare", *worse, *form, *more)[1] for more in ((), ("--all",)))
-        rows = [[name for name in metrics if re.search(rf"[ ?] {name} ", text)] for text in (few, every)]
+        rows = [
+            [name for name in metrics if re.search(rf"[ ?] {name} ", text)] for text in (few, every)
+        ]
         primary = ["success_rate", "balanced_success_rate", "unsafe_rate", "latency_proxy_ms"]
         assert set(rows[0]) == {*primary, "bits_per_episode", "entropy_nats"}
         assert set(rows[1]) == set(metrics)
@@ -226,9 +239,13 @@ def test_prefill_and_decode_of_each_run_are_said(
     assert told["b"]["answer_times"]["ego"]["first_token"] == first
 
 
-def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harness: Harness) -> None:
+def test_json_lists_what_is_shown_and_counts_all(
+    worse: tuple[Path, Path], harness: Harness
+) -> None:
     change(worse[1], answer=lambda row: row["viewer"] == "v2" and row.update(verdict="recovered"))
-    told = json.loads(harness("compare", *worse, "--show", "1", "--json")[1], parse_constant=pytest.fail)
+    told = json.loads(
+        harness("compare", *worse, "--show", "1", "--json")[1], parse_constant=pytest.fail
+    )
     condition = told["conditions"][1]
     assert condition["metrics"]["success_rate"] | {"low": 0, "high": 0} == {
         "a": 1.0, "b": 0.75, "difference": -0.25, "low": 0, "high": 0, "n": 4, "n_excluded": 0,
@@ -252,8 +269,12 @@ def test_json_lists_what_is_shown_and_counts_all(worse: tuple[Path, Path], harne
 
 
 @pytest.mark.slow
-def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Path], harness: Harness) -> None:
-    """B takes 50 ms more in even episodes and 50.01 in odd ones: certain, also among some thirty."""
+def test_no_p_is_printed_as_zero_and_json_keeps_the_number(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
+    """B takes 50 ms more in even episodes and 50.01 in odd ones:
+    certain, also among some thirty.
+    """
 
     def slower(row: Row) -> None:
         row["latency_ms"] = 150.0 + row["episode"] % 2 * 0.01
@@ -261,10 +282,18 @@ def test_no_p_is_printed_as_zero_and_json_keeps_the_number(runs: tuple[Path, Pat
     change(runs[0], decision=lambda row: row.update(latency_ms=100.0))
     change(runs[1], decision=slower)
     told = json.loads(harness("compare", *runs, "--json")[1], parse_constant=pytest.fail)
-    of = [metric for c in told["conditions"] for metric in c["metrics"].values() if metric["p"] is not None]
+    of = [
+        metric
+        for c in told["conditions"]
+        for metric in c["metrics"].values()
+        if metric["p"] is not None
+    ]
     latency = told["conditions"][1]["metrics"]["latency_proxy_ms"]
     assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * 6 < 1e-9
-    printed = [harness("compare", *runs, *form)[1] for form in ((), ("--markdown",), ("--html", "page.html"))]
+    printed = [
+        harness("compare", *runs, *form)[1]
+        for form in ((), ("--markdown",), ("--html", "page.html"))
+    ]
     for text in (*printed[:2], unescape(Path("page.html").read_text())):
         said = " ".join(text.split())
         assert "< 0.001" in said
@@ -314,7 +343,10 @@ def test_gates_are_test_cases_of_junit(worse_once: tuple[Path, Path], harness: H
     suite = ElementTree.parse("gates.xml").getroot()
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
     failed, passed = suite.findall("testcase")
-    assert (failed.get("name"), passed.get("name")) == ("6g:success_rate < -0.01", "unsafe_rate > 0.5")
+    assert (failed.get("name"), passed.get("name")) == (
+        "6g:success_rate < -0.01",
+        "unsafe_rate > 0.5",
+    )
     assert "in 6g (-0.25)" in failed.find("failure").get("message", "")
     assert passed.find("failure") is None
     code, _, err = harness("compare", *worse_once, "--junit", "gates.xml")
@@ -323,7 +355,9 @@ def test_gates_are_test_cases_of_junit(worse_once: tuple[Path, Path], harness: H
 
 def test_no_number_has_more_than_four_figures() -> None:
     def told(value: float) -> str:
-        return line(Difference("bits_per_episode", value, 0.0, Estimate(value, value, value, 2, 0))).a
+        return line(
+            Difference("bits_per_episode", value, 0.0, Estimate(value, value, value, 2, 0))
+        ).a
 
     assert [told(value) for value in (0.0, 7.0, 1234.4, 25850.3, 25856.0)] == [
         "0", "7", "1234", "25850", "25860",
@@ -384,7 +418,11 @@ def test_nothing_a_run_says_becomes_markup(hostile: tuple[Path, Path], harness: 
     assert "default-src 'none'; style-src 'unsafe-inline'" in text
     assert "⟨U+202E⟩" in text
     assert "\u202e" not in text
-    for part in ("{{ 7 * 7 }}", "<script>alert(1)</script>", "FAILED: 6g:success_rate < 0 in 6g (-0.25)"):
+    for part in (
+        "{{ 7 * 7 }}",
+        "<script>alert(1)</script>",
+        "FAILED: 6g:success_rate < 0 in 6g (-0.25)",
+    ):
         assert part in "".join(page.pieces)
     marked = harness("compare", *hostile, *gate, "--markdown")[1]
     bare = re.sub(r"(?<!`)(`+)(?!`).*?(?<!`)\1(?!`)", "", marked)

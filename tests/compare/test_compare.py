@@ -1,4 +1,6 @@
-"""Two runs held against each other: differences that can be counted by hand, and what is refused."""
+"""Two runs held against each other:
+differences that can be counted by hand, and what is refused.
+"""
 
 import csv
 import json
@@ -27,7 +29,13 @@ from harness.runs.metrics import BALANCED, METRICS, ONE_OPTIMAL
 Said = tuple[int, str, str]
 WITNESSED = {name for name in METRICS if name.startswith("success_dangerous_rate_")}
 BY_DANGER = {name for name, metric in METRICS.items() if metric.half} - WITNESSED
-CONFLICTS = {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate", "least_pet_s", "short_pet_rate"}
+CONFLICTS = {
+    "least_ttc_s",
+    "short_ttc_rate",
+    "short_ttc_decision_rate",
+    "least_pet_s",
+    "short_pet_rate",
+}
 # Which not every episode has.
 SOME = {
     "time_to_clear_s", "regret_rate", "delay_s", "time_lost_s", "least_ttc_s", "least_pet_s", ONE_OPTIMAL,
@@ -58,7 +66,9 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
     scenes = len({answer.scene for answer in answers_of(runs[0])})
     assert c.answers_in_both == {"ego": scenes, "helper": 3 * scenes}
     for of in c.conditions:
-        silent = {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
+        silent = (
+            {"effective_loss", "observed_reply_loss"} if of.condition == "single-local" else set()
+        )
         always = set(NAMES) - LIVE - OPTIONAL - FEW - {"merge_failed_rate"}
         assert {d.metric for d in of.differences} == always - silent
         for d in of.differences:
@@ -66,7 +76,9 @@ def test_a_run_against_itself_differs_by_nothing(runs: tuple[Path, Path]) -> Non
             if d.metric == BALANCED or (d.metric in BY_DANGER and d.change.n == 1):
                 assert d.change.low != d.change.low, "one of the four has no danger"
             elif d.metric.endswith(("_rate", "_reply_loss")):
-                assert d.change.low == -d.change.high < 0, "what all episodes agree in, others may not"
+                assert d.change.low == -d.change.high < 0, (
+                    "what all episodes agree in, others may not"
+                )
             else:
                 assert d.change.low != d.change.low
             known = 4 if d.metric not in SOME else d.change.n
@@ -84,11 +96,14 @@ def test_the_means_are_those_of_the_runs_own_summary(runs: tuple[Path, Path]) ->
     c = found(runs)
     for of in c.conditions:
         for d in of.differences:
-            assert d.a == pytest.approx(own[of.condition, d.metric], abs=1e-3 if "_ms" in d.metric else 1e-6)
+            assert d.a == pytest.approx(
+                own[of.condition, d.metric], abs=1e-3 if "_ms" in d.metric else 1e-6
+            )
 
 
 def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
-    """Alone two of 4 gained and one lost, from .5 to .75: squares deviate by 2.75 from their mean, over 3.
+    """Alone two of 4 gained and one lost, from .5 to .75:
+    squares deviate by 2.75 from their mean, over 3.
 
     Two more differ, each by a quarter.
     """
@@ -99,7 +114,12 @@ def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
     c = found(runs)
     alone = differences(c, "single-local")
     change = alone["success_rate"].change
-    assert (alone["success_rate"].a, alone["success_rate"].b, change.value, change.n) == (0.5, 0.75, 0.25, 4)
+    assert (alone["success_rate"].a, alone["success_rate"].b, change.value, change.n) == (
+        0.5,
+        0.75,
+        0.25,
+        4,
+    )
     error = math.sqrt(2.75 / 3 / 4 + 2 / 4**2)
     half = 1.959964 * error
     assert (change.low, change.high) == pytest.approx((0.25 - half, min(0.25 + half, 1)), abs=1e-6)
@@ -111,8 +131,11 @@ def test_success_and_its_test_by_hand(runs: tuple[Path, Path]) -> None:
     assert alone["success_rate"].p_value == pytest.approx(2 * norm.sf(0.25 / error), abs=1e-6)
 
 
-def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(runs: tuple[Path, Path]) -> None:
-    """Episodes go from 0, 1, 0, 0 to 0.5, 1, 0, 0.5: differences of 0.5, 0, 0, 0.5, of mean square 1/8.
+def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(
+    runs: tuple[Path, Path],
+) -> None:
+    """Episodes go from 0, 1, 0, 0 to 0.5, 1, 0, 0.5:
+    differences of 0.5, 0, 0, 0.5, of mean square 1/8.
 
     The two more differ by a quarter of .5 each, or, since few differ, rather by a quarter.
     """
@@ -126,7 +149,10 @@ def test_success_that_hangs_on_the_seed_has_an_interval_over_episodes(runs: tupl
     assert (change.value, change.low, change.high) == pytest.approx(
         (0.25, 0.25 - half, 0.25 + half), abs=1e-6
     )
-    assert c.conditions[1].gained == (Flip(0, (0,), "late", "success"), Flip(3, (0,), "late", "success"))
+    assert c.conditions[1].gained == (
+        Flip(0, (0,), "late", "success"),
+        Flip(3, (0,), "late", "success"),
+    )
 
 
 def test_holm_counts_the_primary_metrics_in_every_condition(runs: tuple[Path, Path]) -> None:
@@ -144,13 +170,17 @@ def test_holm_counts_the_primary_metrics_in_every_condition(runs: tuple[Path, Pa
     assert gained.p_value is not None
     assert gained.p_value == pytest.approx(min(p_values))
     assert gained.p_corrected == pytest.approx(len(p_values) * gained.p_value)
-    assert differences(c, "6g")["late_rate"].p_value == pytest.approx(gained.p_value), "its mirror image"
+    assert differences(c, "6g")["late_rate"].p_value == pytest.approx(gained.p_value), (
+        "its mirror image"
+    )
     unchanged = differences(c, "single-local")["success_rate"]
     assert (unchanged.p_value, unchanged.p_corrected) == (1.0, 1.0)
 
 
 def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> None:
-    """10 ms more in episode 0 and one seed of two is 5 ms; episode 1 is unknown in B, and so left out."""
+    """10 ms more in episode 0 and one seed of two is 5 ms;
+    episode 1 is unknown in B, and so left out.
+    """
 
     def slower(row: Row) -> None:
         row["latency_ms"] = 100.0
@@ -167,18 +197,25 @@ def test_steps_and_seeds_of_an_episode_count_as_one(runs: tuple[Path, Path]) -> 
     d = differences(found(runs), "6g")["latency_proxy_ms"]
     assert (d.a, d.b) == pytest.approx((100, 100 + 5 / 3))
     assert d.change.value == pytest.approx(5 / 3)
-    assert d.change.low == pytest.approx(5 / 3 - 4.3027 * 5 / 3, abs=1e-3), "t(2), standard error 5/3"
+    assert d.change.low == pytest.approx(5 / 3 - 4.3027 * 5 / 3, abs=1e-3), (
+        "t(2), standard error 5/3"
+    )
     assert (d.change.n, d.change.n_excluded) == (3, 1)
 
 
 def test_lost_replies_by_hand(runs: tuple[Path, Path]) -> None:
-    """Episodes 0 and 1 ask two helpers at every decision. In B one of the replies is lost in episode 0."""
+    """Episodes 0 and 1 ask two helpers at every decision.
+    In B one of the replies is lost in episode 0.
+    """
 
     def heard(lost: float, loss: float) -> Callable[[Row], None]:
         def heard(row: Row) -> None:
             asked = row["condition"] == "6g" and row["episode"] < 2
             observed = lost if row["episode"] == 0 else 0.0
-            row |= {"observed_loss": observed if asked else None, "effective_loss": loss if asked else None}
+            row |= {
+                "observed_loss": observed if asked else None,
+                "effective_loss": loss if asked else None,
+            }
 
         return heard
 
@@ -186,14 +223,20 @@ def test_lost_replies_by_hand(runs: tuple[Path, Path]) -> None:
     change(runs[1], decision=heard(0.5, 0.112))
     told = differences(found(runs), "6g")
     lost = told["observed_reply_loss"]
-    assert (lost.a, lost.b, lost.change.value) == (0, 0.25, 0.25), "of episodes 0 and 1, half and nothing"
+    assert (lost.a, lost.b, lost.change.value) == (0, 0.25, 0.25), (
+        "of episodes 0 and 1, half and nothing"
+    )
     assert (lost.change.n, lost.change.n_excluded) == (2, 2)
     assert told["effective_loss"].change.value == pytest.approx(0.1)
     change(runs[1], decision=lambda row: row.update(effective_loss=None))
-    assert "effective_loss" not in differences(found(runs), "6g"), "one of the runs does not know it"
+    assert "effective_loss" not in differences(found(runs), "6g"), (
+        "one of the runs does not know it"
+    )
 
 
-def test_latency_percentiles_are_of_all_decisions_and_resampled_by_episode(runs: tuple[Path, Path]) -> None:
+def test_latency_percentiles_are_of_all_decisions_and_resampled_by_episode(
+    runs: tuple[Path, Path],
+) -> None:
     """A takes 100 ms. In B episode 3 takes 200 ms in seed 0: a quarter of that seed's decisions."""
 
     def slow(row: Row) -> None:
@@ -236,10 +279,13 @@ def test_what_only_driving_shows_by_hand(tmp_path: Path) -> None:
     assert told["least_gap_m"].change.value == -0.5
 
 
-def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path], small: Dataset) -> None:
+def test_answers_that_are_read_otherwise_are_told_by_role(
+    runs: tuple[Path, Path], small: Dataset
+) -> None:
     """B replays A, with one ego's answer and two helpers' made unreadable or a little broken.
 
-    The ego's and one helper's are at the last decision of an episode, so that all go where they went.
+    The ego's and one helper's are at the last decision of an episode,
+    so that all go where they went.
     """
     over_6g = rows_of(runs[0], "6g")
     last = max((row["step"], row["scene"]) for row in over_6g if row["episode"] == 0)[1]
@@ -252,7 +298,9 @@ def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path
 
     change(runs[1], answer=spoil)
     points = (POINTS["single-local"], POINTS["6g"])
-    replayed = evaluate(spec_of(small, f"replay:{runs[1]}", points=points, seeds=SEEDS), Path(runs[1], "new"))
+    replayed = evaluate(
+        spec_of(small, f"replay:{runs[1]}", points=points, seeds=SEEDS), Path(runs[1], "new")
+    )
     c = found((runs[0], replayed.out))
     turned = {(t.role, t.a, t.b): t.requests for t in c.answers}
     assert turned == {
@@ -260,11 +308,16 @@ def test_answers_that_are_read_otherwise_are_told_by_role(runs: tuple[Path, Path
         ("helper", "strict", "failed"): (f"{last}/v2",),
         ("helper", "strict", "recovered"): (f"{other}/v3",),
     }
-    mine = [[r["scene"] == last for r in over_6g if (r["episode"], r["seed"]) == (0, s)] for s in SEEDS]
+    mine = [
+        [r["scene"] == last for r in over_6g if (r["episode"], r["seed"]) == (0, s)] for s in SEEDS
+    ]
     texts = {each.request: each for each in c.held.changed}
     assert texts.keys() == {request for requests in turned.values() for request in requests}
     assert (c.held.same, c.held.other) == (sum(c.answers_in_both.values()), 0)
-    assert (texts[f"{last}/v1"].b, texts[f"{last}/v1"].verdicts) == ("no idea", ("strict", "failed"))
+    assert (texts[f"{last}/v1"].b, texts[f"{last}/v1"].verdicts) == (
+        "no idea",
+        ("strict", "failed"),
+    )
     share = sum(sum(of) / len(of) for of in mine) / len(SEEDS)
     assert differences(c, "6g")["fallback_rate"].change.value == pytest.approx(share / 4)
     assert "model.name" in {name for name, _, _ in c.settings}
@@ -302,11 +355,16 @@ def test_a_setting_of_an_extension_in_which_runs_differ_is_told(runs: tuple[Path
 def test_runs_of_other_lengths_and_conditions_are_compared_where_they_meet(
     runs: tuple[Path, Path], small_path: Path
 ) -> None:
-    short = evaluate(spec_of(load(small_path, 3), points=(POINTS["6g"], POINTS["v2x"])), runs[1] / "short")
+    short = evaluate(
+        spec_of(load(small_path, 3), points=(POINTS["6g"], POINTS["v2x"])), runs[1] / "short"
+    )
     c = found((runs[0], short.out))
     assert (c.pair.conditions, c.pair.episodes) == (("6g",), (0, 1, 2))
     assert c.settings == ()
-    assert all(d.change.n == 3 or d.metric in {*BY_DANGER, ONE_OPTIMAL} for d in c.conditions[0].differences)
+    assert all(
+        d.change.n == 3 or d.metric in {*BY_DANGER, ONE_OPTIMAL}
+        for d in c.conditions[0].differences
+    )
     assert all(d.change.value == 0 for d in c.conditions[0].differences)
 
 
@@ -337,7 +395,9 @@ def test_live_runs_are_compared_with_live_runs(
     unheard = {"effective_loss", "observed_reply_loss", "merge_failed_rate"}
     frozen = {name for name in NAMES if METRICS[name].world == "frozen"}
     by_tree = {
-        f"{what}_{half}_rate" for what in ("miss", "false_alarm") for half in ("dangerous", "harmless")
+        f"{what}_{half}_rate"
+        for what in ("miss", "false_alarm")
+        for half in ("dangerous", "harmless")
     }
     assert set(NAMES) - set(told) == frozen | unheard | by_tree | OPTIONAL
     for name, d in told.items():
@@ -351,7 +411,11 @@ def test_live_runs_are_compared_with_live_runs(
 
 @pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(
-    runs: tuple[Path, Path], small: Dataset, two_run: Path, tmp_path: Path, harness: Callable[..., Said]
+    runs: tuple[Path, Path],
+    small: Dataset,
+    two_run: Path,
+    tmp_path: Path,
+    harness: Callable[..., Said],
 ) -> None:
     points = (POINTS["6g"],)
     luck = evaluate(spec_of(small, points=points, seeds=(0, 2)), tmp_path / "luck").out

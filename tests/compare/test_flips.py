@@ -1,4 +1,6 @@
-"""Which decisions flipped, which of them gave success away, and what changed in the prompt beside them."""
+"""Which decisions flipped, which of them gave success away,
+and what changed in the prompt beside them.
+"""
 
 import json
 import re
@@ -15,7 +17,8 @@ from harness.report.compare.pair import pair
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
-Acts = dict[tuple[str, int], tuple[str, bool | None]]  # action and regret by decision point and seed
+# action and regret by decision point and seed
+Acts = dict[tuple[str, int], tuple[str, bool | None]]
 
 
 def act(run: Path, acts: Acts) -> None:
@@ -29,7 +32,9 @@ def act(run: Path, acts: Acts) -> None:
 @pytest.fixture
 def flipped(runs: tuple[Path, Path]) -> tuple[tuple[Path, Path], list[str]]:
     """Of five decision points B alone loses two, in one seed and in both, and A alone one."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows_of(runs[0], "6g") if row["episode"] == 1))[:5]
+    scenes = list(
+        dict.fromkeys(row["scene"] for row in rows_of(runs[0], "6g") if row["episode"] == 1)
+    )[:5]
     one, both, other, safe, gone = scenes
     act(runs[0], {
         (one, 0): ("IDLE", False), (both, 0): ("IDLE", False), (both, 1): ("IDLE", False),
@@ -61,11 +66,14 @@ def test_flips_by_hand_what_b_gave_away_first(flipped: tuple[tuple[Path, Path], 
         DecisionFlip(one, 1, (0,), "IDLE", "FASTER", "B"),
         DecisionFlip(other, 1, (1,), "FASTER", "IDLE", "A"),
         *sorted(
-            (DecisionFlip(at, 1, (0,), "SLOWER", "IDLE", None) for at in (safe, gone)), key=lambda f: f.scene
+            (DecisionFlip(at, 1, (0,), "SLOWER", "IDLE", None) for at in (safe, gone)),
+            key=lambda f: f.scene,
         ),
     )
     turned = compare(pair(*reversed(runs))).conditions[1]
-    assert [(f.scene, f.a, f.b) for f in turned.flips if f.lost_by == "B"] == [(other, "IDLE", "FASTER")]
+    assert [(f.scene, f.a, f.b) for f in turned.flips if f.lost_by == "B"] == [
+        (other, "IDLE", "FASTER")
+    ]
     assert [f.scene for f in turned.flips if f.lost_by == "A"] == [both, one]
 
 
@@ -148,7 +156,9 @@ def test_a_prompt_that_is_not_here_as_it_was_is_one_line(
     assert code == 0
     assert f"what differs between the prompts is not known: {shown}" in " ".join(out.split())
     assert "@@" not in out
-    assert "What differs between the prompts is not known: B's" in unescape(Path("page.html").read_text())
+    assert "What differs between the prompts is not known: B's" in unescape(
+        Path("page.html").read_text()
+    )
     assert json.loads(harness("compare", *runs, "--json")[1])["prompts"].endswith(" is not here")
 
 
@@ -157,7 +167,9 @@ def test_helpers_with_a_prompt_of_their_own_have_their_own_difference(
 ) -> None:
     prompt = {"version": "v4", "sha256": prompts.load("v4").sha256}
     model = json.loads((runs[1] / "run.json").read_text())["model"]
-    configure(runs[1], helpers=[{"model": model, "prompt": prompt, "answer": "json", "thinking": False}])
+    configure(
+        runs[1], helpers=[{"model": model, "prompt": prompt, "answer": "json", "thinking": False}]
+    )
     texts = json.loads(harness("compare", *runs, "--json")[1])["prompts"]["texts"]
     assert not texts["ego.j2"]["hunks"]
     assert texts["helper.j2"]["added"] > 50

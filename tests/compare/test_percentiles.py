@@ -10,13 +10,16 @@ from harness.runs.metrics import PERCENTILES
 from harness.runs.percentiles import Decided, differences
 
 DECISIONS = st.lists(
-    st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])), max_size=12
+    st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])),
+    max_size=12,
 )
 SEEDS = st.integers(1, 3)
 
 
 def laid(made: list[tuple[int, float]]) -> Decided:
-    return np.array([place for place, _ in made], dtype=np.int64), np.array([v for _, v in made], dtype=float)
+    return np.array([place for place, _ in made], dtype=np.int64), np.array(
+        [v for _, v in made], dtype=float
+    )
 
 
 @given(st.data(), SEEDS)
@@ -29,7 +32,9 @@ def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
     for one, other in zip(*sides, strict=True):
         known = [{int(p) for p, v in zip(*side, strict=True) if v == v} for side in (one, other)]
         met |= (both := known[0] & known[1])
-        kept = [[v for p, v in zip(*side, strict=True) if p in both and v == v] for side in (one, other)]
+        kept = [
+            [v for p, v in zip(*side, strict=True) if p in both and v == v] for side in (one, other)
+        ]
         by_seed.append([np.percentile(v, PERCENTILES) if v else np.full(3, np.nan) for v in kept])
     if not met:
         assert found == []
@@ -48,7 +53,9 @@ def test_the_difference_is_that_of_all_decisions_of_episodes_that_both_know(
 
 @pytest.mark.slow
 def test_the_interval_has_the_width_that_theory_gives_a_median() -> None:
-    """The median of n normal values has a standard error of 1.2533 sigma / sqrt(n); mean of 30 widths."""
+    """The median of n normal values has a standard error of 1.2533 sigma / sqrt(n);
+    mean of 30 widths.
+    """
     rng, place, widths = np.random.default_rng(7), np.arange(400), []
     for _ in range(30):
         b = (place, rng.normal(100, 10, 400))

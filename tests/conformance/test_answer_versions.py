@@ -1,7 +1,9 @@
-"""What answers and decisions depend on has versions: whoever changes a result raises the version with it.
+"""What answers and decisions depend on has versions:
+whoever changes a result raises the version with it.
 
-The golden file has the version of each engine, of the parser and of the decisions, and what they gave. After
-a wanted change raise the version, then `UPDATE_GOLDEN=1`; an update without a new version is refused.
+The golden file has the version of each engine, of the parser and of the decisions, and what they
+gave. After a wanted change raise the version, then `UPDATE_GOLDEN=1`; an update without a new
+version is refused.
 """
 
 import json
@@ -45,7 +47,9 @@ TOLERANCE = 0.02  # of a probability: float32 is summed in another order on anot
 CARDS = {
     "proxy": ("proxy", ("json",)),
     "proxy-faulty": ("proxy", ("json",)),
-    **{name: ("driver", ("json",)) for name in cards.names() if cards.load(name).engine == "driver"},
+    **{
+        name: ("driver", ("json",)) for name in cards.names() if cards.load(name).engine == "driver"
+    },
     "openai-example": ("openai", get_args(AnswerMode)),
     "systemone-example": ("systemone", ("decision",)),
     "decisions-example": ("decisions", ("decision",)),
@@ -62,7 +66,9 @@ def shipped() -> Dataset:
 
 
 def held(name: str, version: int, result: Any, same: Any = lambda now, then: now == then) -> None:
-    """Compare a result with the golden one under its version; by name, more results may be added."""
+    """Compare a result with the golden one under its version;
+    by name, more results may be added.
+    """
     golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
     then = golden.get(name)
     moved = then is None or not same(result, then["result"])
@@ -72,7 +78,9 @@ def held(name: str, version: int, result: Any, same: Any = lambda now, then: now
         golden[name] = {"version": version, "result": result}
         GOLDEN.write_text(json.dumps(dict(sorted(golden.items())), indent=1) + "\n")
         return
-    assert not moved, f"{name} gives other results: raise its version, now {version}, then UPDATE_GOLDEN=1"
+    assert not moved, (
+        f"{name} gives other results: raise its version, now {version}, then UPDATE_GOLDEN=1"
+    )
     assert then["version"] == version
 
 
@@ -106,7 +114,9 @@ def served(name: str) -> Iterator[Card]:
 @pytest.mark.parametrize(
     ("name", "answer"), [(name, answer) for name, (_, modes) in CARDS.items() for answer in modes]
 )
-def test_an_engine_answers_as_its_version_did(name: str, answer: AnswerMode, shipped: Dataset) -> None:
+def test_an_engine_answers_as_its_version_did(
+    name: str, answer: AnswerMode, shipped: Dataset
+) -> None:
     engine, _ = CARDS[name]
     with served(name) as card:
         if lacking := missing(card):
@@ -121,7 +131,10 @@ def test_an_engine_answers_as_its_version_did(name: str, answer: AnswerMode, shi
 
 
 def test_replies_of_a_server_are_read_as_its_version_did() -> None:
-    half, parts = '{"action_distribution": {"A"', [{"type": "thinking", "thinking": "Hm."}, {"text": "{}"}]
+    half, parts = (
+        '{"action_distribution": {"A"',
+        [{"type": "thinking", "thinking": "Hm."}, {"text": "{}"}],
+    )
     endings = ("stop", "length", "model_length", "MAX_TOKENS", "content_filter", "refusal", "eos")
     replies = {
         **{ending: completion(half, ending) for ending in endings},
@@ -135,7 +148,9 @@ def test_replies_of_a_server_are_read_as_its_version_did() -> None:
     for name, reply in replies.items():
         said = shapes.read(reply, request)
         result[name] = f"{said.finish_reason}: {said.error or said.text}"
-    broken = {f"broken off: {end}": fault_in(completion(half, end)) for end in ("error", "abort", "stop")}
+    broken = {
+        f"broken off: {end}": fault_in(completion(half, end)) for end in ("error", "abort", "stop")
+    }
     faults = {name: fault.words if fault else "none" for name, fault in broken.items()}
     held("openai replies", BUILT_IN["openai"].answers, result | faults)
 
@@ -147,7 +162,9 @@ def test_every_engine_but_a_replay_is_pinned() -> None:
 
 @pytest.mark.slow
 def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Path) -> None:
-    """Every operating point, rule, content, attack and schedule that needs no words, by the proxy."""
+    """Every operating point, rule, content, attack and schedule that needs no words,
+    by the proxy.
+    """
     changes = [
         *(f"consensus={rule}" for rule in RULES.built_in if not reads_plans(rule)),
         *(
@@ -171,7 +188,9 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
         decisions["latency_ms"].round(1), decisions["messages"],
     ])  # fmt: skip
     known = np.nan_to_num(rows + 0.0, nan=-1)  # and no zero has a sign
-    result = {point.name: sha256_bytes(known[condition == point.name].tobytes())[:16] for point in points}
+    result = {
+        point.name: sha256_bytes(known[condition == point.name].tobytes())[:16] for point in points
+    }
     held("decisions", versions.DECISIONS, result)
 
 
@@ -185,19 +204,29 @@ def test_completions_are_parsed_as_their_version_did() -> None:
 
 
 def test_answers_are_read_as_their_version_did() -> None:
-    """`test_real_answers` says what each answer is read as; here its file is held to the version."""
+    """`test_real_answers` says what each answer is read as;
+    here its file is held to the version.
+    """
     held("parser", versions.PARSER, sha256_bytes(REAL_ANSWERS.read_bytes()))
 
 
 @pytest.mark.slow
 def test_figures_are_those_of_their_version(tmp_path: Path) -> None:
-    """Of a run's tables follow the same values and intervals; a new metric is added to its version."""
+    """Of a run's tables follow the same values and intervals;
+    a new metric is added to its version.
+    """
     points = [POINTS["single-local"], POINTS["6g"]]
-    done = run(spec_of(load(find(DATASET), limit=60), seeds=(0, 1), points=points), tmp_path / "run")
+    done = run(
+        spec_of(load(find(DATASET), limit=60), seeds=(0, 1), points=points), tmp_path / "run"
+    )
     rows = dict[str, list[str]]()
     for score in folder.read(done.out).scores:
-        numbers = (f"{each:.5g}" for each in (score.value, score.low, score.high) if each is not None)
-        rows.setdefault(score.metric, []).append(f"{score.condition} {score.interval} {' '.join(numbers)}")
+        numbers = (
+            f"{each:.5g}" for each in (score.value, score.low, score.high) if each is not None
+        )
+        rows.setdefault(score.metric, []).append(
+            f"{score.condition} {score.interval} {' '.join(numbers)}"
+        )
     result = {metric: sha256_bytes("\n".join(of).encode())[:16] for metric, of in rows.items()}
     assert "calibration_error_one_optimal" in result
     held("figures", versions.FIGURES, result)

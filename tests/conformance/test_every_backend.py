@@ -1,4 +1,6 @@
-"""What holds for every backend that can run here: the contract of `harness.backends.base.Backend`."""
+"""What holds for every backend that can run here:
+the contract of `harness.backends.base.Backend`.
+"""
 
 import json
 from collections.abc import Callable, Collection, Iterator
@@ -25,7 +27,9 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 @dataclass(frozen=True)
 class Case:
-    """An opened backend and five requests that it can answer; helpers' too, where it answers for them."""
+    """An opened backend and five requests that it can answer;
+    helpers' too, where it answers for them.
+    """
 
     backend: Backend
     asked: tuple[Request, ...]
@@ -53,7 +57,10 @@ def tiny_weights(folder: Path) -> None:
 
 @pytest.fixture(scope="module", params=ENGINES, ids="-".join)
 def case(
-    request: pytest.FixtureRequest, small_path: Path, once: Once, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    small_path: Path,
+    once: Once,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Case]:
     folder = tmp_path_factory.mktemp("conformance")
     model, answer = request.param
@@ -106,13 +113,19 @@ def answered(asked: Asked) -> None:
     if asked.path == "/v1/systemone":
         [(name, question)] = asked.body["questions"].items()
         asked.reply(
-            {"answers": {name: {"type": "choice", "probabilities": shares(question["criteria"], said)}}}
+            {
+                "answers": {
+                    name: {"type": "choice", "probabilities": shares(question["criteria"], said)}
+                }
+            }
         )
     elif asked.path == "/v1/decisions":
         [question] = asked.body["questions"]
         p = shares([choice["value"] for choice in question["choices"]], said)
         listed = [{"value": value, "probability": share} for value, share in p.items()]
-        asked.reply({"answers": [{"type": "choice", "name": question["name"], "probabilities": listed}]})
+        asked.reply(
+            {"answers": [{"type": "choice", "name": question["name"], "probabilities": listed}]}
+        )
     elif asked.body.get("logprobs"):
         asked.reply(read_out(("A", -0.5), (" B", -1.5 - int(said[0], 16)), ("C", -4.0)))
     elif "grammar" in asked.body:
@@ -142,7 +155,9 @@ def test_a_constrained_answer_keeps_to_the_schema(case: Case) -> None:
 
 
 def same(one: list[Completion], other: list[Completion]) -> None:
-    """Equal texts; a read-out's numbers as far as they do not depend on how float32 is summed up."""
+    """Equal texts; a read-out's numbers as far as they do not depend on how float32 is summed
+    up.
+    """
     for a, b in zip(one, other, strict=True):
         if a.label_mass is None:
             assert a.text == b.text
@@ -174,11 +189,19 @@ def test_each_completion_keeps_the_contract(case: Case) -> None:
         assert c.finish_reason == "error" or c.text, "these five are answered with some text"
         assert c.batch_size >= 1
         assert c.seconds is None or (c.batch_size == 1 and c.seconds > 0)
-        assert c.first_token_s is None or (c.seconds is not None and 0 < c.first_token_s <= c.seconds)
+        assert c.first_token_s is None or (
+            c.seconds is not None and 0 < c.first_token_s <= c.seconds
+        )
         assert c.token_s is None or (c.first_token_s is not None and c.token_s > 0)
         assert c.prompt_tokens is None or c.prompt_tokens > 0
-        least = 0 if capabilities(case.backend.identity()["engine"]).answer_modes == ("decision",) else 1
-        assert c.completion_tokens is None or c.completion_tokens >= least, "who only decides writes none"
+        least = (
+            0
+            if capabilities(case.backend.identity()["engine"]).answer_modes == ("decision",)
+            else 1
+        )
+        assert c.completion_tokens is None or c.completion_tokens >= least, (
+            "who only decides writes none"
+        )
 
 
 def test_an_engine_that_has_tokens_keeps_to_the_most_that_is_allowed(case: Case) -> None:

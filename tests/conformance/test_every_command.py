@@ -1,9 +1,11 @@
-"""Every command on hostile copies of all that it takes: no server asked, no module imported, no secret told.
+"""Every command on hostile copies of all that it takes:
+no server asked, no module imported, no secret told.
 
-Each command is run in a stranger's project, once as it is, and once for each hostile value of each of its
-parameters: runs, datasets, models, prompts, cards, traces, weights, answers of a server. In `make test` it is
-run with one hostile value of each parameter, another at each command. A new command is covered if its
-parameters have names that other commands have; else `PLAIN` asks for one line.
+Each command is run in a stranger's project, once as it is, and once for each hostile value of each
+of its parameters: runs, datasets, models, prompts, cards, traces, weights, answers of a server. In
+`make test` it is run with one hostile value of each parameter, another at each command. A new
+command is covered if its parameters have names that other commands have; else `PLAIN` asks for one
+line.
 """
 
 import importlib
@@ -158,7 +160,13 @@ class Strangers:
             "retries": 0,
         }
         # The identity is what the canary server would state of itself.
-        identity = {"engine": "openai", "server": "generic", "base_url": url, "model": "m", "listed": {}}
+        identity = {
+            "engine": "openai",
+            "server": "generic",
+            "base_url": url,
+            "model": "m",
+            "listed": {},
+        }
         asks = {**stated["model"], "engine": "openai", "weights": "m", "server": served}
         loads = {
             **stated["model"],
@@ -169,7 +177,9 @@ class Strangers:
             "served": {"model": {**asks, "name": "theirs"}, "identity": identity},
             "posing": {"model": {**asks, "name": "proxy"}, "identity": identity},
             "weights": {"model": {**loads, "name": "theirs"}},
-            "moved": {"world": {**stated["world"], "path": str(Path("datasets/module").absolute())}},
+            "moved": {
+                "world": {**stated["world"], "path": str(Path("datasets/module").absolute())}
+            },
             "named": {"world": {**stated["world"], "path": "nowhere", "name": "traffic"}},
         }
         for name, changes in folders.items():
@@ -189,7 +199,10 @@ SETTINGS = {
     "module.toml": '[world]\nkind = "frozen"\ndataset = "datasets/module"\n',
     "driven.toml": f'[world]\nkind = "closed-loop"\nscenario = "{ENV}"\n',
 }
-RUNS = [f"reports/{name}" for name in ("served", "posing", "weights", "moved", "named", "driven", "traffic")]
+RUNS = [
+    f"reports/{name}"
+    for name in ("served", "posing", "weights", "moved", "named", "driven", "traffic")
+]
 DATASETS = ["module", "datasets/traffic"]
 MODELS = ["evil", "mine", "models/evil-weights", "replay:reports/served", "replay:reports/weights"]
 # Hostile values of parameters by name, or by command and name.
@@ -214,23 +227,38 @@ PLAIN: dict[str, str] = {
     "prompt compare a": "v2", "prompt compare b": "v4", "init folder": "new",
     "dataset build name": "occluded-intersection",
     "dataset scenario show name": "do-not-pass", "dataset scenario drive name": "do-not-pass",
-    "dataset scenario audit name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
+    "dataset "
+    "scenario audit "
+    "name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
     "edition": "small", "commit": "0" * 40, "benchmark seeds names": "narrow-passage",
     "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
-    "model device check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
-    "serve model": "mine", "budget": "1", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1",
+    "model device "
+    "check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
+    "serve "
+    "model": "mine", "budget": "1", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1",
     "layouts": "20",
-    "study attribute sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
+    "study "
+    "attribute "
+    "sample": "2", "count": "1", "over": "consensus", "grid": "ego-prompt", "attacks": "jump",
     "rules": "linear", "share": "1/3", "twin": "mirrored", "schedule": "entropy", "samples": "1,1,1,1",
     "prompts": "1", "window_s": "1", "out": "written",
     "run video out": "written/video.gif", "dataset show out": "written/scene.svg",
     "prompt show out": "written.png",
-    "eval workers": "", "dataset scenario audit layouts": "2", "prompt check dataset": "base/dataset",
-    "study grid model": "proxy,mine", "study trust run": "reports/served", "study paper episodes": "10",
-    "sweep_episodes": "10", "study schedule learn out": "written.toml", "run export out": "written/file",
+    "eval workers": "", 
+        "dataset scenario "
+        "audit layouts": "2", "prompt check dataset": "base/dataset",
+    "study grid model": "proxy,mine", "study trust run": "reports/served", 
+        "study "
+        "paper "
+        "episodes": "10",
+    "sweep_episodes": "10", 
+        "study "
+        "schedule "
+        "learn out": "written.toml", "run export out": "written/file",
     "report out": "written/page.html",
 }  # fmt: skip
-DEAR = ("prompt examples", "study closed-loop", "study contents", "study paper")  # whatever they are given
+# whatever they are given
+DEAR = ("prompt examples", "study closed-loop", "study contents", "study paper")
 ALWAYS = {"run export": ["--csv"], "study fidelity": ["base/run"], "dataset build": ["--no-audit"]}
 
 
@@ -239,7 +267,9 @@ def change(file: Path, **values: Any) -> None:
 
 
 def typed(words: str, command: Any, *, every: bool) -> Iterator[list[str]]:
-    """What is typed: the command as it is, and with every hostile value of each parameter, or with one."""
+    """What is typed: the command as it is, and with every hostile value of each parameter,
+    or with one.
+    """
     parameters = [p for p in command.params if p.name not in ("help", "as_json", "quiet")]
 
     def value(table: Mapping[str, Any], name: str) -> Any:
@@ -250,8 +280,15 @@ def typed(words: str, command: Any, *, every: bool) -> Iterator[list[str]]:
         for p in parameters:
             given = to if p.name == changed else value(PLAIN, p.name) or None
             if p.required and given is None:
-                pytest.fail(f"harness {words} needs {p.name}: give PLAIN a value, and HOSTILE a hostile one")
-            needed = p.required or changed == p.name or f"{words} {p.name}" in PLAIN or p.name not in HOSTILE
+                pytest.fail(
+                    f"harness {words} needs {p.name}: give PLAIN a value, and HOSTILE a hostile one"
+                )
+            needed = (
+                p.required
+                or changed == p.name
+                or f"{words} {p.name}" in PLAIN
+                or p.name not in HOSTILE
+            )
             if given is not None and needed:
                 at = arguments if p.param_type_name == "argument" else options
                 at += [given] if p.param_type_name == "argument" else [p.opts[0], given]
@@ -264,7 +301,8 @@ def typed(words: str, command: Any, *, every: bool) -> Iterator[list[str]]:
         yield line()
     for p in parameters:
         hostile = value(HOSTILE, p.name) or ()
-        # By chance, and the same at each time: the commands that read runs meet all kinds of hostile ones.
+        # By chance, and the same at each time: the commands that read runs meet all kinds of
+        # hostile ones.
         first = zlib.crc32(f"{words} {p.name}".encode()) % max(1, len(hostile))
         for each in hostile if every else hostile[first : first + 1]:
             yield line(p.name, each)
@@ -290,7 +328,8 @@ def theirs() -> Iterator[Server]:
 
 def listed(asked: Asked) -> None:
     if not asked.path.startswith(STRANGE):
-        # A pool of another worker's test waits for its server, whose port this server was given since.
+        # A pool of another worker's test waits for its server, whose port this server was given
+        # since.
         asked.reply({}, 404)
         return
     asked.handler.server.asked.append(asked)
@@ -304,7 +343,9 @@ def mine(theirs: Server) -> Iterator[Server]:
     def elsewhere(asked: Asked) -> None:
         asked.reply({"next": theirs.url}, 307, location=f"{theirs.url}/chat/completions")
 
-    with serving(elsewhere, lambda asked: asked.reply({"data": [{"id": "m"}], "next": theirs.url})) as server:
+    with serving(
+        elsewhere, lambda asked: asked.reply({"data": [{"id": "m"}], "next": theirs.url})
+    ) as server:
         yield server
 
 
@@ -313,7 +354,9 @@ def cases() -> Iterator[Any]:
     for words, command in commands():
         yield pytest.param(words, command, True, id=words, marks=pytest.mark.exhaustive)
         if words not in DEAR:
-            yield pytest.param(words, command, False, id=f"{words}, in short", marks=pytest.mark.slow)
+            yield pytest.param(
+                words, command, False, id=f"{words}, in short", marks=pytest.mark.slow
+            )
 
 
 @pytest.mark.parametrize(("words", "command", "every"), cases())
@@ -325,7 +368,9 @@ def test_a_hostile_copy_causes_nothing(
     canary.mkdir()
     (canary / f"{MODULE}.py").write_text(IMPORTED)
     (tmp_path / "theirs").mkdir()
-    (tmp_path / "theirs/secret.txt").write_text(f"distance_m,reception,{SECRET}\n1,0.9,0\n99,0.1,0\n")
+    (tmp_path / "theirs/secret.txt").write_text(
+        f"distance_m,reception,{SECRET}\n1,0.9,0\n99,0.1,0\n"
+    )
     project = tmp_path / "theirs" / "project"
     project.mkdir(parents=True)
     monkeypatch.chdir(project)
@@ -359,7 +404,9 @@ def test_a_hostile_copy_causes_nothing(
 def visited(self: uvicorn.Server, sockets: Any) -> None:
     """The pages of `harness view` as a browser opens them, in place of a server; or a question."""
     browser = TestClient(
-        cast("Any", self.config.app), base_url="http://127.0.0.1:7654", raise_server_exceptions=False
+        cast("Any", self.config.app),
+        base_url="http://127.0.0.1:7654",
+        raise_server_exceptions=False,
     )
     if browser.get("/v1/models").status_code == 200:  # of `harness serve`
         asked = {"type": "choice", "criteria": {"{{ environ }}": None, MODULE: None}}

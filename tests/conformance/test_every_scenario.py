@@ -49,12 +49,15 @@ def test_it_says_what_it_is(scenario: Scenario) -> None:
     assert {"SLOWER", "IDLE", "FASTER"} <= set(scenario.actions)
 
 
-def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(scenario: Scenario) -> None:
+def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(
+    scenario: Scenario,
+) -> None:
     for seed in SEEDS:
         found = scenario.layout(seed, scenario.parameters)
         assert found == scenario.layout(seed, scenario.parameters)
         parts = [spawn.part for spawn in found.spawns]
-        if scenario.parameters.witnesses == "any":  # else who helps is drawn among vehicles of fixed places
+        # else who helps is drawn among vehicles of fixed places
+        if scenario.parameters.witnesses == "any":
             assert parts == sorted(parts, key=("ego", "helper", "other").index)
         assert (parts.count("ego"), found.spawns[0].id) == (1, "v1")
         assert len({spawn.id for spawn in found.spawns}) == len(parts)
@@ -65,7 +68,9 @@ def test_equal_seeds_are_equal_layouts_with_the_ego_first_and_its_helpers_next(s
 
 
 @some_or_the_rest(range(10), range(10, 40))
-def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(scenario: Scenario, seeds: range) -> None:
+def test_whatever_is_not_its_danger_is_where_it_would_be_without_it(
+    scenario: Scenario, seeds: range
+) -> None:
     p = scenario.parameters
     if not hasattr(p, "danger_share"):
         pytest.skip("no dial for dangers")
@@ -98,7 +103,9 @@ def test_its_ego_comes_through_every_crossing(scenario: Scenario) -> None:
         assert road.paths[key].at(at.other_arc_m)[:2] == pytest.approx((at.x_m, at.y_m), abs=0.05)
 
 
-def test_it_travels_as_its_name_and_parameters(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_travels_as_its_name_and_parameters(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(scenarios, "get", {scenario.name: scenario}.__getitem__)
     assert pickle.loads(pickle.dumps(scenario)) == scenario
     assert len(pickle.dumps(scenario)) < 2000
@@ -110,7 +117,8 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(scenario: Scenario)
     text = msgspec.json.encode((start.state(), start.snapshot()))
     stored = msgspec.json.decode(text, type=tuple[WorldState, Snapshot])
     every = [
-        (start.branch(), World.thaw(scenario, *stored), start.branch().branch()) for _ in scenario.actions
+        (start.branch(), World.thaw(scenario, *stored), start.branch().branch())
+        for _ in scenario.actions
     ]
     acting = [world for worlds in every for world in worlds]
     for actions in (scenario.actions, ("IDLE",) * len(every)):
@@ -147,7 +155,9 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(
     rule = Trust()
     for seed in seeds:
         world, moments = World.start(scenario, seed), list[Scene]()
-        while len(moments) < min(decisions, scenario.parameters.decisions) and not world.outcome.ended:
+        while (
+            len(moments) < min(decisions, scenario.parameters.decisions) and not world.outcome.ended
+        ):
             moments.append(look(world, 0, seed, len(moments), ego_alone=False))
             world.act(scenario.actions[0])
         said = claims(scenario, moments)
@@ -161,7 +171,9 @@ def test_none_of_its_vehicles_is_distrusted_for_where_it_drives(
             undecided = np.full((1 + len(there), len(scenario.actions)), 1 / len(scenario.actions))
             weights = inverse_distance_weights(distance_m, there, 1.0)
             arrival_s, range_m = np.where(there, 0.1, np.inf), np.ones(len(there))
-            fused = rule.fuse(Messages(undecided, weights, there, arrival_s, distance_m, range_m, now), state)
+            fused = rule.fuse(
+                Messages(undecided, weights, there, arrival_s, distance_m, range_m, now), state
+            )
             assert fused.trust is not None
             assert (fused.trust[there] > 0.8).all()
             state = fused.state
@@ -212,7 +224,9 @@ def test_many_points_are_projected_as_each_alone_on_the_nearest_point(
 ) -> None:
     road, rng, far_m = scenario.road(), np.random.default_rng(1), 2.2
     paths = list(road.paths.values())
-    on = np.concatenate([path.points[rng.integers(len(path.points), size=on_each)] for path in paths])
+    on = np.concatenate(
+        [path.points[rng.integers(len(path.points), size=on_each)] for path in paths]
+    )
     beyond = np.concatenate([path.points[[0, -1]] for path in paths]) * 1.2
     points = np.concatenate(
         [on, on + rng.normal(0.0, far_m, on.shape), beyond, rng.uniform(-99, 99, on.shape)]

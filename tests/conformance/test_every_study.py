@@ -25,7 +25,9 @@ KINDS = dict(joined(formats.STUDIES, "studies"))
 TRIALS = trials()
 WRONG = [(kind, options) for kind, trial in TRIALS.items() for options in trial.wrong]
 KILLED = [  # and of those that lie in their run's folder, without a name in lists
-    pytest.param(kind, marks=pytest.mark.slow if kind in ("trust", "grid") else pytest.mark.exhaustive)
+    pytest.param(
+        kind, marks=pytest.mark.slow if kind in ("trust", "grid") else pytest.mark.exhaustive
+    )
     for kind in dict.fromkeys([*KINDS, *TRIALS])
 ]
 N = re.compile(r"\bn (= |is )|\d+ (seed means|channel seeds) of \d+ episodes")
@@ -37,7 +39,9 @@ Typed = Callable[..., tuple[int, str, str]]
 
 @pytest.mark.slow
 @every
-def test_it_writes_page_and_tables_and_last_what_its_registration_says(kind: str, tries: Tries) -> None:
+def test_it_writes_page_and_tables_and_last_what_its_registration_says(
+    kind: str, tries: Tries
+) -> None:
     of = tries(kind)
     before, whole = of.said["before"], of.said["whole"]
     assert (whole.code, whole.err) == (0, "")
@@ -164,7 +168,8 @@ def test_one_that_is_killed_and_typed_again_has_the_bytes_of_one_that_ran_throug
     assert killed.code == studied.KILLED
     assert (resumed.code, resumed.files) == (0, whole.files)
     asked = Counter(
-        (a["scene"], a["viewer"], a["role"], tuple(a.get("heard", ()))) for a in map(json.loads, answers)
+        (a["scene"], a["viewer"], a["role"], tuple(a.get("heard", ())))
+        for a in map(json.loads, answers)
     )
     assert max(asked.values(), default=1) == 1, "an answer is kept twice"
 

@@ -74,7 +74,10 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
     project: Path, small_path: Path, harness: Callable[..., tuple[int, str, str]]
 ) -> None:
     asked = ("eval", "--model", "echo-1", "--dataset", small_path, "--out", "run")
-    assert "--answer readout: echo-1 cannot answer so; use json" in harness(*asked, "--answer", "readout")[2]
+    assert (
+        "--answer readout: echo-1 cannot answer so; use json"
+        in harness(*asked, "--answer", "readout")[2]
+    )
     assert "--thinking: echo-1 cannot think" in harness(*asked, "--thinking")[2]
     assert "--device cpu: echo-1 has no weights here" in harness(*asked, "--device", "cpu")[2]
 
@@ -91,7 +94,10 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
             ('"echo"', '"gone"'),
             r"plug-in 'gone' \(swarmdrive.backends\): no_such_module:ECHO does not load",
         ),
-        (('"echo"', '"odd"'), "plug-in 'odd' .*: echoing:answer is of type function and no Registration"),
+        (
+            ('"echo"', '"odd"'),
+            "plug-in 'odd' .*: echoing:answer is of type function and no Registration",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(project: Path, change: tuple[str, str], said: str) -> None:
@@ -105,5 +111,7 @@ def test_a_package_that_it_needs_is_named_with_the_command_that_installs_it(proj
     (project / "models" / "echo-1.toml").write_text(text)
     card = cards.load("echo-1")
     assert registry.missing(card) == "a-package"
-    with pytest.raises(UserError, match="needs a-package, which is not installed; run `pip install it`"):
+    with pytest.raises(
+        UserError, match="needs a-package, which is not installed; run `pip install it`"
+    ):
         registry.open_backend(card)

@@ -1,4 +1,6 @@
-"""The closed loop as tests walk it: the real parts, or the real parts around answers from a script."""
+"""The closed loop as tests walk it: the real parts,
+or the real parts around answers from a script.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,7 +29,9 @@ ALONE = POINTS["single-local"]
 
 
 class Script:
-    """A backend whose answers are a function of who is asked when; `fused` is any answer to a fusion call."""
+    """A backend whose answers are a function of who is asked when;
+    `fused` is any answer to a fusion call.
+    """
 
     def __init__(
         self, line: Callable[[str, int], Sequence[float]], fused: Sequence[float] = (0.0, 1.0, 0.0)
@@ -49,7 +53,9 @@ class Script:
 
 @dataclass(frozen=True)
 class Driven:
-    """What a run has of some episodes: decisions as written, episodes by place, answers in a run's order."""
+    """What a run has of some episodes: decisions as written, episodes by place,
+    answers in a run's order.
+    """
 
     decisions: Decisions
     episodes: list[Episode]
@@ -71,9 +77,14 @@ def spec(
 
 
 def driven(
-    of: Spec, episodes: Sequence[int] = (0,), backend: Backend | None = None, infer_s: float | None = None
+    of: Spec,
+    episodes: Sequence[int] = (0,),
+    backend: Backend | None = None,
+    infer_s: float | None = None,
 ) -> Driven:
-    """Walk some episodes of the closed loop, every inference taking `infer_s`, or what it would in a run."""
+    """Walk some episodes of the closed loop, every inference taking `infer_s`,
+    or what it would in a run.
+    """
     assert isinstance(of.source, LiveSource)
     opened = backend or open_backend(of.ego.card, batch_size=of.settings.batch_size)
     latency = known(of.settings.latency, of.agents, [opened])
@@ -81,9 +92,13 @@ def driven(
         latency = Latency("card", "test", infer_s, infer_s, infer_s)
     assert latency is not None, "no test measures"
     asker = Asker(of, lambda: opened, latency)
-    world = LiveWorld(of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone)
+    world = LiveWorld(
+        of.source.scenario, of.source.first_seed, episodes, of.points, of.seeds, of.ego_alone
+    )
     decisions = table(
-        list(chain.from_iterable(walk(world, of.points, asker, of.ties))), world.columns(), of.actions
+        list(chain.from_iterable(walk(world, of.points, asker, of.ties))),
+        world.columns(),
+        of.actions,
     ).rounded()
     grid = Grid(tuple(point.name for point in of.points), of.seeds, tuple(episodes))
     return Driven(

@@ -46,9 +46,9 @@ def test_an_agent_is_the_ego_in_its_own_eyes_and_nothing_else_changes(name: str)
         for agent in list(world.journeys)[1:]:
             seen, seat = world.state(agent), world.seat(agent)
             assert seen.ego.id == true.vehicles[agent].id
-            assert {v.id for v in seen.helpers} == {v.id for v in true.vehicles if v.part != "other"} - {
-                seen.ego.id
-            }
+            assert {v.id for v in seen.helpers} == {
+                v.id for v in true.vehicles if v.part != "other"
+            } - {seen.ego.id}
             for v in seen.vehicles:
                 before, path = true.vehicle(v.id), seat.road().paths[v.approach, v.route]
                 assert (v.x_m, v.y_m, v.heading_rad, v.speed_mps) == (
@@ -60,7 +60,10 @@ def test_an_agent_is_the_ego_in_its_own_eyes_and_nothing_else_changes(name: str)
 @PAIRS
 def test_who_decides_at_a_share_decides_at_a_higher_one(name: str) -> None:
     deciding = [
-        [set(World.start(scenarios.get(f"{name}:agent_share={share}"), seed).journeys) for seed in range(20)]
+        [
+            set(World.start(scenarios.get(f"{name}:agent_share={share}"), seed).journeys)
+            for seed in range(20)
+        ]
         for share in (0, 0.3, 0.7, 1)
     ]
     assert all(agents == {0} for agents in deciding[0])
@@ -95,7 +98,9 @@ def test_a_world_branches_with_all_its_journeys() -> None:
 def test_every_agent_is_asked_with_its_own_graph() -> None:
     world = World.start(scenarios.get(ALL), 2)
     scenes = looks([(world, agent, 0) for agent in world.journeys], 0, ego_alone=False)
-    assert [scene.viewers[0] for scene in scenes] == [world.vehicles[n].spawn.id for n in world.journeys]
+    assert [scene.viewers[0] for scene in scenes] == [
+        world.vehicles[n].spawn.id for n in world.journeys
+    ]
     assert len({scene.id for scene in scenes}) == len(scenes)
     for scene in scenes:
         assert scene.graphs[scene.viewers[0]].role == "ego"
@@ -109,7 +114,9 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four episodes of two to four agents, whose decisions are not ready at once, or never."""
     out = tmp_path_factory.mktemp("agents") / "run"
     points = named_point("single-local"), named_point("6g")
-    spec = live_spec_of(prompt="v4", points=points, seeds=(0,), latency="ego=1.3,helper=1.3,fusion=0")
+    spec = live_spec_of(
+        prompt="v4", points=points, seeds=(0,), latency="ego=1.3,helper=1.3,fusion=0"
+    )
     run(replace(spec, source=LiveSource(50_000, 4, ALL)), out)
     return out
 
@@ -140,7 +147,9 @@ def beside_few() -> Spec:
 
 
 @pytest.mark.slow
-def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(tmp_path: Path) -> None:
+def test_an_episode_in_which_nobody_beside_the_ego_decides_is_one_of_the_swarm(
+    tmp_path: Path,
+) -> None:
     run(beside_few(), tmp_path / "run")
     there = load(tmp_path / "run")
     assert (there.episodes.groupby("episode").agents.first() == [1, 2]).all()
@@ -156,7 +165,9 @@ def test_episodes_of_one_agent_and_of_two_are_driven_together_as_each(
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)
     run(beside_few(), tmp_path / "each")
     for name in FILES:
-        assert (tmp_path / "each" / name).read_bytes() == (tmp_path / "together" / name).read_bytes()
+        assert (tmp_path / "each" / name).read_bytes() == (
+            tmp_path / "together" / name
+        ).read_bytes()
 
 
 @pytest.mark.slow
@@ -165,7 +176,9 @@ def test_the_settings_of_a_run_of_agents_drive_it_again(
 ) -> None:
     copytree(driven, tmp_path / "run")
     assert harness("drive", "run", "--quiet", "--workers", 1, "--out", "again")[0] == 0
-    assert (tmp_path / "again" / "episodes.csv").read_bytes() == (driven / "episodes.csv").read_bytes()
+    assert (tmp_path / "again" / "episodes.csv").read_bytes() == (
+        driven / "episodes.csv"
+    ).read_bytes()
 
 
 @pytest.mark.slow
@@ -205,7 +218,11 @@ def test_a_broken_table_of_agents_is_named(driven: Path, tmp_path: Path) -> None
 def test_every_decision_point_comes_out_again_from_the_seat_of_who_decided(driven: Path) -> None:
     there = folder.read(driven)
     names = list(there.decisions.scenes)
-    assert sum(e.skipped or 0 for e in there.episodes) > 0 < sum(e.never_acted or 0 for e in there.episodes)
+    assert (
+        sum(e.skipped or 0 for e in there.episodes)
+        > 0
+        < sum(e.never_acted or 0 for e in there.episodes)
+    )
     assert [scene.id for scene in scenes_of(there, names)] == names
 
 
@@ -217,11 +234,15 @@ def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path:
     spec = replace(spec, source=LiveSource(50_000, 1, ALL), helpers=(cruise,))
     spec = spec.changed(latency="ego=0.1,helper=0.3")
     there = folder.read(run(spec, tmp_path / "run").out)
-    egos = {World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_001)}
+    egos = {
+        World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_001)
+    }
     table, page = there.decisions, details(render(gather([tmp_path / "run"]), full=True))
     for d in table.records(0, len(table)):
         [answer] = [a for a in there.answers_by_scene[d.scene] if a.role == "ego"]
-        assert page[d.scene]["runs"][0]["answers"][0]["took_s"] == pytest.approx(d.latency_ms / 1000)
+        assert page[d.scene]["runs"][0]["answers"][0]["took_s"] == pytest.approx(
+            d.latency_ms / 1000
+        )
         model = there.agent(answer)["model"]["name"]
         assert d.latency_ms == {"proxy": 100.0, "cruise": 300.0}[model]
         assert d.action == "IDLE" or model == "proxy", "who never yields"
@@ -233,7 +254,9 @@ def test_a_rule_answers_agents_of_several_seats_together_as_each_alone(model: st
     spec = replace(live_spec_of(prompt="v4"), ego=Agent(cards.resolve(model), versions.load("v4")))
     spec = replace(spec, points=(named_point("single-local"),), source=LiveSource(50_000, 2, ALL))
     worlds = [World.start(spec.scenario, seed) for seed in (50_000, 50_001)]
-    scenes = looks([(world, agent, 0) for world in worlds for agent in world.journeys], 0, spec.ego_alone)
+    scenes = looks(
+        [(world, agent, 0) for world in worlds for agent in world.journeys], 0, spec.ego_alone
+    )
     asked = list(requests(spec, scenes, places=[EGO] * len(scenes)))
     assert len({id(request.scenario) for request in asked}) == 4
     backend = open_backend(spec.ego.card)
@@ -247,7 +270,9 @@ def test_a_liar_is_one_vehicle_and_lies_to_whoever_asks(tmp_path: Path) -> None:
         points = (named_point("6g:attack=liar"),)
         spec = live_spec_of(prompt="v4", points=points, seeds=(0,))
         table = folder.read(
-            run(replace(spec, source=LiveSource(50_000, 2, name)), tmp_path / f"run-{len(liars)}").out
+            run(
+                replace(spec, source=LiveSource(50_000, 2, name)), tmp_path / f"run-{len(liars)}"
+            ).out
         ).decisions
         said = [
             (d.agent, (d.episode, m.sender), m.attacker)
@@ -334,7 +359,9 @@ def test_workers_shards_and_a_stop_change_no_byte(
 
 
 @pytest.mark.slow
-def test_a_page_lists_decisions_by_step_and_agent_and_has_the_prompts_that_were_sent(driven: Path) -> None:
+def test_a_page_lists_decisions_by_step_and_agent_and_has_the_prompts_that_were_sent(
+    driven: Path,
+) -> None:
     text = render(gather([driven]), full=True)
     index, every, there = json.loads(packed(text, "index")), details(text), folder.read(driven)
     assert [place[1:3] + place[4:] for place in index["scenes"]] == sorted(
@@ -346,7 +373,9 @@ def test_a_page_lists_decisions_by_step_and_agent_and_has_the_prompts_that_were_
         assert all(a["prompt"] is not None for a in every[scene]["runs"][0]["answers"])
     telling = failures(there)
     points = {(place[1], place[2], place[4]) for place in index["scenes"] if place[0] in telling}
-    assert len(points) == len(telling) > len({episode for episode, *_ in points}), "one of each agent"
+    assert len(points) == len(telling) > len({episode for episode, *_ in points}), (
+        "one of each agent"
+    )
 
 
 def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> None:
@@ -359,7 +388,9 @@ def test_alone_on_the_road_an_agent_comes_as_soon_as_its_speed_takes_it() -> Non
 
 def test_what_has_one_ego_says_so_of_a_scenario_of_several(tmp_path: Path) -> None:
     scenario = scenarios.get(ALL)
-    with pytest.raises(UserError, match="agent_share is 1, and a dataset has one ego that decides; leave it"):
+    with pytest.raises(
+        UserError, match="agent_share is 1, and a dataset has one ego that decides; leave it"
+    ):
         build(scenario, tmp_path / "set", 2, 100, 1, lambda done: None)
     assert not (tmp_path / "set").exists()
 

@@ -11,7 +11,18 @@ pytestmark = pytest.mark.usefixtures("svg_alone")
 
 @pytest.mark.slow
 def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
-    options = ("--condition", "all", "--episodes", 2, "--first-seed", 5, "--seeds", "0:2", "--workers", 1)
+    options = (
+        "--condition",
+        "all",
+        "--episodes",
+        2,
+        "--first-seed",
+        5,
+        "--seeds",
+        "0:2",
+        "--workers",
+        1,
+    )
     code, out, err = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines()[:-1])) <= 80
@@ -20,7 +31,9 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert "…" not in out
     assert " · closed loop · occluded-intersection, scenes of v2v-safety-2" in " ".join(out.split())
     assert "n = 2 episodes × 2 channel seeds; layout seeds 5 to 6 (tune);" in out
-    code, out, _ = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json")
+    code, out, _ = harness(
+        "drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json"
+    )
     found = json.loads(out)
     assert (code, found["manifest"]["world"]["first_seed"]) == (0, 5)
     [success] = [
@@ -31,7 +44,9 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(harness, tmp_path, small_path):
+def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(
+    harness, tmp_path, small_path
+):
     draw = ("--sample", 2, "--sample-seed", 3, "--seeds", "0:1")
     layouts = json.loads((small_path / "manifest.json").read_text())
     of = ("--episodes", layouts["episodes"], "--first-seed", layouts["seed"])
@@ -40,15 +55,29 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
     assert (code, err) == (0, "")
     assert f"n = 2 episodes × 1 channel seed; of layout seeds {layouts['seed']} to" in out
     assert (
-        harness("eval", "--dataset", small_path, *draw, "--condition", "6g", "--out", tmp_path / "frozen")[0]
+        harness(
+            "eval",
+            "--dataset",
+            small_path,
+            *draw,
+            "--condition",
+            "6g",
+            "--out",
+            tmp_path / "frozen",
+        )[0]
         == 0
     )
     driven, frozen = (folder.read(path) for path in (run, tmp_path / "frozen"))
     assert driven.grid.episodes == frozen.grid.episodes
     assert [e.layout_seed for e in driven.episodes] == [e.layout_seed for e in frozen.episodes]
     assert " --sample 2 --sample-seed 3 " in driven.manifest.command
-    assert harness("study", "fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0] == 0
-    code, _, err = harness("drive", *draw, *of, "--condition", "6g", "--sample-seed", 4, "--out", run)
+    assert (
+        harness("study", "fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0]
+        == 0
+    )
+    code, _, err = harness(
+        "drive", *draw, *of, "--condition", "6g", "--sample-seed", 4, "--out", run
+    )
     assert (code, "already holds a finished run" in err) == (2, True)
 
 
@@ -73,7 +102,9 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(h
         ("--out EMPTY/file --episodes 1", "is no folder; choose an empty or a new one"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(harness, tmp_path, words, says):
+def test_bad_input_is_one_line_and_exit_code_2_and_nothing_is_written(
+    harness, tmp_path, words, says
+):
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "file").write_text("mine")
     words = words.replace("EMPTY", str(tmp_path / "empty"))

@@ -46,7 +46,9 @@ def test_a_run_holds_what_was_driven_and_enough_to_drive_it_again(whole):
         rows = list(csv.DictReader(file))
     assert len(rows) == 10 * 3 * 2
     places = [(int(r["episode"]), r["condition"], int(r["seed"])) for r in rows]
-    assert places == [(e, c, s) for c in ("single-local", "v2x", "6g") for s in (0, 1) for e in range(10)]
+    assert places == [
+        (e, c, s) for c in ("single-local", "v2x", "6g") for s in (0, 1) for e in range(10)
+    ]
     assert {r["partner"] != "" for r in rows if r["failure"] == "collision"} == {True}
 
 
@@ -59,7 +61,9 @@ def test_a_summary_agrees_with_its_episodes(whole):
         assert value["collision_rate"] == pytest.approx((mine.failure == "collision").mean())
         ends = ("success_rate", "collision_rate", "late_rate", "time_out_rate", "off_road_rate")
         assert sum(value[end] for end in ends) == pytest.approx(1.0)
-        assert value["unsafe_rate"] == pytest.approx(1.0 - value["success_rate"] - value["late_rate"])
+        assert value["unsafe_rate"] == pytest.approx(
+            1.0 - value["success_rate"] - value["late_rate"]
+        )
         assert value["messages_per_episode"] == pytest.approx(mine.messages.mean())
         assert value["hard_brakings_per_episode"] == pytest.approx(mine.hard_brakings.mean())
     assert summary[summary.condition == "all"].metric.tolist()[:2] == [
@@ -73,9 +77,12 @@ def four(tmp_path_factory):
     return folder_of(spec(episodes=4), tmp_path_factory.mktemp("four") / "run")
 
 
-@pytest.mark.parametrize(("workers", "batch_size"), some([(2, 3), (1, 1)], exhaustive=[(2, 8), (1, 100)]))
+@pytest.mark.parametrize(
+    ("workers", "batch_size"), some([(2, 3), (1, 1)], exhaustive=[(2, 8), (1, 100)])
+)
 def test_workers_and_batches_change_no_byte(four, tmp_path, monkeypatch, workers, batch_size):
-    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)  # so that both workers have some
+    # so that both workers have some
+    monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)
     assert folder_of(spec(episodes=4, batch_size=batch_size), tmp_path / "run", workers) == four
 
 
@@ -118,7 +125,9 @@ def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
 
 
 @pytest.mark.exhaustive
-def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(harness, tmp_path, monkeypatch):
+def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(
+    harness, tmp_path, monkeypatch
+):
     """A worker is forked with the world in which it dies."""
 
     class Deadly(LiveWorld):
@@ -147,20 +156,26 @@ def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(har
         code, out, said = harness(*line)
     assert (code, out) == (2, "")
     assert said == (
-        "harness: episodes 2 to 3: the worker was killed 3 times, perhaps because memory ran out; try "
-        "fewer --workers; the other 2 are done; run keeps what is done; type the same command to continue: "
+        "harness: episodes 2 to 3: the worker was killed 3 times, perhaps because memory ran out; "
+        "try "
+        "fewer --workers; the other 2 are done; run keeps what is done; type the same command to "
+        "continue: "
         f"harness {' '.join(line)}\n"
     )
     kept = {part.name for part in (tmp_path / "run/.work").glob("episodes-*")}
     assert kept == {"episodes-000000-000001", "episodes-000004-000004"}
     assert harness(*line) == (0, "", "")
     assert harness(*line[:-1], "whole", "--workers", "1") == (0, "", "")
-    assert all((tmp_path / "run" / n).read_bytes() == (tmp_path / "whole" / n).read_bytes() for n in FILES)
+    assert all(
+        (tmp_path / "run" / n).read_bytes() == (tmp_path / "whole" / n).read_bytes() for n in FILES
+    )
 
 
 def test_a_worker_that_opens_another_model_is_told_so(tmp_path, monkeypatch):
     monkeypatch.setattr(DriverBackend, "identity", lambda self: {"opened": os.urandom(4).hex()})
-    with pytest.raises(UserError, match=r"a worker opens another model behind cruise .*; give it the same"):
+    with pytest.raises(
+        UserError, match=r"a worker opens another model behind cruise .*; give it the same"
+    ):
         evaluate(spec("cruise", seeds=(0,), episodes=1), tmp_path / "run", lambda done: None)
 
 

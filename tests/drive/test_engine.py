@@ -31,10 +31,11 @@ IDLE, SLOWER, FASTER, UNSURE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 @pytest.mark.slow
 def test_an_episode_played_by_hand():
-    """Nobody is dangerous. At 1 s the ego is unsure: alone it goes on, over 6G its helpers make it brake.
+    """Nobody is dangerous. At 1 s the ego is unsure:
+    alone it goes on, over 6G its helpers make it brake.
 
-    A decision takes 0.1 s of thought, 5 frames. Over 6G it takes 5 ms of latency and at most 1.9 ms of
-    jitter and 0.02 ms on air more: 6 frames. What braking costs shows in the time to clear.
+    A decision takes 0.1 s of thought, 5 frames. Over 6G it takes 5 ms of latency and at most 1.9 ms
+    of jitter and 0.02 ms on air more: 6 frames. What braking costs shows in the time to clear.
     """
 
     def line(viewer, step):
@@ -58,7 +59,8 @@ def test_an_episode_played_by_hand():
     helpers = {f"{its[1].scene}/{viewer}" for viewer in ("v2", "v3", "v4")}
     egos = [asked for asked in script.asked if asked.endswith("/v1")]
     assert len(egos) == len(set(egos)) == made.decision_points
-    assert sorted(set(script.asked) - set(egos)) == sorted(helpers)  # of whom the ego was unsure, once
+    # of whom the ego was unsure, once
+    assert sorted(set(script.asked) - set(egos)) == sorted(helpers)
     assert len(script.asked) == len(egos) + len(helpers)
 
     world = World.start(SCENARIO, NO_DANGER)
@@ -74,7 +76,12 @@ def test_an_episode_played_by_hand():
 
 def test_braking_three_frames_later_is_42_centimetres_further():
     """145 ms are 8 frames and 219 ms are 11. From 14 to 7 m/s, 0.06 s later: 0.06 s x 7 m/s."""
-    assert (frames(0.145, 50), frames(0.219, 50), frames(0.14, 50), frames(0.0, 50)) == (8, 11, 7, 0)
+    assert (frames(0.145, 50), frames(0.219, 50), frames(0.14, 50), frames(0.0, 50)) == (
+        8,
+        11,
+        7,
+        0,
+    )
     south_m = []
     for latency_s in (0.145, 0.219):
         course = Course(ALONE, 0, {0: Decision("SLOWER", 50 + frames(latency_s, 50))})
@@ -94,7 +101,9 @@ def test_a_decision_acts_in_its_frame_and_not_before():
     assert (still.target()[1], braking.world.target()[1]) == (2, 1)
     advance([braking], 9)
     still.advance(9)
-    assert still.state().ego.speed_mps - braking.world.state().ego.speed_mps == pytest.approx(8.0 * 0.02)
+    assert still.state().ego.speed_mps - braking.world.state().ego.speed_mps == pytest.approx(
+        8.0 * 0.02
+    )
 
 
 def test_a_decision_still_open_when_the_next_is_due_goes_on_and_the_next_is_skipped():
@@ -110,7 +119,10 @@ def test_a_decision_still_open_when_the_next_is_due_goes_on_and_the_next_is_skip
         world.advance(frame)
         world.take("SLOWER")
     world.advance(500)
-    assert (episode.failure, episode.least_gap_m) == ("time_out", round(world.outcome.least_gap_m, 3))
+    assert (episode.failure, episode.least_gap_m) == (
+        "time_out",
+        round(world.outcome.least_gap_m, 3),
+    )
 
 
 def test_a_decision_that_is_ready_when_the_next_is_due_acts_first():
@@ -139,7 +151,11 @@ def by_reference(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize(
-    "seed", [FROM_LEFT, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in (NO_DANGER, ONCOMING))]
+    "seed",
+    [
+        FROM_LEFT,
+        *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in (NO_DANGER, ONCOMING)),
+    ],
 )
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
@@ -163,7 +179,9 @@ def test_episodes_are_in_one_world_until_one_acts_otherwise():
         there = [one for one in lives if step in made[one]]
         for a in there:
             for b in there:
-                past = [[(d.action, d.acts_at_s) for d in list(made[x].values())[:step]] for x in (a, b)]
+                past = [
+                    [(d.action, d.acts_at_s) for d in list(made[x].values())[:step]] for x in (a, b)
+                ]
                 if past[0] == past[1]:
                     assert made[a][step].scene == made[b][step].scene
                 elif made[a][step].scene == made[b][step].scene:
@@ -194,7 +212,8 @@ def test_sharing_a_world_changes_nothing(points, seeds, episodes):
 
 
 @pytest.mark.parametrize(
-    "count", [pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.exhaustive)]
+    "count",
+    [pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.exhaustive)],
 )
 def test_who_is_driven_beside_changes_nothing(count):
     together = driven(spec("proxy-faulty"), range(count))
@@ -213,14 +232,24 @@ def test_the_luck_is_the_frozen_runs(small):
         asker = Asker(of, lambda: open_backend(of.ego.card), PAPER)
         for step, [decided] in enumerate(walk(world, of.points, asker, of.ties)):
             due = decided.due
-            for n, (episode, seed) in enumerate(zip(due.episode.tolist(), due.seed.tolist(), strict=True)):
-                yield (episode, seed, step), (due.draws.link[n].tolist(), due.draws.jitter[n].tolist())
+            for n, (episode, seed) in enumerate(
+                zip(due.episode.tolist(), due.seed.tolist(), strict=True)
+            ):
+                yield (
+                    (episode, seed, step),
+                    (due.draws.link[n].tolist(), due.draws.jitter[n].tolist()),
+                )
 
     first = small.manifest.seed
     run = spec("cruise", points=(ALONE,), seeds=(3, 4), first_seed=first, episodes=4)
-    frozen = dict(draws(spec_of(small, "cruise", points=(ALONE,)), FrozenWorld(small, (ALONE,), (3, 4))))
-    # A driver asks no helper, so the ego alone is looked at; `ego_alone` is given here to see all four.
-    closed = dict(draws(run, LiveWorld(SCENARIO, first, range(4), run.points, run.seeds, ego_alone=False)))
+    frozen = dict(
+        draws(spec_of(small, "cruise", points=(ALONE,)), FrozenWorld(small, (ALONE,), (3, 4)))
+    )
+    # A driver asks no helper, so the ego alone is looked at; `ego_alone` is given here to see all
+    # four.
+    closed = dict(
+        draws(run, LiveWorld(SCENARIO, first, range(4), run.points, run.seeds, ego_alone=False))
+    )
     assert closed.keys() <= frozen.keys()
     assert {step for *_, step in closed} == set(range(6))
     assert closed == {place: frozen[place] for place in closed}
@@ -239,7 +268,9 @@ def test_helpers_that_cannot_be_heard_make_no_difference_but_time():
 
 @pytest.mark.slow
 def test_messages_that_the_egos_model_fuses_take_a_second_inference():
-    """Unsure at 1 s, the ego hears three helpers, is asked again with their messages, and is for braking."""
+    """Unsure at 1 s, the ego hears three helpers, is asked again with their messages,
+    and is for braking.
+    """
     calling = named_point("6g:consensus=ego-prompt")
     run = spec("swarm-tiny", points=(POINTS["6g"], calling), seeds=(0,), first_seed=NO_DANGER)
     script = Script(

@@ -1,9 +1,10 @@
-"""Frozen is driven: a walk through a layout's tree ends, and gets there, as driving that layout does.
+"""Frozen is driven: a walk through a layout's tree ends, and gets there,
+as driving that layout does.
 
-That holds for every episode whose decisions act in the frame of the dataset's lag. The reference drivers'
-all do. Over 6G a decision that waits for a lost or a slow reply acts later, and one answer of twenty of
-`proxy-faulty` is 0.4 s late: such episodes are left out, and counted. Over a physical radio it shows that
-both worlds have the same places, shadowing and packets.
+That holds for every episode whose decisions act in the frame of the dataset's lag. The reference
+drivers' all do. Over 6G a decision that waits for a lost or a slow reply acts later, and one answer
+of twenty of `proxy-faulty` is 0.4 s late: such episodes are left out, and counted. Over a physical
+radio it shows that both worlds have the same places, shadowing and packets.
 """
 
 from collections import defaultdict
@@ -44,9 +45,14 @@ def told(of: Run) -> dict[Place, tuple[list[Any], list[tuple[Any, ...]]]]:
     """How each episode ended, and what was decided at which decision points on the way."""
     way = defaultdict(list)
     for d in of.decisions.records(0, len(of.decisions)):
-        way[d.condition, d.seed, d.episode].append((d.step, d.scene, d.action, d.fused, d.latency_ms))
+        way[d.condition, d.seed, d.episode].append(
+            (d.step, d.scene, d.action, d.fused, d.latency_ms)
+        )
     return {
-        (place := (e.condition, e.seed, e.episode)): ([getattr(e, name) for name in SAME], sorted(way[place]))
+        (place := (e.condition, e.seed, e.episode)): (
+            [getattr(e, name) for name in SAME],
+            sorted(way[place]),
+        )
         for e in of.episodes
     }
 
@@ -68,7 +74,11 @@ def off_lag(of: Run) -> set[Place]:
 @pytest.mark.parametrize(
     ("model", "points", "seeds", "least", "layouts"),
     [
-        *(case for driver in DRIVERS for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(3, 40))),
+        *(
+            case
+            for driver in DRIVERS
+            for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(3, 40))
+        ),
         *few_or_many("proxy", (ALONE, OVER_6G), (0, 1), 0.8, layouts=(2, 20)),
         *few_or_many("proxy", (named_point("its-g5"),), (0, 1), 0.5, layouts=(2, 20)),
         *few_or_many("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4, layouts=(2, 20)),
@@ -106,8 +116,12 @@ def test_what_the_tree_says_is_what_driving_gives(
 CONFLICTS = ("least_ttc_s", "short_ttc", "least_pet_s", "short_pet")
 
 
-@pytest.mark.parametrize("model", some(["cruise", "proxy"], exhaustive=["full-view", "brake", "local-view"]))
-def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset, model: str) -> None:
+@pytest.mark.parametrize(
+    "model", some(["cruise", "proxy"], exhaustive=["full-view", "brake", "local-view"])
+)
+def test_conflicts_in_a_tree_are_those_of_driving(
+    tmp_path: Path, small: Dataset, model: str
+) -> None:
     """Of each decision and episode, on a tree that is built today; the shipped ones are older."""
     how: dict[str, Any] = {"points": (ALONE,), "seeds": (0,)}
     driven = live_spec_of(model, len(small.episodes), small.manifest.seed, **how)
@@ -117,7 +131,9 @@ def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset
     )
     assert not off_lag(walked)
     for e, expected in zip(walked.episodes, drove.episodes, strict=True):
-        assert [getattr(e, name) for name in CONFLICTS] == [getattr(expected, name) for name in CONFLICTS]
+        assert [getattr(e, name) for name in CONFLICTS] == [
+            getattr(expected, name) for name in CONFLICTS
+        ]
         assert e.failure != "collision" or (e.least_ttc_s, e.least_pet_s) == (0.0, 0.0)
     for name in ("ttc_s", "pet_s", "short_ttc", "short_pet"):
         np.testing.assert_array_equal(walked.decisions[name], drove.decisions[name])
@@ -128,8 +144,14 @@ def test_conflicts_in_a_tree_are_those_of_driving(tmp_path: Path, small: Dataset
 
 
 def test_what_an_older_tree_does_not_hold_is_unknown_and_said(tmp_path: Path) -> None:
-    older = folder.read(run(spec_of(load(find(former.DATASET), 2), "cruise"), tmp_path / "older").out)
+    older = folder.read(
+        run(spec_of(load(find(former.DATASET), 2), "cruise"), tmp_path / "older").out
+    )
     assert {getattr(e, name) for e in older.episodes for name in CONFLICTS} == {None}
     assert np.isnan(older.decisions["short_ttc"]).all()
-    assert not {s.metric for s in older.scores} & {"least_ttc_s", "short_ttc_rate", "short_ttc_decision_rate"}
+    assert not {s.metric for s in older.scores} & {
+        "least_ttc_s",
+        "short_ttc_rate",
+        "short_ttc_decision_rate",
+    }
     assert [s for s in unmeasured(older) if "Time to collision" in s and "dataset is older" in s]

@@ -31,7 +31,9 @@ V2 = prompts.load("v2")
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory):
-    """Layouts with dangers; among others the ego alone runs into somebody, and does not under 6g."""
+    """Layouts with dangers; among others the ego alone runs into somebody,
+    and does not under 6g.
+    """
     out = tmp_path_factory.mktemp("live") / "run"
     run(live_spec_of(episodes=2, first_seed=FROM_LEFT), out)
     return out
@@ -68,7 +70,9 @@ def test_workers_change_no_byte_of_a_page(driven, tmp_path, monkeypatch):
 
 @pytest.mark.exhaustive
 def test_a_run_with_other_beacons_is_replayed_with_them(tmp_path):
-    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,))
+    spec = live_spec_of(
+        episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,)
+    )
     name = f"{NAME},perfect_knowledge=true"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
@@ -88,12 +92,18 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
     found = read(driven)
     scene = next(iter(found.decisions.scenes))
     earlier = edited(
-        driven, tmp_path, "run.json", lambda text: text.replace('"time_limit_s": 10.0', '"time_limit_s": 0.5')
+        driven,
+        tmp_path,
+        "run.json",
+        lambda text: text.replace('"time_limit_s": 10.0', '"time_limit_s": 0.5'),
     )
     assert played(read(earlier), 0, "6g", 0).scenario.parameters.time_limit_s == 0.5
     assert [replayed.id for replayed in scenes_of(read(earlier), [scene])] == [scene]
     gone = edited(
-        driven, tmp_path / "gone", "run.json", lambda text: text.replace('"time_limit_s"', '"patience_s"')
+        driven,
+        tmp_path / "gone",
+        "run.json",
+        lambda text: text.replace('"time_limit_s"', '"patience_s"'),
     )
     with pytest.raises(UserError, match="scenario occluded-intersection has other parameters here"):
         scenes_of(read(gone), [scene])
@@ -101,7 +111,9 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
 
 @pytest.mark.slow
 def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
-    spec = live_spec_of(episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,))
+    spec = live_spec_of(
+        episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,)
+    )
     name = f"{NAME},ambient=night"
     run(replace(spec, source=replace(spec.source, scenario_name=name)), tmp_path / "run")
     found = read(tmp_path / "run")
@@ -123,10 +135,16 @@ def test_each_condition_is_shown_with_what_only_driving_shows(driven, page):
     found = read(driven)
     for name in ("single-local", "v2x", "6g"):
         score = found.score(name, "collision_rate")
-        assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
+        assert (
+            f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %"
+            in page.text
+        )
         gap = found.score(name, "least_gap_m")
         assert f"{gap.value:.1f} m" in page.text
-    assert "2 episodes of occluded-intersection, scenes of v2v-safety, driven in closed loop (" in page.text
+    assert (
+        "2 episodes of occluded-intersection, scenes of v2v-safety, driven in closed loop ("
+        in page.text
+    )
     assert "(layout seeds 6 to 7)" in page.text
     for metric in ("collision rate", "time to clear", "least gap", "hard brakings per episode"):
         assert metric in page.text
@@ -148,7 +166,11 @@ def test_a_moment_has_what_was_decided_when_it_acted_and_what_became_of_each_epi
     assert list(every) == list(moments)
     for scene, rows in moments.items():
         [told] = every[scene]["runs"]
-        again = {(d["condition"], seed): d.get("acts_at_s") for d in told["decisions"] for seed in d["seeds"]}
+        again = {
+            (d["condition"], seed): d.get("acts_at_s")
+            for d in told["decisions"]
+            for seed in d["seeds"]
+        }
         assert again == {(row["condition"], row["seed"]): row["acts_at_s"] for row in rows}
         number = rows[0]["episode"]
         assert len(told["ends"]) == len([e for e in ends.values() if e.episode == number])
@@ -179,7 +201,9 @@ def test_a_failure_is_shown_where_it_parts_from_a_success_with_its_seed(driven):
         assert not all(map(fails, rows)) or not any(of_layout)
         assert any(fails(row) and row["seed"] == seed for row in rows)
         later = list(moments.values())[list(moments).index(scene) + 1 :]
-        for others in (rows for rows in later if rows[0]["episode"] == moments[scene][0]["episode"]):
+        for others in (
+            rows for rows in later if rows[0]["episode"] == moments[scene][0]["episode"]
+        ):
             assert len(set(map(fails, others))) == 1
     assert set(telling) <= set(pick(found, telling, 60))
 
@@ -255,7 +279,10 @@ def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_pa
 @pytest.mark.slow
 def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(driven, tmp_path):
     other = edited(
-        driven, tmp_path, "run.json", lambda text: text.replace('"first_seed": 6', '"first_seed": 600')
+        driven,
+        tmp_path,
+        "run.json",
+        lambda text: text.replace('"first_seed": 6', '"first_seed": 600'),
     )
     episodes = pd.read_csv(other / "episodes.csv")
     episodes["layout_seed"] += 594
@@ -270,7 +297,11 @@ def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(dri
 @pytest.mark.parametrize(
     ("name", "edit", "message"),
     [
-        ("run.json", lambda t: t.replace('"first_seed"', '"first"'), "run.json is broken .*`first_seed`"),
+        (
+            "run.json",
+            lambda t: t.replace('"first_seed"', '"first"'),
+            "run.json is broken .*`first_seed`",
+        ),
         ("episodes.csv", lambda t: t.replace("partner", "p"), "episodes.csv is broken .*partner"),
         (
             "episodes.csv",

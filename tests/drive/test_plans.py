@@ -1,4 +1,6 @@
-"""Agents tell each other what they are going to do: plans, the rules that read them, and broken words."""
+"""Agents tell each other what they are going to do:
+plans, the rules that read them, and broken words.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +39,13 @@ def decided(rule, intents, reaches_s, lost_s=(), heard=None, vehicle=None) -> li
     )
     there = np.array(heard if heard is not None else [True] * (n - 1))
     messages = Messages(
-        np.array(intents), np.full(n, 1 / n), there, np.zeros(n - 1), np.ones(n), np.ones(n - 1), plans=plans
+        np.array(intents),
+        np.full(n, 1 / n),
+        there,
+        np.zeros(n - 1),
+        np.ones(n),
+        np.ones(n - 1),
+        plans=plans,
     )
     return RULES[rule].fuse(messages, np.zeros(0)).policy.tolist()
 
@@ -45,7 +53,9 @@ def decided(rule, intents, reaches_s, lost_s=(), heard=None, vehicle=None) -> li
 def test_who_reaches_the_conflict_sooner_goes_on_and_the_other_waits():
     assert decided("yield-by-time", [BOLD, STEADY], [4.0, 3.0]) == [1, 0, 0]
     assert decided("yield-by-time", [BOLD, STEADY], [3.0, 4.0]) == BOLD
-    assert decided("yield-by-time", [BOLD, STEADY], [3.0, 3.0]) == BOLD, "the lower number goes first"
+    assert decided("yield-by-time", [BOLD, STEADY], [3.0, 3.0]) == BOLD, (
+        "the lower number goes first"
+    )
     assert decided("yield-by-time", [BOLD, STEADY], [3.0, 3.0], vehicle=[2, 1]) == [1, 0, 0]
 
 
@@ -71,7 +81,8 @@ def test_the_highest_bid_goes_first_and_a_number_decides_by_itself():
 def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path: Path) -> None:
     points = tuple(named_point(PLAN + rule) for rule in ("yield-by-time", "auction"))
     spec = replace(
-        live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,)), source=LiveSource(50_000, 4, ALL)
+        live_spec_of(prompt="v4", points=(named_point("6g"),), seeds=(0,)),
+        source=LiveSource(50_000, 4, ALL),
     )
     run(replace(spec, points=points), tmp_path / "run")
     there = folder.read(tmp_path / "run")
@@ -79,7 +90,9 @@ def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path:
     table = there.decisions
     broken, episode = table["broke_word"], table.whole("episode")
     assert {0, 1} <= set(broken.tolist())
-    rates = {score.condition: score.value for score in there.scores if score.metric == "broken_word_rate"}
+    rates = {
+        score.condition: score.value for score in there.scores if score.metric == "broken_word_rate"
+    }
     for point in points:
         here = np.array(table.labels("condition")) == point.name
         means = [np.nanmean(broken[here & (episode == e)]) for e in np.unique(episode[here])]
@@ -93,7 +106,10 @@ def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path:
         ("6g:consensus=auction", "content is 'intent'; it must be plan where consensus is auction"),
         (PLAN + "auction,on_demand=true", "on_demand is True"),
         (PLAN + "auction,messages=blind", "messages is 'blind'"),
-        (PLAN + "auction,attack=liar+injection", "attack is 'liar.injection'; it must be one on intents"),
+        (
+            PLAN + "auction,attack=liar+injection",
+            "attack is 'liar.injection'; it must be one on intents",
+        ),
     ],
 )
 def test_what_plans_go_without_is_refused_in_one_line(condition: str, says: str) -> None:
@@ -107,7 +123,9 @@ def test_an_ego_alone_has_nobody_whose_plan_it_hears() -> None:
 
 
 def three(point: OperatingPoint) -> tuple[SentIntents, Exchange]:
-    """The first round of three agents that all want to go, 1.5 s apart; each is near the next one."""
+    """The first round of three agents that all want to go, 1.5 s apart;
+    each is near the next one.
+    """
     n, senders = 3, np.array([[1, 2], [0, 2], [0, 1]])
     own = Intents(
         own=np.array([BOLD, STEADY, STEADY]), helpers=np.full((n, 2, 3), np.nan), valid=np.ones((n, 2), bool),
@@ -122,7 +140,9 @@ def three(point: OperatingPoint) -> tuple[SentIntents, Exchange]:
 
 
 def acted(point: OperatingPoint) -> Coordination:
-    said, heard = further_rounds(point, *three(point), lambda heard, intents: fuse(point, heard, intents))
+    said, heard = further_rounds(
+        point, *three(point), lambda heard, intents: fuse(point, heard, intents)
+    )
     return fuse(point, heard, said.intents)
 
 
@@ -158,7 +178,9 @@ def test_each_round_waits_for_the_answer_before_it() -> None:
     assert once.latency_s == pytest.approx(0.1 + exchange_s + 0.1)
     assert twice.latency_s == pytest.approx(0.1 + 2 * (exchange_s + 0.1))
     assert twice.messages.tolist() == [4, 4, 4]
-    assert late.latency_s == pytest.approx(once.latency_s), "the window is over, so nobody is asked again"
+    assert late.latency_s == pytest.approx(once.latency_s), (
+        "the window is over, so nobody is asked again"
+    )
 
 
 def test_a_round_that_ends_after_the_window_is_not_heard_and_none_begins_after_it() -> None:

@@ -1,4 +1,6 @@
-"""ego-prompt with plans: an agent's model is asked once more with what the others are going to do."""
+"""ego-prompt with plans: an agent's model is asked once more with what the others are going to
+do.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +30,9 @@ TWICE = f"{READS},rounds=2,window_s=0.6"
 
 
 class Polite(Scripted):
-    """Wants to go; waits as soon as it reads that anybody else plans to. Fails after so many questions."""
+    """Wants to go; waits as soon as it reads that anybody else plans to.
+    Fails after so many questions.
+    """
 
     def __init__(self, questions: int = 1 << 30) -> None:
         super().__init__({})
@@ -49,7 +53,9 @@ class Polite(Scripted):
 def spec(*conditions: str, prompt: str = "v13", **options) -> Spec:
     points = tuple(map(named_point, conditions))
     made = live_spec_of("swarm-tiny-six-v2", prompt=prompt, points=(named_point("6g"),), seeds=(0,))
-    return replace(made, source=LiveSource(50_000, 2, ALL), points=points).changed(latency="paper", **options)
+    return replace(made, source=LiveSource(50_000, 2, ALL), points=points).changed(
+        latency="paper", **options
+    )
 
 
 def driven(where: Spec, backend: Scripted, kept: Path | None = None) -> tuple[Steps, Asker]:
@@ -61,9 +67,14 @@ def driven(where: Spec, backend: Scripted, kept: Path | None = None) -> tuple[St
 
 def same(one: Steps, other: Steps) -> bool:
     """Whether the same was decided in each step."""
-    parts = [(a.result, b.result) for x, y in zip(one, other, strict=True) for a, b in zip(x, y, strict=True)]
+    parts = [
+        (a.result, b.result)
+        for x, y in zip(one, other, strict=True)
+        for a, b in zip(x, y, strict=True)
+    ]
     return all(
-        np.array_equal(a.fused, b.fused) and np.array_equal(a.latency_s, b.latency_s) for a, b in parts
+        np.array_equal(a.fused, b.fused) and np.array_equal(a.latency_s, b.latency_s)
+        for a, b in parts
     )
 
 
@@ -83,7 +94,9 @@ def test_agents_are_asked_again_with_the_plans_of_others() -> None:
         heard, scene = messages_of({}, answer.heard, where.actions), scenes[answer.scene]
         said |= {tuple(plan["intent"]) for plan in heard}
         words = (scene.seat or where.scenario).prompt_words
-        asked = versions.load("v13").render(scene.graphs[answer.viewer], where.actions, heard, words)
+        asked = versions.load("v13").render(
+            scene.graphs[answer.viewer], where.actions, heard, words
+        )
         assert digest(asked) == answer.prompt_sha256, "a page can show what was asked"
         assert "PLANS" in asked[-1]["content"]
     assert said == {(0.1, 0.2, 0.7), (0.8, 0.1, 0.1)}
@@ -113,7 +126,10 @@ def test_batches_and_a_stop_change_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("condition", "says"),
     [
-        (f"{READS},defence=schema", "defence is 'schema'; it must be left out where content is plan"),
+        (
+            f"{READS},defence=schema",
+            "defence is 'schema'; it must be left out where content is plan",
+        ),
         (
             f"{READS},round_trip_s=0.1,rounds=2",
             "rounds is 2; it must be 1 where the ego's model runs in a cloud",
@@ -135,7 +151,11 @@ def test_who_cannot_read_plans_is_refused() -> None:
     with pytest.raises(UserError, match="proxy is no language model"):
         replace(spec("6g"), ego=live_spec_of(prompt="v13").ego, points=(named_point(READS),))
     with pytest.raises(UserError, match="cruise is no language model and cannot read plans"):
-        replace(spec("6g"), helpers=(live_spec_of("cruise", prompt="v13").ego,), points=(named_point(READS),))
+        replace(
+            spec("6g"),
+            helpers=(live_spec_of("cruise", prompt="v13").ego,),
+            points=(named_point(READS),),
+        )
 
 
 @pytest.mark.parametrize("key", ["v2!plan", "v2!plan:1:a,b:3:0", "v2!plan:1:0.1:3"])

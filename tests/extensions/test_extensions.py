@@ -1,4 +1,6 @@
-"""Extensions: the one that docs/extend.md shows, and those that do not work; and the core without any."""
+"""Extensions: the one that docs/extend.md shows, and those that do not work;
+and the core without any.
+"""
 
 import json
 import os
@@ -47,7 +49,9 @@ def of_the_page(folder: Path) -> Path:
     """Write the package that docs/extend.md shows, in the order in which it shows its files."""
     page = (DOCS / "extend.md").read_text()
     [project] = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    extension, study = [block for language, block in blocks(DOCS / "extend.md") if language == "python"][:2]
+    extension, study = [
+        block for language, block in blocks(DOCS / "extend.md") if language == "python"
+    ][:2]
     for name, text in {
         "pyproject.toml": project,
         "doubt/__init__.py": extension,
@@ -70,7 +74,13 @@ def in_process(packages: Sequence[Path], folder: Path, *typed: str) -> Said:
 @pytest.mark.slow
 def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: Path) -> None:
     site = tmp_path / "site"
-    options = ["--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation"]
+    options = [
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-index",
+        "--no-deps",
+        "--no-build-isolation",
+    ]
     pip = [sys.executable, "-m", "pip", "install", *options, "--target", str(site)]
     subprocess.run([*pip, str(of_the_page(tmp_path / "package"))], check=True)
     asked = ("--model", "proxy", "--condition", "6g", "--seeds", "0:2", "--dataset", str(two_path))
@@ -85,7 +95,9 @@ def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: P
     assert "<h2>Doubt</h2>" in page
     assert page.count("Decisions in doubt") == 2  # its head, and the name of its region
     assert "decisions have a normalised entropy above 0.25." in page
-    again = in_process([ROOT, site], tmp_path, "eval", "reports/run", "--quiet", "--out", "reports/again")
+    again = in_process(
+        [ROOT, site], tmp_path, "eval", "reports/run", "--quiet", "--out", "reports/again"
+    )
     assert again == (0, "", "")
     other = tmp_path / "reports" / "again" / "run.json"
     assert json.loads(other.read_text())["settings"]["extensions"] == {"doubt_above": 0.25}
@@ -96,7 +108,11 @@ def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: P
     assert (code, err) == (0, "")
     assert out.startswith("Doubt of run\n1 of 1 conditions have the metric.\n")
     listed = json.loads(in_process([ROOT, site], tmp_path, "run", "ls", "--json")[1])
-    assert {one["name"]: one["kind"] for one in listed} == {"run": "eval", "again": "eval", "doubt": "doubt"}
+    assert {one["name"]: one["kind"] for one in listed} == {
+        "run": "eval",
+        "again": "eval",
+        "doubt": "doubt",
+    }
     assert "\n  doubt " in in_process([ROOT, site], tmp_path, "study", "--help")[1]
 
 
@@ -116,22 +132,38 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Installed:
 
 
 ODD = {
-    'Extension(name="odd", interface=9)': "extension odd is for version 9 of `Extension`, and this is "
+    'Extension(name="odd", interface=9)': "extension odd is for version 9 of "
+    "`Extension`, and this is "
     "version 1; install a version of its package for this harness",
     'Extension(name="other")': "extension odd calls itself other; give both the same name",
-    'Extension(name="odd", commands=["study x"])': "extension odd: its commands are no table of texts",
+    'Extension(name="odd", commands=["study x"])': "extension odd: its commands "
+    "are no table of texts",
     'Extension(name="odd", adds={"rules": 3})': "extension odd: its adds are no table of texts",
-    'Extension(name="odd", commands={"": "x:y"})': "extension odd: nobody can type '' of its commands",
-    'Extension(name="odd", commands={"study  x": "x:y"})': "nobody can type 'study  x' of its commands",
-    'Extension(name="odd", studies={"../x": "x"})': "extension odd: nobody can type '../x' of its studies",
-    'Extension(name="odd", spellings={"old": ""})': "extension odd: nobody can type '' of its spellings",
-    'Extension(name="odd", settings={"level": 3})': "extension odd: its settings are no table of Setting",
-    'Extension(name="odd", settings={"a": Setting(int, "x", "")})': "its settings are no table of Setting",
-    'Extension(name="odd", settings={"class": Setting(int, 1, "")})': "its settings are no table of Setting",
-    'Extension(name="odd", settings={"help": Setting(int, 1, "")})': "its settings are no table of Setting",
-    'Extension(name="odd", settings={"a": Setting(float, float("nan"), "")})': "are no table of Setting",
-    'Extension(name="odd", settings={"A b": Setting(int, 1, "")})': "its settings are no table of Setting",
-    "1 / 0": "plug-in 'odd' (swarmdrive.extensions): of_others:ODD does not load (division by zero)",
+    'Extension(name="odd", commands={"": "x:y"})': "extension odd: nobody can "
+    "type '' of its commands",
+    'Extension(name="odd", '
+    'commands={"study  x": "x:y"})': "nobody can type 'study  x' of its commands",
+    'Extension(name="odd", studies={"../x": "x"})': "extension odd: nobody can "
+    "type '../x' of its studies",
+    'Extension(name="odd", spellings={"old": ""})': "extension odd: nobody can "
+    "type '' of its spellings",
+    'Extension(name="odd", settings={"level": 3})': "extension odd: its settings "
+    "are no table of Setting",
+    'Extension(name="odd", '
+    'settings={"a": Setting(int, "x", '
+    '"")})': "its settings are no table of Setting",
+    'Extension(name="odd", '
+    'settings={"class": Setting(int, 1, '
+    '"")})': "its settings are no table of Setting",
+    'Extension(name="odd", '
+    'settings={"help": Setting(int, 1, '
+    '"")})': "its settings are no table of Setting",
+    'Extension(name="odd", settings={"a": '
+    'Setting(float, float("nan"), "")})': "are no table of Setting",
+    'Extension(name="odd", settings={"A '
+    'b": Setting(int, 1, "")})': "its settings are no table of Setting",
+    "1 / 0": "plug-in 'odd' (swarmdrive.extensions): "
+    "of_others:ODD does not load (division by zero)",
     "Extension": "is of type type and no Extension",
     "exit()": "ends the program (SystemExit",
     "__import__('absent_package')": "does not load (No module named 'absent_package')",
@@ -152,7 +184,8 @@ def test_an_extension_that_does_not_work_is_one_line_and_all_else_works(
 
 def test_a_name_that_is_taken_is_left_out_with_a_line(installed: Installed, harness: Typed) -> None:
     installed(
-        odd='Extension(name="odd", commands={"eval": "x:y", "odd": "x:y"}, studies={"sweep": "mine"})',
+        odd='Extension(name="odd", commands={"eval": "x:y", "odd": "x:y"}, studies={"sweep": '
+        '"mine"})',
         other='Extension(name="other", commands={"odd": "x:z"})',
     )
     assert harness("eval", "--help")[0] == 0
@@ -198,10 +231,15 @@ def test_what_sections_and_metrics_print_is_no_output_of_a_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loud_section = {"loud": lambda run: print("from a section")}
-    monkeypatch.setattr(sections, "SECTIONS", Plugins("swarmdrive.sections", Callable, loud_section))
+    monkeypatch.setattr(
+        sections, "SECTIONS", Plugins("swarmdrive.sections", Callable, loud_section)
+    )
     assert sections._written("loud", None) is None
     loud = replace(METRICS["success_rate"], name="loud")
-    assert list(metrics._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [0.0, 0.0]
+    assert list(metrics._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [
+        0.0,
+        0.0,
+    ]
     assert capsys.readouterr() == ("", "from a section\nfrom a metric\n")
 
 
@@ -236,7 +274,9 @@ def test_a_file_sets_what_an_installed_extension_has_and_to_its_kind(
     installed(odd='Extension(name="odd", settings={"level": Setting(float, 1.0, "h")})')
     for text, said in {
         "level = 'x'": "settings stated.toml: level = 'x'; allowed: float",
-        "none = 2": "settings stated.toml: none is a setting of an extension that is not installed; install",
+        "none = 2": "settings stated.toml: none is a setting of an "
+        "extension that is not installed; "
+        "install",
     }.items():
         Path("stated.toml").write_text(f"[extensions]\n{text}\n")
         code, out, err = harness("eval", "stated.toml")
@@ -302,7 +342,9 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
         (known.STUDIES, extension.studies),
         (known.NAMES, extension.adds.get("python", {})),
     ):
-        named = {key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"}
+        named = {
+            key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"
+        }
         assert named == set(names)
     for part in extension.adds.get("parts", {}):
         for setting, default in structs.asdict(more_parts()[part]()).items():
@@ -331,13 +373,23 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("core") / "checkout"
     left_out = shutil.ignore_patterns("__pycache__", "extensions")
     shutil.copytree(ROOT / "harness", copy / "harness", ignore=left_out)
-    for name in ("prompts", "models", "channels", "devices", "networks", "schedules", "pyproject.toml"):
+    for name in (
+        "prompts",
+        "models",
+        "channels",
+        "devices",
+        "networks",
+        "schedules",
+        "pyproject.toml",
+    ):
         (copy / name).symlink_to(ROOT / name)
     return copy
 
 
 def in_the_core(core: Path, folder: Path, code: str) -> "subprocess.CompletedProcess[str]":
-    """Run Python code in a process whose `harness` has no extensions, with the packages of this one."""
+    """Run Python code in a process whose `harness` has no extensions,
+    with the packages of this one.
+    """
     return subprocess.run(
         [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(core), *sys.path])}, check=True,
@@ -383,7 +435,8 @@ def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
 ) -> None:
     code = (
         f"import harness\nprint(dir(harness))\ntry:\n    harness.{name}\n"
-        "except harness.UserError as error:\n    print(error)\nassert not hasattr(harness, 'absent')\n"
+        "except harness.UserError as error:\n    print(error)\nassert not hasattr(harness, "
+        "'absent')\n"
     )
     done = in_the_core(core, tmp_path, code)
     names, said = done.stdout.splitlines()
@@ -400,7 +453,8 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
     code = (
         "from harness.coordination.operating_point import OperatingPoint, named_point\n"
         "from harness.core.errors import UserError\n"
-        "print(OperatingPoint.from_dict({'name': '6g', 'profile': '6g', 'calibration': ''}).record() == "
+        "print(OperatingPoint.from_dict({'name': '6g', 'profile': '6g', 'calibration': "
+        "''}).record() == "
         "OperatingPoint.from_dict({'name': '6g', 'profile': '6g'}).record())\n"
         "for ask in (lambda: OperatingPoint.from_dict({'name': '6g', 'calibration': 'l1'}), "
         "lambda: named_point('6g:calibration=l1')):\n"
@@ -411,7 +465,10 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
         env={**os.environ, "PYTHONPATH": str(core)}, check=True,
     )  # fmt: skip
     of_one = "is part of the extension calibration, which is not installed"
-    assert done.stdout.splitlines() == ["True", *[f"setting calibration=l1 of a condition {of_one}"] * 2]
+    assert done.stdout.splitlines() == [
+        "True",
+        *[f"setting calibration=l1 of a condition {of_one}"] * 2,
+    ]
 
 
 PART = """
@@ -435,10 +492,17 @@ class Muffled(Part, frozen=True, kw_only=True):
 
 @pytest.mark.slow
 def test_a_package_adds_a_part_of_a_condition(tmp_path: Path, two_path: Path) -> None:
-    """Its setting is typed and recorded like any other, and refuses in one line what it does not go with."""
+    """Its setting is typed and recorded like any other,
+    and refuses in one line what it does not go with.
+    """
     parts = '{"parts": {"muffled": "muffled:Muffled"}}'
     extension = f'from harness import Extension\nODD = Extension(name="odd", adds={parts})\n'
-    register(tmp_path / "site", f"[{known.GROUP}]\nodd = of_others:ODD\n", of_others=extension, muffled=PART)
+    register(
+        tmp_path / "site",
+        f"[{known.GROUP}]\nodd = of_others:ODD\n",
+        of_others=extension,
+        muffled=PART,
+    )
     both, alone = [ROOT, tmp_path / "site"], [ROOT]
     asked = ("eval", "--model", "proxy", "--dataset", str(two_path), "--seeds", "0:2", "--quiet")
     typed = ("--condition", "6g", "--condition", "6g:muffle=1", "--condition", "6g:muffle=0")
@@ -450,7 +514,9 @@ def test_a_package_adds_a_part_of_a_condition(tmp_path: Path, two_path: Path) ->
     plain, muffled, idle = (fused[names == name] for name in ("6g", "6g:muffle=1", "6g:muffle=0"))
     assert np.array_equal(plain, idle)
     assert not np.array_equal(plain, muffled)
-    code, out, err = in_process(both, tmp_path, *asked, "--condition", "v2x:muffle=1", "--out", "other")
+    code, out, err = in_process(
+        both, tmp_path, *asked, "--condition", "v2x:muffle=1", "--out", "other"
+    )
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "muffle does not go with v2x" in err
     code, out, err = in_process(alone, tmp_path, "eval", "run", "--quiet", "--out", "again")
@@ -476,10 +542,14 @@ def test_a_part_that_does_not_work_is_one_line_and_all_else_works(
     said: str,
 ) -> None:
     extension = (
-        'from harness import Extension\nEXT = Extension(name="odd", adds={"parts": {"odd": "odd_part:ODD"}})'
+        'from harness import Extension\nEXT = Extension(name="odd", adds={"parts": {"odd": '
+        '"odd_part:ODD"}})'
     )
     register(
-        tmp_path / "site", f"[{known.GROUP}]\nodd = of_others:EXT\n", of_others=extension, odd_part=source
+        tmp_path / "site",
+        f"[{known.GROUP}]\nodd = of_others:EXT\n",
+        of_others=extension,
+        odd_part=source,
     )
     monkeypatch.syspath_prepend(tmp_path / "site")
     for name in ("of_others", "odd_part"):
@@ -507,15 +577,23 @@ def test_a_stopped_run_resumes_with_an_extensions_setting_as_it_was(
         unfinished(spec.changed(extensions={"level": 2}), tmp_path / "run")
 
 
-def test_a_command_of_a_package_that_fails_is_one_line(installed: Installed, harness: Typed) -> None:
-    installed(odd='Extension(name="odd", commands={"oddly": "of_others:fail", "leave": "of_others:leave"})')
+def test_a_command_of_a_package_that_fails_is_one_line(
+    installed: Installed, harness: Typed
+) -> None:
+    installed(
+        odd='Extension(name="odd", commands={"oddly": "of_others:fail", "leave": '
+        '"of_others:leave"})'
+    )
     source = Path(sys.path[0]) / "of_others.py"
     fail = "def fail():\n    raise ValueError('bad\\x1b[31m')\n"
     leave = "def leave():\n    raise typer.Exit(4)\n"
     source.write_text(f"{source.read_text()}\nimport typer\n{fail}{leave}")
     code, out, err = harness("oddly")
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "command oddly (of_others:fail) fails (bad\\x1b[31m); repair or uninstall its package" in err
+    assert (
+        "command oddly (of_others:fail) fails (bad\\x1b[31m); repair or uninstall its package"
+        in err
+    )
     assert harness("leave") == (4, "", "")
 
 

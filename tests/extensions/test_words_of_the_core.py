@@ -39,7 +39,8 @@ ORDINARY = {
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",
 }
-# Messages, help and starter files that lead on to a command, which says whose it is where it is gone.
+# Messages, help and starter files that lead on to a command, which says whose it is where it is
+# gone.
 LEADS_ON = {
     ("backends/llama_cpp/backend.py", "model check"),
     ("cli/dataset.py", "study fidelity"),
@@ -85,7 +86,9 @@ def words_of_the_core() -> set[str]:
     """Return the words of its commands, and of its kinds of plug-ins that extensions add to."""
     commands = {word for path in (*COMMANDS, *GROUPS, *OLD) for word in path.split()}
     rooms = {path.name for path in HARNESS.iterdir()}
-    kinds = {kind.removesuffix("s") for extension in extensions().values() for kind in extension.adds}
+    kinds = {
+        kind.removesuffix("s") for extension in extensions().values() for kind in extension.adds
+    }
     return commands | rooms | kinds
 
 
@@ -101,7 +104,9 @@ def texts() -> Iterator[tuple[str, str]]:
 def found() -> Iterator[tuple[str, str]]:
     """Yield each file of the core with a name in it that is an extension's."""
     ours = set().union(*map(names, extensions().values())) - words_of_the_core()
-    spoken = sorted({phrase for extension in extensions().values() for phrase in phrases(extension)})
+    spoken = sorted(
+        {phrase for extension in extensions().values() for phrase in phrases(extension)}
+    )
     said = re.compile(rf"\b({'|'.join(map(re.escape, spoken))})\b")
     for path, text in texts():
         for name in {*WORD.findall(text)} & ours:

@@ -1,7 +1,9 @@
-"""All that the golden runs know of the program: how a command is typed, and how a run's folder is read.
+"""All that the golden runs know of the program:
+how a command is typed, and how a run's folder is read.
 
-What comes out has a form of its own, so that the goldens outlive every module's name and the folder's format:
-only this file is mended when those change. A table is a list of rows, a row a mapping of columns to text.
+What comes out has a form of its own, so that the goldens outlive every module's name and the
+folder's format: only this file is mended when those change. A table is a list of rows, a row a
+mapping of columns to text.
 """
 
 import json
@@ -25,7 +27,8 @@ from harness.report.drawing import pictures
 Row = dict[str, str]
 Table = list[Row]
 
-# How a run came by its answers is not what it says: seconds are the machine's, batches the engine's.
+# How a run came by its answers is not what it says: seconds are the machine's, batches the
+# engine's.
 NOT_HELD = ("seconds", "first_token_s", "token_s", "batch_size")
 SETTINGS = (
     "actions", "conditions", "seeds", "answer", "thinking", "latency", "delay_allowance_s", "late_against",
@@ -34,11 +37,14 @@ SETTINGS = (
 
 
 def typed(*arguments: str | Path) -> str:
-    """What the command prints, typed in the current folder. Raises AssertionError unless it ends well."""
+    """What the command prints, typed in the current folder.
+    Raises AssertionError unless it ends well.
+    """
     command = ["harness", *map(str, arguments)]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as printed:
         patch.setattr(sys, "argv", command)
-        patch.setattr(pictures, "FORMATS", ("svg",))  # pictures take longer than all else, and none is golden
+        # pictures take longer than all else, and none is golden
+        patch.setattr(pictures, "FORMATS", ("svg",))
         with pytest.raises(SystemExit) as ended:
             main()
     assert not ended.value.code, f"`{' '.join(command)}` ended with {ended.value.code}"
@@ -46,13 +52,15 @@ def typed(*arguments: str | Path) -> str:
 
 
 def tables_of(run: Path) -> dict[str, Table]:
-    """What a finished run holds beside its `summary.csv` and `episodes.csv`, each table in the order of keys.
+    """What a finished run holds beside its `summary.csv` and `episodes.csv`,
+    each table in the order of keys.
 
     Returns:
         `settings`: name, value, of the manifest's that decide or count something.
-        `scenes`: a decision point, under a name of our own (`_numbered`); of a frozen run also what each
-            action would lead to.
-        `answers`: an answer, with what was read in it; its `id` is viewer, or ego and who was heard.
+        `scenes`: a decision point, under a name of our own (`_numbered`);
+            of a frozen run also what each action would lead to.
+        `answers`: an answer, with what was read in it;
+            its `id` is viewer, or ego and who was heard.
         `decisions`: a decision point, condition and seed.
         `messages`: the same and a helper that was asked.
     """
@@ -65,7 +73,11 @@ def tables_of(run: Path) -> dict[str, Table]:
         condition["consensus"] == "ego-prompt" for condition in manifest["conditions"]
     )  # fmt: skip
     # A condition leaves out the settings of an extension that do nothing.
-    idle = {key: value for kind in more_parts().values() for key, value in structs.asdict(kind()).items()}
+    idle = {
+        key: value
+        for kind in more_parts().values()
+        for key, value in structs.asdict(kind()).items()
+    }
     told = {
         **world, **manifest, "conditions": [{**idle, **condition} for condition in manifest["conditions"]],
         "latency": {
@@ -77,7 +89,8 @@ def tables_of(run: Path) -> dict[str, Table]:
     held = {name: told[name] for name in SETTINGS if name in told}
     return {
         "settings": sorted(
-            ({"name": name, "value": text(value)} for name, value in _flat(held, "")), key=itemgetter("name")
+            ({"name": name, "value": text(value)} for name, value in _flat(held, "")),
+            key=itemgetter("name"),
         ),
         "scenes": [_cells(_scene(scene, actions)) for scene in scenes],
         "answers": [_cells(row) for scene in scenes for row in _answers(scene, actions)],
@@ -103,7 +116,10 @@ def _scenes_of(run: Path, actions: list[str]) -> Iterator[dict[str, Any]]:
     for name, rows in of_scenes.items():
         first = rows[0]
         outcomes = (
-            {what: [first[f"{what}_{action}"] for action in actions] for what in ("safe", "delay_s")}
+            {
+                what: [first[f"{what}_{action}"] for action in actions]
+                for what in ("safe", "delay_s")
+            }
             if first["acted"] is None
             else {}
         )
@@ -133,7 +149,9 @@ def _made_of(row: dict[str, Any], actions: list[str]) -> dict[str, Any]:
 
 
 def place(row: Row) -> tuple[Any, ...]:
-    """Where a line of `episodes.csv` or `summary.csv` stands, whatever order the program writes them in."""
+    """Where a line of `episodes.csv` or `summary.csv` stands,
+    whatever order the program writes them in.
+    """
     numbers = (int(row.get(name) or 0) for name in ("seed", "episode"))
     return row["condition"], row.get("metric", ""), row.get("interval", ""), *numbers
 
@@ -142,18 +160,24 @@ def text(value: Any) -> str:
     """A cell: nothing where nothing is known, JSON for what has parts."""
     if value is None:
         return ""
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+    return (
+        value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)
+    )
 
 
 def _numbered(scenes: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Decision points in order, each named by episode, step and a number.
 
-    The number tells apart the worlds into which an episode's conditions and seeds have parted, in the order
-    of the first condition and seed in each, whatever the program calls them.
+    The number tells apart the worlds into which an episode's conditions and seeds have parted, in
+    the order of the first condition and seed in each, whatever the program calls them.
     """
 
     def place(scene: Mapping[str, Any]) -> tuple[Any, ...]:
-        return scene["episode"], scene["step"], min((m["condition"], m["seed"]) for m in scene["decisions"])
+        return (
+            scene["episode"],
+            scene["step"],
+            min((m["condition"], m["seed"]) for m in scene["decisions"]),
+        )
 
     counts: Counter[tuple[int, int]] = Counter()
     named = []
@@ -198,7 +222,11 @@ def _scene(scene: Mapping[str, Any], actions: list[str]) -> dict[str, Any]:
 def _answers(scene: Mapping[str, Any], actions: list[str]) -> Iterator[dict[str, Any]]:
     said = {**scene["answers"], **scene.get("merged", {})}
     for who, answer in sorted(said.items()):
-        held = {name: value for name, value in sorted(answer.items()) if name not in (*NOT_HELD, "intent")}
+        held = {
+            name: value
+            for name, value in sorted(answer.items())
+            if name not in (*NOT_HELD, "intent")
+        }
         intent = _by_action("intent", answer["intent"], actions)
         yield {"scene": scene["scene"], "id": who, **intent, **held}
 
@@ -213,7 +241,9 @@ def _key(scene: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     return {"scene": scene["scene"], "condition": made["condition"], "seed": made["seed"]}
 
 
-def _decision(scene: Mapping[str, Any], made: Mapping[str, Any], actions: list[str]) -> dict[str, Any]:
+def _decision(
+    scene: Mapping[str, Any], made: Mapping[str, Any], actions: list[str]
+) -> dict[str, Any]:
     key = _key(scene, made)
     rest = {n: v for n, v in sorted(made.items()) if n not in (*key, "messages", "fused")}
     return {**key, **rest, **_by_action("fused", made["fused"], actions)}

@@ -11,7 +11,18 @@ from adapter import Row, Table
 UPDATE = os.environ.get("UPDATE_GOLDEN") == "1"
 # NumPy on another machine may differ in a number's last bits.
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
-TEXT = ("model", "prompt", "answer", "condition", "source", "scene", "id", "raw", "from", "prompt_sha256")
+TEXT = (
+    "model",
+    "prompt",
+    "answer",
+    "condition",
+    "source",
+    "scene",
+    "id",
+    "raw",
+    "from",
+    "prompt_sha256",
+)
 PLACE = (
     "source", "panel", "variable", "value", "scene", "episode", "condition", "seed", "id", "from", "metric",
     "interval", "name",
@@ -44,7 +55,8 @@ def columns(table: Table) -> list[str]:
 
 
 def difference(golden: Table, table: Table, more: bool = False) -> str | None:
-    """The first difference, by row and column; None if there is none. The columns' order does not count.
+    """The first difference, by row and column; None if there is none.
+    The columns' order does not count.
 
     With `more`, neither do columns that are new.
     """
@@ -55,7 +67,10 @@ def difference(golden: Table, table: Table, more: bool = False) -> str | None:
     for n, (a, b) in enumerate(zip_longest(golden, table), 1):
         if a is None or b is None:
             kind = "a row more" if a is None else "a row less"
-            return f"row {n} ({_place(a or b or {})}): {kind}; {len(golden)} rows before, {len(table)} now"
+            return (
+                f"row {n} ({_place(a or b or {})}): {kind}; {len(golden)} rows before, "
+                f"{len(table)} now"
+            )
         for name in old:
             if not same(name, a.get(name, ""), b.get(name, "")):
                 return f"row {n} ({_place(a)}), column {name}: {a[name]!r} before, {b[name]!r} now"
@@ -63,7 +78,9 @@ def difference(golden: Table, table: Table, more: bool = False) -> str | None:
 
 
 def same(column: str, a: str, b: str) -> bool:
-    """Whether two cells say the same: by text, and by value where both are numbers and the column no name."""
+    """Whether two cells say the same: by text,
+    and by value where both are numbers and the column no name.
+    """
     if a == b:
         return True
     if column in TEXT:
@@ -76,7 +93,9 @@ def same(column: str, a: str, b: str) -> bool:
 
 
 def held(file: Path, table: Table, more: bool = False) -> None:
-    """Hold a table against its golden file, or make that of it. Raises AssertionError where they differ."""
+    """Hold a table against its golden file, or make that of it.
+    Raises AssertionError where they differ.
+    """
     if UPDATE:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(write(table), encoding="utf-8", newline="")

@@ -1,7 +1,7 @@
 """Stored completions, played by a server that speaks OpenAI's chat completions.
 
-The wire is public, so what is stored depends on no module of the program and on no engine's numerics. A
-completion is found by the SHA-256 of its messages, as JSON with sorted keys.
+The wire is public, so what is stored depends on no module of the program and on no engine's
+numerics. A completion is found by the SHA-256 of its messages, as JSON with sorted keys.
 """
 
 import hashlib
@@ -42,7 +42,9 @@ def sha256_of(messages: Any) -> str:
 
 
 def store(file: Path, answers: Iterable[Row]) -> None:
-    """Keep what a model said, from tables of answers: a line a prompt, in the order of their digests."""
+    """Keep what a model said, from tables of answers:
+    a line a prompt, in the order of their digests.
+    """
     found = {row["prompt_sha256"]: {name: row[name] for name in NEEDED} for row in answers}
     lines = [json.dumps(found[key], ensure_ascii=False) + "\n" for key in sorted(found)]
     file.write_text("".join(lines), encoding="utf-8", newline="")
@@ -70,7 +72,9 @@ def project(file: Path, folder: Path) -> Iterator[list[str]]:
     with serving(play) as server:
         (folder / "models").mkdir(parents=True)
         (folder / "swarmdrive.toml").touch()
-        (folder / "models" / f"{MODEL}.toml").write_text(CARD.format(url=server.url), encoding="utf-8")
+        (folder / "models" / f"{MODEL}.toml").write_text(
+            CARD.format(url=server.url), encoding="utf-8"
+        )
         yield missing
 
 

@@ -32,7 +32,9 @@ def test_any_changed_cell_of_any_golden_is_found(file: Path) -> None:
         assert found is not None
         assert found.startswith(f"row {n + 1} ")
         assert f", column {column}: {golden[n][column]!r} before, {other!r} now" in found
-        assert comparing.difference(golden, [{k: v for k, v in row.items() if k != column} for row in golden])
+        assert comparing.difference(
+            golden, [{k: v for k, v in row.items() if k != column} for row in golden]
+        )
     if golden:
         assert comparing.difference(golden, golden[:-1])
         assert comparing.difference(golden, [*golden, golden[-1]])
@@ -74,5 +76,7 @@ def test_a_golden_is_held_and_a_failure_names_its_file(
     comparing.held(file, TABLE)
     monkeypatch.setattr(comparing, "UPDATE", False)
     comparing.held(file, TABLE)
-    with pytest.raises(AssertionError, match=r"run/summary.csv, row 1 .*column n: '3' before, '9' now"):
+    with pytest.raises(
+        AssertionError, match=r"run/summary.csv, row 1 .*column n: '3' before, '9' now"
+    ):
         comparing.held(file, changed(0, n="9"))

@@ -1,7 +1,8 @@
-"""What whole runs say is what they said: golden tables of frozen and closed-loop runs, sweeps and the study.
+"""What whole runs say is what they said:
+golden tables of frozen and closed-loop runs, sweeps and the study.
 
-`UPDATE_GOLDEN=1` writes the tables anew. `UPDATE_GOLDEN=completions` asks swarm-tiny for its completions
-anew, which needs an engine; write the tables anew after that.
+`UPDATE_GOLDEN=1` writes the tables anew. `UPDATE_GOLDEN=completions` asks swarm-tiny for its
+completions anew, which needs an engine; write the tables anew after that.
 """
 
 import json
@@ -117,7 +118,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
             quiet = [] if command[1] == "fidelity" else ["--quiet"]  # which has no such option
             printed = adapter.typed(*command, *quiet, "--out", folder / name)
             assert not (quiet and printed)
-            assert not missing, f"{name} asks what no completion is stored for, first:\n{missing[0]}"
+            assert not missing, (
+                f"{name} asks what no completion is stored for, first:\n{missing[0]}"
+            )
         return folder / name
 
     with pytest.MonkeyPatch.context() as patch, playing.project(COMPLETIONS, folder) as missing:
@@ -127,7 +130,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
         yield run
 
 
-@pytest.mark.skipif(os.environ.get("UPDATE_GOLDEN") != "completions", reason="asks the model itself")
+@pytest.mark.skipif(
+    os.environ.get("UPDATE_GOLDEN") != "completions", reason="asks the model itself"
+)
 def test_record_completions(tmp_path: Path) -> None:
     """No test, but the way to `completions.jsonl`."""
     said = []

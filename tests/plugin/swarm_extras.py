@@ -54,7 +54,8 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Fog:
-    """Replies are lost with distance and never wait for each other. An assumption; nothing was measured.
+    """Replies are lost with distance and never wait for each other. An assumption;
+    nothing was measured.
 
     Attributes:
         latency_s: seconds of one exchange, the request included.
@@ -94,7 +95,9 @@ class Cautious:
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Any number of requests at a time, so no answer has seconds of its own."""
-        return [Completion(r.id, answer(r), None, None, "stop", None, len(requests)) for r in requests]
+        return [
+            Completion(r.id, answer(r), None, None, "stop", None, len(requests)) for r in requests
+        ]
 
     def identity(self) -> dict[str, Any]:
         """There is nothing else to it: no weights and no settings."""
@@ -138,7 +141,9 @@ FOG = Fog()
 MUMBLE = Mumble()
 NEAR = Formula(near, 0.5)
 SURE = Metric(
-    "sure_rate", "share of decisions whose own intent is nearly certain", PERCENT, "neither", "rate", 1.0,
+    "sure_rate", 
+        "share of decisions whose own "
+        "intent is nearly certain", PERCENT, "neither", "rate", 1.0,
     decisions=lambda d: (d["normalised_entropy"] < 0.5).astype(float),
 )  # fmt: skip
 CAUTIOUS = Registration(

@@ -1,4 +1,6 @@
-"""A small run folder from a real dataset: a rule answers in the models' place, the rest is the harness."""
+"""A small run folder from a real dataset:
+a rule answers in the models' place, the rest is the harness.
+"""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -22,7 +24,9 @@ from harness.runs.summary import Figures, counted
 SEEDS = (0, 1, 2)
 
 
-def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer, points=None, **stated):
+def write_run(
+    out, dataset, model="rule-of-thumb", change=lambda answer: answer, points=None, **stated
+):
     """Write a run. `change` may replace any answer; `stated` are further fields of run.json."""
     spec = spec_of(dataset, seeds=SEEDS, latency="paper", **({"points": points} if points else {}))
     asked = list(requests(spec, all_scenes(dataset)))
@@ -45,7 +49,9 @@ def write_run(out, dataset, model="rule-of-thumb", change=lambda answer: answer,
     }  # fmt: skip
     writer.write(
         out,
-        msgspec.convert(formats.upgraded(msgspec.to_builtins(restated(manifest, stated))), Manifest),
+        msgspec.convert(
+            formats.upgraded(msgspec.to_builtins(restated(manifest, stated))), Manifest
+        ),
         decisions,
         episodes,
         [writer.lines(writer.ordered(answers, decisions))],
@@ -63,7 +69,9 @@ def _completion(request):
     graph = request.view
     close = [c for c in graph.conflicts if abs((c.ego.time_s or 99) - (c.other.time_s or 99)) < 1.5]
     blind = any(s.occluded for s in graph.sectors)
-    p: Sequence[float] = (0.9, 0.08, 0.02) if close else (0.3, 0.4, 0.3) if blind else (0.05, 0.8, 0.15)
+    p: Sequence[float] = (
+        (0.9, 0.08, 0.02) if close else (0.3, 0.4, 0.3) if blind else (0.05, 0.8, 0.15)
+    )
     text = says(p, request.role, request.actions)
     place = graph.step, graph.viewer
     if place == (2, "v3"):

@@ -53,7 +53,9 @@ def test_each_viewer_has_its_picture_and_boxes_around_what_its_sensors_list(run,
 def seeing(run, tmp_path):
     """The run, as if the ego had been shown its picture."""
     copy = shutil.copytree(run, tmp_path / "run")
-    change(copy, answer=lambda a: a.update({"image_sha256": "0" * 64} if a["role"] == "ego" else {}))
+    change(
+        copy, answer=lambda a: a.update({"image_sha256": "0" * 64} if a["role"] == "ego" else {})
+    )
     return copy
 
 
@@ -83,7 +85,10 @@ def test_an_answer_says_which_picture_its_prompt_had(seeing, mode, monkeypatch):
     configure(seeing, image=mode)
     for detail in details(render(gather([seeing]))).values():
         [of] = detail["runs"]
-        assert {(a["role"], a.get("picture")) for a in of["answers"]} == {("ego", mode), ("helper", None)}
+        assert {(a["role"], a.get("picture")) for a in of["answers"]} == {
+            ("ego", mode),
+            ("helper", None),
+        }
 
 
 def test_pictures_of_a_report_of_the_default_dataset_take_less_than_one_and_a_half_megabytes():

@@ -20,7 +20,9 @@ def point(actions=("IDLE", "IDLE"), safe=(True, True), verdict="strict"):
 
 def run_of(out, episodes):
     """A driven run of episodes, each a list of decision points, all as long."""
-    points = {f"{e:05d}-{step}": p for e, course in enumerate(episodes) for step, p in enumerate(course)}
+    points = {
+        f"{e:05d}-{step}": p for e, course in enumerate(episodes) for step, p in enumerate(course)
+    }
     conditions = ("single-local", "6g")
 
     def decision(row):
@@ -42,7 +44,10 @@ def run_of(out, episodes):
 
 def pick(run, n):
     """Episode and step of what is chosen."""
-    return [tuple(map(int, scene.split("-"))) for scene in decisions.pick(run, decisions.failures(run), n)]
+    return [
+        tuple(map(int, scene.split("-")))
+        for scene in decisions.pick(run, decisions.failures(run), n)
+    ]
 
 
 def test_telling_decisions_are_chosen_and_an_even_sample_fills_up(tmp_path):
@@ -69,7 +74,8 @@ def test_a_run_full_of_failures_still_shows_ordinary_decisions(tmp_path):
     failures = decisions.failures(run)
     assert len(failures) == 51
     chosen = decisions.pick(run, failures, 40)
-    # A quarter are chosen as failures, and 30 are spread over the other 90, of which 49 are ordinary.
+    # A quarter are chosen as failures, and 30 are spread over the other 90, of which 49 are
+    # ordinary.
     assert set(decisions.spread(list(failures), 10)) <= set(chosen)
     assert len([scene for scene in chosen if scene not in failures]) == 16
 
@@ -81,7 +87,9 @@ def test_a_decision_lost_an_episode_where_any_condition_with_any_seed_gave_succe
 
     points = [POINTS[name] for name in ("single-local", "6g")]
     run = read(
-        made_up(tmp_path / "run", decision, points=points, seeds=(0, 1), episodes=3, steps=2, helpers=0)
+        made_up(
+            tmp_path / "run", decision, points=points, seeds=(0, 1), episodes=3, steps=2, helpers=0
+        )
     )
     assert decisions.lost(run) == ["00001-1"]
 
@@ -93,7 +101,9 @@ POINTS_AS_DRAWN = st.builds(
     st.sampled_from(["strict", "recovered", "failed"]),
 )
 EPISODES = st.integers(1, 8).flatmap(
-    lambda steps: st.lists(st.lists(POINTS_AS_DRAWN, min_size=steps, max_size=steps), min_size=1, max_size=5)
+    lambda steps: st.lists(
+        st.lists(POINTS_AS_DRAWN, min_size=steps, max_size=steps), min_size=1, max_size=5
+    )
 )
 
 

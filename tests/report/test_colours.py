@@ -1,4 +1,6 @@
-"""The palette: a colour has one meaning, and is seen on white and on dark paper, by the colour-blind too."""
+"""The palette: a colour has one meaning, and is seen on white and on dark paper,
+by the colour-blind too.
+"""
 
 import csv
 import re
@@ -54,7 +56,9 @@ def test_no_colour_has_two_meanings():
 def test_no_colour_stands_outside_the_palette():
     """Pages, charts, figures and pictures name their colours."""
     room = Path(colours.__file__).parents[1]
-    places = [p for name in ("report", "studies") for p in (room.parent / name).rglob("*") if p.is_file()]
+    places = [
+        p for name in ("report", "studies") for p in (room.parent / name).rglob("*") if p.is_file()
+    ]
     written = {
         str(p) for p in places
         if p.suffix in (".py", ".css", ".j2", ".js") and re.search(r"#[0-9A-Fa-f]{3,6}\b", p.read_text())
@@ -94,7 +98,11 @@ def test_the_papers_conditions_keep_their_colours_and_no_two_share_one(names):
 
 def test_the_papers_points_are_those_of_its_numbers():
     rows = csv.DictReader((files("harness.studies") / "paper_numbers.csv").read_text().splitlines())
-    core = {(row["condition"], row["metric"]): row["paper_value"] for row in rows if row["panel"] == "core"}
+    core = {
+        (row["condition"], row["metric"]): row["paper_value"]
+        for row in rows
+        if row["panel"] == "core"
+    }
     names = {"single-local": "single_local", "v2x": "swarm_v2x", "6g": "swarm_6g"}
     for name, (latency_ms, success) in PAPER.items():
         assert float(core[names[name], "latency"]) == latency_ms

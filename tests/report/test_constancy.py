@@ -19,7 +19,9 @@ from harness.runs.records import Answer
 
 
 def said(dataset: Dataset, out: Path, model: str, engine: str | None = None) -> list[str]:
-    """What is said of a run whose answers are those of a rule, with another engine in its record."""
+    """What is said of a run whose answers are those of a rule,
+    with another engine in its record.
+    """
     evaluate(spec_of(dataset, model=model, seeds=(0,)), out)
     if engine:
         record = json.loads((out / "run.json").read_text())
@@ -35,8 +37,10 @@ def test_a_model_that_always_answers_the_same_drives_as_a_driver(
     [sentence] = said(small, tmp_path / "run", driver, "llama-cpp")
     n = sum(answer.role == "ego" for answer in folder.read(tmp_path / "run").answers)
     assert sentence == (
-        f"The model ignores its input: {action} is the likeliest action in {n} of the ego's {n} readable "
-        "answers, and its probability moves by 0.000 (standard deviation) between them. Without messages it "
+        f"The model ignores its input: {action} is the likeliest action in {n} of the ego's {n} "
+        "readable "
+        "answers, and its probability moves by 0.000 (standard deviation) between them. Without "
+        "messages it "
         f"drives as the driver `{driver}`, which needs no model."
     )
 
@@ -46,16 +50,22 @@ def test_nothing_is_said_of_who_looks_or_of_a_driver(small: Dataset, tmp_path: P
     assert said(small, tmp_path / "brake", "brake") == []
 
 
-def test_who_holds_every_action_for_equally_likely_drives_as_uniform(small: Dataset, tmp_path: Path) -> None:
+def test_who_holds_every_action_for_equally_likely_drives_as_uniform(
+    small: Dataset, tmp_path: Path
+) -> None:
     [sentence] = said(small, tmp_path / "run", "uniform", "llama-cpp")
     assert "SLOWER, IDLE, FASTER are equally likely in" in sentence
-    assert sentence.endswith("Without messages it drives as the driver `uniform`, which needs no model.")
+    assert sentence.endswith(
+        "Without messages it drives as the driver `uniform`, which needs no model."
+    )
     configure(tmp_path / "run", ties="first")
     [sentence] = ignores_input(folder.read(tmp_path / "run"))
     assert sentence.endswith("drives as the driver `brake`, which needs no model.")
 
 
-def test_of_who_looks_a_line_and_a_figure_say_how_much_it_moves(small: Dataset, tmp_path: Path) -> None:
+def test_of_who_looks_a_line_and_a_figure_say_how_much_it_moves(
+    small: Dataset, tmp_path: Path
+) -> None:
     assert said(small, tmp_path / "run", "proxy", "llama-cpp") == []
     run = folder.read(tmp_path / "run")
     p = np.array([answer.intent for answer in run.answers if answer.role == "ego"])

@@ -55,7 +55,9 @@ def test_what_the_viewer_does_not_see_is_labelled_hidden(dataset):
         seen = {node.id for node in scene.graphs[viewer].nodes} | {viewer}
         unseen = [v for v in scene.state.vehicles if v.id not in seen]
         assert unseen
-        assert sum(text.endswith("hidden") for text in texts(picture(scene, viewer=viewer))) == len(unseen)
+        assert sum(text.endswith("hidden") for text in texts(picture(scene, viewer=viewer))) == len(
+            unseen
+        )
 
 
 def test_conflict_points_say_when_the_ego_and_the_other_are_there(dataset):
@@ -81,7 +83,8 @@ def test_the_ego_from_the_south_is_in_the_lower_half_because_north_is_up(dataset
 
 def test_who_is_no_viewer_and_what_is_no_format_is_refused_with_what_is_allowed(dataset):
     with pytest.raises(
-        UserError, match=r"unknown viewer of scene 00000-0-[0-9a-f]{12} 'v9'.* known: v1, v2, v3, v4"
+        UserError,
+        match=r"unknown viewer of scene 00000-0-[0-9a-f]{12} 'v9'.* known: v1, v2, v3, v4",
     ):
         picture(scenes_of(dataset)[0], viewer="v9")
     with pytest.raises(UserError, match=r"unknown picture format 'bmp'.* known: pdf, png, svg"):

@@ -57,7 +57,9 @@ def test_a_run_of_easier_episodes_alone_is_not_the_best():
 
 
 def test_where_each_run_is_behind_another_none_is_the_best():
-    """The first beats the second on 40 episodes; the third, of 4, beats the first and loses to the second."""
+    """The first beats the second on 40 episodes;
+    the third, of 4, beats the first and loses to the second.
+    """
     first = [0.0, 0.0, 1.0, 0.0] + [1.0] * 36
     second = [1.0, 1.0, 1.0, 1.0] + [0.0] * 36
     third = [1.0, 1.0, 1.0, 0.0]
@@ -71,10 +73,11 @@ def test_runs_without_episodes_in_common_are_not_marked():
 
 
 def test_holm_counts_every_pair_under_every_condition():
-    """Seven of 18 successes lost in 20 episodes, none gained: real alone and among 6 pairs, not among 12.
+    """Seven of 18 successes lost in 20 episodes, none gained:
+    real alone and among 6 pairs, not among 12.
 
-    Of 4 runs under 2 conditions there are 12 pairs: the first counts 12 times, and so do the next, equal ones
-    at least.
+    Of 4 runs under 2 conditions there are 12 pairs:
+    the first counts 12 times, and so do the next, equal ones at least.
     """
     best, worse = ({(e, 0): float(first <= e < 18) for e in range(20)} for first in (0, 7))
     [[_, (mark, alone)]] = matrix.marked([[best, worse]])
@@ -91,7 +94,9 @@ def test_holm_counts_every_pair_under_every_condition():
 @pytest.fixture(scope="session")
 def both(run, dataset, tmp_path_factory):
     prompt = {"version": "v1", "sha256": "00" * 32}
-    other = write_run(tmp_path_factory.mktemp("matrix") / "other", dataset, model="other", prompt=prompt)
+    other = write_run(
+        tmp_path_factory.mktemp("matrix") / "other", dataset, model="other", prompt=prompt
+    )
     return gather([run, other])
 
 
@@ -109,13 +114,19 @@ def test_a_run_has_a_line_under_each_condition_and_a_place_in_each_grid(both):
 
 def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     lines = matrix.lines(both)
-    assert matrix.headline(lines).startswith("Best under single-local: none clearly (0.0 % at the most; ")
+    assert matrix.headline(lines).startswith(
+        "Best under single-local: none clearly (0.0 % at the most; "
+    )
     best = [line for line in lines if line.mark == matrix.BEST]
     apart = "the most of 2 runs that cannot be told apart"
     assert [(f["what"], f["value"]) for f in matrix.figures(lines)] == [
-        (f"success with {line.condition}, {apart}", shown(line.scores[SUCCESS])["value"]) for line in best
+        (f"success with {line.condition}, {apart}", shown(line.scores[SUCCESS])["value"])
+        for line in best
     ]
-    clear = [replace(line, mark=matrix.WORSE if line.mark == matrix.CLOSE else line.mark) for line in lines]
+    clear = [
+        replace(line, mark=matrix.WORSE if line.mark == matrix.CLOSE else line.mark)
+        for line in lines
+    ]
     assert f"single-local: {best[0].name} " in matrix.headline(clear)
     assert [f["what"] for f in matrix.figures(clear)] == [
         f"success with {line.condition}, best: {line.name}" for line in best
@@ -130,7 +141,9 @@ def test_the_headline_names_the_best_or_says_that_there_is_none(both):
 def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path, monkeypatch):
     points, seeds = tuple(POINTS.values()), (0, 1, 2)
     paths = [
-        evaluate(spec_of(load(small_path, limit), points=points, seeds=seeds), tmp_path / f"{limit}").out
+        evaluate(
+            spec_of(load(small_path, limit), points=points, seeds=seeds), tmp_path / f"{limit}"
+        ).out
         for limit in (4, 2)
     ]
     runs = gather(paths)
@@ -186,7 +199,9 @@ def test_every_decision_and_reply_is_counted_once(run, dataset):
     arrived = sum(row[f"delivered_{place}"] is True for row in rows for place in (1, 2, 3))
     assert sum(row["count"] for row in panels.arrivals(found)) == arrived > 0
     answers = answers_of(run)
-    assert len(answers) == sum(len(scene.viewers) for scene in dataset.scenes(list(found.decisions.scenes)))
+    assert len(answers) == sum(
+        len(scene.viewers) for scene in dataset.scenes(list(found.decisions.scenes))
+    )
     assert sum(row["count"] for row in panels.statuses(found)) == len(answers)
     read_out = [a for a in answers if a.role == "ego" and a.intent]
     assert sum(row["count"] for row in panels.entropies(found)) == len(read_out)
@@ -200,6 +215,14 @@ def test_a_value_on_an_edge_belongs_to_the_bar_above_it():
 
 
 def test_what_is_no_verdict_is_drawn_as_no_answer():
-    row = {"run": "r", "role": "ego", "status": "<b>", "verdict": "<i>", "count": 1, "share": 1.0, "n": 1}
+    row = {
+        "run": "r",
+        "role": "ego",
+        "status": "<b>",
+        "verdict": "<i>",
+        "count": 1,
+        "share": 1.0,
+        "n": 1,
+    }
     spec = statuses([row])
     assert spec["encoding"]["color"]["scale"]["domain"] == ["<b>"]

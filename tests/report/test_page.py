@@ -55,7 +55,10 @@ def written(*folders, prompts=prompts_of):
 
 
 def greeting(viewer):
-    return [{"role": "system", "content": "Be careful."}, {"role": "user", "content": f"I am {viewer}."}]
+    return [
+        {"role": "system", "content": "Be careful."},
+        {"role": "user", "content": f"I am {viewer}."},
+    ]
 
 
 @pytest.fixture(scope="session")
@@ -103,7 +106,9 @@ def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, 
     for scene, (rows, answers) in every.items():
         detail = opened[scene]
         [found] = detail["runs"]
-        assert {a["viewer"]: a["raw"] for a in found["answers"]} == {v: a.raw for v, a in answers.items()}
+        assert {a["viewer"]: a["raw"] for a in found["answers"]} == {
+            v: a.raw for v, a in answers.items()
+        }
         again = {
             (d["condition"], seed): (d["action"], d["fused"], d["messages"])
             for d in found["decisions"] for seed in d["seeds"]
@@ -117,7 +122,10 @@ def test_every_decision_can_be_opened_with_all_that_is_known_of_it(run, opened, 
             for row in rows
         }
         assert [(o["safe"], o["delay_s"]) for o in detail["outcomes"]] == [
-            (rows[0][f"safe_{action}"], (delay_s := rows[0][f"delay_s_{action}"]) and round(delay_s, 3))
+            (
+                rows[0][f"safe_{action}"],
+                (delay_s := rows[0][f"delay_s_{action}"]) and round(delay_s, 3),
+            )
             for action in dataset.actions
         ]
         assert set(detail["world"]["viewers"]) == set(answers)
@@ -148,12 +156,17 @@ def test_the_list_says_of_each_decision_what_was_done_and_what_came_of_it(run, t
 
 def test_what_was_read_in_a_recovered_answer_is_marked(opened):
     fenced = [
-        a for d in opened.values() for a in d["runs"][0]["answers"] if a.get("repairs") == ["code_fence"]
+        a
+        for d in opened.values()
+        for a in d["runs"][0]["answers"]
+        if a.get("repairs") == ["code_fence"]
     ]
     assert fenced
     for answer in fenced:
         [(start, end)] = answer["spans"]
-        assert answer["raw"][start:end] == answer["raw"].removeprefix("```json\n").removesuffix("\n```")
+        assert answer["raw"][start:end] == answer["raw"].removeprefix("```json\n").removesuffix(
+            "\n```"
+        )
 
 
 def prompts_in(opened):
@@ -176,7 +189,9 @@ def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, 
     def as_read_out(answer):
         [scene] = dataset.scenes([answer.scene])
         shown = V2.render(scene.graphs[answer.viewer], dataset.actions)
-        return structs.replace(answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said)
+        return structs.replace(
+            answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said
+        )
 
     run = write_run(tmp_path / "run", dataset, change=as_read_out)
     assert "prompt v2, answers json" in Page(written(run)).text
@@ -196,14 +211,19 @@ def test_the_summary_has_every_condition_and_metric_with_interval_and_n(run, pag
     for name in ("single-local", "v2x", "6g"):
         score = read(run).score(name, "success_rate")
         assert score.interval == "episodes"
-        assert f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %" in page.text
+        assert (
+            f"{100 * score.value:.1f} % {100 * score.low:.1f} to {100 * score.high:.1f} %"
+            in page.text
+        )
     assert "2 episodes × 3 channel seeds of two; 95 % intervals over episodes" in page.text
     for metric in ("latency proxy", "trigger rate", "entropy"):
         assert metric in page.text
 
 
 def test_the_page_says_how_honest_the_probabilities_are(run, page):
-    """A line a condition, above the picture; figures that others have replaced stay off the page."""
+    """A line a condition, above the picture;
+    figures that others have replaced stay off the page.
+    """
     loaded = read(run)
     rows = loaded.decisions
     optimal = (rows.of_actions("safe") == 1.0).sum(axis=1)
@@ -216,12 +236,15 @@ def test_the_page_says_how_honest_the_probabilities_are(run, page):
         for metric in contents.HONEST:
             cell = shown(loaded.score(condition, metric))
             assert f"{cell['value']} {cell['interval']}" in line
-        assert f" – {(one_optimal & here).sum()} – – " in line  # no flip was asked for, and they are too few
+        # no flip was asked for, and they are too few
+        assert f" – {(one_optimal & here).sum()} – – " in line
     assert "fewer than 100 such decisions" in page.text
     assert "negative log likelihood" not in page.text
 
 
-def test_the_page_names_model_prompt_dataset_versions_and_where_latency_comes_from(run, page, dataset):
+def test_the_page_names_model_prompt_dataset_versions_and_where_latency_comes_from(
+    run, page, dataset
+):
     config = json.loads((run / "run.json").read_text())
     for fact in (
         config["model"]["name"],
@@ -250,10 +273,13 @@ def test_the_page_asks_for_nothing_and_runs_two_scripts_that_it_names(text, page
 
 def test_a_page_is_written_where_python_writes_no_package_metadata_as_text(monkeypatch):
     def refuse(self, *args, **options):
-        raise email.errors.HeaderWriteError("folded header contains newline")  # Python 3.12.5 and later
+        # Python 3.12.5 and later
+        raise email.errors.HeaderWriteError("folded header contains newline")
 
     monkeypatch.setattr(email.message.Message, "as_string", refuse)
-    assert re.search(r"Vega 5[\d.]+, Vega Lite 5[\d.]+, Vega Embed 6[\d.]+, which lie", library.licence())
+    assert re.search(
+        r"Vega 5[\d.]+, Vega Lite 5[\d.]+, Vega Embed 6[\d.]+, which lie", library.licence()
+    )
 
 
 @pytest.mark.slow
@@ -331,7 +357,9 @@ def scored(run, tmp_path, *scores, ended=None):
     if ended:
         [*some] = {(e.condition, e.seed): e for e in read(run).episodes}.values()
         episodes = [
-            structs.replace(e, episode=n, success=n < ended[e.condition]) for e in some for n in range(50)
+            structs.replace(e, episode=n, success=n < ended[e.condition])
+            for e in some
+            for n in range(50)
         ]
         (copy / "episodes.csv").write_text(csv_text(Episode, episodes, variant))
         manifest = json.loads((copy / "run.json").read_text())
@@ -340,7 +368,9 @@ def scored(run, tmp_path, *scores, ended=None):
     return read(copy)
 
 
-def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(run, tmp_path):
+def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_without_v2v(
+    run, tmp_path
+):
     found = scored(
         run,
         tmp_path,
@@ -351,7 +381,8 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
         ended=ENDED,
     )
     assert headline(found) == (
-        "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: +26.0 [+12.5, "
+        "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: +26.0 "
+        "[+12.5, "
         "+39.5] points, a clear difference."
     )
     told = [(figure["value"], figure["interval"]) for figure in figures(found)]
@@ -362,7 +393,9 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
     ]
 
 
-def test_the_headline_and_the_figures_are_of_the_best_condition_that_no_warning_is_about(run, tmp_path):
+def test_the_headline_and_the_figures_are_of_the_best_condition_that_no_warning_is_about(
+    run, tmp_path
+):
     rates = (("single-local", 0.6), ("v2x", 0.9), ("6g", 0.7))
     found = scored(
         run,
@@ -376,7 +409,9 @@ def test_the_headline_and_the_figures_are_of_the_best_condition_that_no_warning_
     assert [figure["value"] for figure in figures(found)] == ["70.0 %"]
 
 
-def test_where_only_a_doubted_condition_beats_driving_alone_the_headline_does_not_deny_it(run, tmp_path):
+def test_where_only_a_doubted_condition_beats_driving_alone_the_headline_does_not_deny_it(
+    run, tmp_path
+):
     rates = (("single-local", 0.7), ("v2x", 0.9), ("6g", 0.6))
     found = scored(
         run,
@@ -439,7 +474,9 @@ def whose_answers_took(run, **times):
 
 
 def test_prefill_and_decode_in_words(run):
-    """Half a millisecond a token has two decimals. Where some TTFTs are unknown there is no share."""
+    """Half a millisecond a token has two decimals.
+    Where some TTFTs are unknown there is no share.
+    """
     first = Times(240, 0.021, 0.02, 0.03, (0.0205, 0.0215), (0.029, 0.031))
     ego = Times(240, 0.042, 0.03, 0.05, first_token=first, token=Times(240, 0.0005, 0.0004, 0.0006))
     helper = msgspec.structs.replace(ego, n=241)
@@ -466,7 +503,8 @@ def test_people_read_fusion_where_files_say_merge(run):
     shares = {f"{kind}_rate_merge": kind == "strict" for kind in ("strict", "recovered", "failed")}
     fused = whose_answers_took(run, merge=Times(1, 0.2, 0.2, 0.2))
     fused.__dict__["scores"] = [
-        Score("all", name, float(value), None, None, 8, 0, "answers") for name, value in shares.items()
+        Score("all", name, float(value), None, None, 8, 0, "answers")
+        for name, value in shares.items()
     ]
     assert [*answer_times(fused), *readings(fused)] == [
         "fusion answers took 200.0 ms (5-95 %: 200.0 to 200.0, n = 1); not used as latency",
@@ -496,17 +534,30 @@ def edited(run, tmp_path, name, edit):
         (
             "run.json",
             lambda t: t.replace("swarmdrive-run/2", "swarmdrive-run/1"),
-            "has format 'swarmdrive-run/1', .*harness 0.1 reads it: run again, or install that version",
+            "has format 'swarmdrive-run/1', .*harness 0.1 reads it: run again, or install that "
+            "version",
         ),
         ("run.json", lambda t: "[]", "has format 'None'"),
         ("run.json", lambda t: t[:50], "run.json is broken"),
         ("run.json", lambda t: t.replace('"seeds"', '"seed"'), "run.json is broken .*`seeds`"),
         ("run.json", lambda t: t.replace("brakes", r"\ud800"), "run.json is broken"),
         ("answers.jsonl", lambda t: t[:-40], "answers.jsonl is broken"),
-        ("answers.jsonl", lambda t: t.replace('"verdict"', '"said"'), "answers.jsonl is broken .*`verdict`"),
-        ("answers.jsonl", lambda t: t.replace('"strict"', '"stern"'), "answers.jsonl is broken .*'stern'"),
+        (
+            "answers.jsonl",
+            lambda t: t.replace('"verdict"', '"said"'),
+            "answers.jsonl is broken .*`verdict`",
+        ),
+        (
+            "answers.jsonl",
+            lambda t: t.replace('"strict"', '"stern"'),
+            "answers.jsonl is broken .*'stern'",
+        ),
         ("answers.jsonl", lambda t: t.replace("would", r"\ud800"), "answers.jsonl is broken"),
-        ("answers.jsonl", lambda t: t.replace('"intent":[', '"intent":[0.0,'), "has 4 probabilities"),
+        (
+            "answers.jsonl",
+            lambda t: t.replace('"intent":[', '"intent":[0.0,'),
+            "has 4 probabilities",
+        ),
         ("decisions.parquet", lambda t: t[:-40], "decisions.parquet is broken"),
         ("decisions.parquet", lambda t: "", "decisions.parquet is broken"),
         ("summary.csv", lambda t: t.replace("ci_low", "low"), "summary.csv is broken .*ci_low"),
@@ -563,10 +614,19 @@ def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
             "answers.jsonl has scene '00000-0-[0-9a-f]+', which decisions.parquet has not",
         ),
         (set_in_first("condition", "v3x"), "decisions.parquet is broken .unknown condition 'v3x'"),
-        (set_in_first("seed", 9), "decisions.parquet is broken .a decision of another seed or episode"),
+        (
+            set_in_first("seed", 9),
+            "decisions.parquet is broken .a decision of another seed or episode",
+        ),
         (set_in_first("action", "XIDLE"), "decisions.parquet is broken .unknown action 'XIDLE'"),
-        (set_in_first("action", None), "decisions.parquet is broken .action is unknown in some rows"),
-        (set_in_first("latency_ms", math.inf), "decisions.parquet is broken .latency_ms is infinite"),
+        (
+            set_in_first("action", None),
+            "decisions.parquet is broken .action is unknown in some rows",
+        ),
+        (
+            set_in_first("latency_ms", math.inf),
+            "decisions.parquet is broken .latency_ms is infinite",
+        ),
     ],
 )
 def test_a_broken_decision_is_one_line_that_names_the_file(run, tmp_path, decision, message):
@@ -582,7 +642,9 @@ def test_a_broken_decision_is_one_line_that_names_the_file(run, tmp_path, decisi
 def test_a_missing_column_is_named(run, tmp_path, column):
     copy = copied(run, tmp_path)
     pq.write_table(read(run).decisions.table.drop_columns([column]), copy / "decisions.parquet")
-    with pytest.raises(UserError, match=rf"decisions.parquet is broken .it lacks {column}") as error:
+    with pytest.raises(
+        UserError, match=rf"decisions.parquet is broken .it lacks {column}"
+    ) as error:
         written(copy)
     assert "\n" not in str(error.value)
 
@@ -616,9 +678,12 @@ def test_a_page_of_a_frozen_run_waits_for_no_painter_no_simulator_and_no_pandas(
     program = (
         "import sys; from pathlib import Path; from harness.cli.report import write;"
         f"write([Path({str(run)!r})], Path({str(tmp_path / 'page.html')!r}), quiet=True);"
-        "print(sorted({'matplotlib', 'highway_env', 'gymnasium', 'pandas', 'torch'} & set(sys.modules)))"
+        "print(sorted({'matplotlib', 'highway_env', 'gymnasium', 'pandas', 'torch'} & "
+        "set(sys.modules)))"
     )
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert said.stdout == "[]\n"
 
 

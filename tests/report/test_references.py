@@ -1,4 +1,6 @@
-"""What needs no model beside a model: the drivers, the best constant action, and any action at all."""
+"""What needs no model beside a model: the drivers, the best constant action,
+and any action at all.
+"""
 
 import csv
 from dataclasses import replace
@@ -25,7 +27,9 @@ ALONE = POINTS["single-local"]
 
 
 def by_hand(dataset: Dataset, point: int, tree: int) -> float:
-    """With what probability an episode succeeds from a decision point, if every action is equally likely."""
+    """With what probability an episode succeeds from a decision point,
+    if every action is equally likely.
+    """
     forest = dataset.forest
     return fmean(
         by_hand(dataset, int(child), tree)
@@ -51,7 +55,9 @@ def test_words_tell_what_trees_say_of_uniform_from_what_a_run_drew(small: Datase
 @pytest.mark.slow
 def test_the_model_uniform_comes_to_what_the_trees_say(small: Dataset, tmp_path: Path) -> None:
     """Over many seeds, of which each has draws of its own."""
-    of = run(spec_of(small, "uniform", points=(ALONE,), seeds=tuple(range(300))), tmp_path / "run").out
+    of = run(
+        spec_of(small, "uniform", points=(ALONE,), seeds=tuple(range(300))), tmp_path / "run"
+    ).out
     ends = read(of).episodes
     for episode, expected in zip(small.episodes, small.reference_success()["uniform"], strict=True):
         share = fmean(e.success for e in ends if e.episode == episode)
@@ -109,7 +115,8 @@ def test_the_constant_of_each_scenario_was_chosen_on_tune_layouts() -> None:
         best = {}
         for row in (row for row in rows if (row["scenario"], row["limits"]) == (name, str(limits))):
             cleared, layouts, safely, harmless = (
-                int(row[column]) for column in ("cleared", "layouts", "harmless_cleared", "harmless")
+                int(row[column])
+                for column in ("cleared", "layouts", "harmless_cleared", "harmless")
             )
             assert layouts >= 200
             assert purpose(int(row["first_seed"]), layouts) == "tune"
@@ -143,8 +150,23 @@ def test_references_have_intervals_and_n_as_a_model_has(small: Dataset) -> None:
 
 
 def test_names_of_near_lines_stand_together() -> None:
-    rows = [{"run": "a", "condition": "6g", "latency_ms": 150.0, "success": 0.5, "low": 0.4, "high": 0.6}]
-    heights = {"brake": 0.0, "full-view": 0.97, "constant IDLE": 0.52, "cruise": 0.55, "local-view": 0.93}
+    rows = [
+        {
+            "run": "a",
+            "condition": "6g",
+            "latency_ms": 150.0,
+            "success": 0.5,
+            "low": 0.4,
+            "high": 0.6,
+        }
+    ]
+    heights = {
+        "brake": 0.0,
+        "full-view": 0.97,
+        "constant IDLE": 0.52,
+        "cruise": 0.55,
+        "local-view": 0.93,
+    }
     spec = success_latency(rows, heights, [], "success")
     [layer] = [x for x in spec["layer"] if "layer" in x and "data" in x["layer"][0]]
     lines, names = (part["data"]["values"] for part in layer["layer"])
@@ -158,7 +180,9 @@ def test_names_of_near_lines_stand_together() -> None:
 
 @pytest.mark.slow
 def test_the_command_shows_both_beside_the_model(small_path: Path, harness: Any) -> None:
-    code, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0:1", "--condition", "single-local")
+    code, out, _ = harness(
+        "eval", "--dataset", small_path, "--seeds", "0:1", "--condition", "single-local"
+    )
     assert code == 0
     rows = {line.split("  ")[0]: line for line in out.splitlines()}
     assert "[" in rows["constant IDLE"]
@@ -168,7 +192,17 @@ def test_the_command_shows_both_beside_the_model(small_path: Path, harness: Any)
 
 @pytest.mark.slow
 def test_a_scenario_without_a_constant_is_refused_in_one_line(harness: Any, tmp_path: Path) -> None:
-    typed = ("drive", "--env", "merge-v0", "--model", "constant", "--episodes", "1", "--seeds", "0:1")
+    typed = (
+        "drive",
+        "--env",
+        "merge-v0",
+        "--model",
+        "constant",
+        "--episodes",
+        "1",
+        "--seeds",
+        "0:1",
+    )
     code, _, said = harness(*typed, "--out", tmp_path / "run")
     assert code == 2
     assert (

@@ -48,7 +48,9 @@ def asked(monkeypatch: pytest.MonkeyPatch, **added: Any) -> None:
     monkeypatch.setattr(remarks.REMARKS, "_loaded", dict(added))
 
 
-def test_what_one_says_stands_though_another_fails(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_one_says_stands_though_another_fails(
+    runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked(monkeypatch, broken=Fails(ValueError("<i>no</i>")), mine=Says(), again=Says())
     said = [text for text in remarks.sentences(runs) if "said" in text or "broken" in text]
     assert said == [
@@ -78,7 +80,9 @@ class Odd:
 @pytest.mark.parametrize(
     "beside", [None, {"00000-0": 5}, {"00000-0": [{"shift": float("nan")}]}, {"a": [{"b": {1}}]}]
 )
-def test_what_no_page_can_hold_is_left_out(beside: Any, runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_no_page_can_hold_is_left_out(
+    beside: Any, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked(monkeypatch, odd=Odd(beside), mine=Says())
     said = [text for text in remarks.sentences(runs) if "said" in text or "odd" in text]
     assert said == ["odd: its package failed: no text", "<b>said</b> of 1"]

@@ -30,7 +30,9 @@ ZONE = 5.0, 0.0
 def graph(*met, viewer="v1"):
     """A viewer's conflicts: with whom, and how far ahead of it."""
     conflicts = (
-        Conflict(name, "east", "straight", Point(m, 0.0), EgoArrival(m, None), Arrival(m, None, 0.0))
+        Conflict(
+            name, "east", "straight", Point(m, 0.0), EgoArrival(m, None), Arrival(m, None, 0.0)
+        )
         for name, m in met
     )
     ego = Ego("v1", 10.0, 10.0, 0.0, 15.0, 0.0, 0.0)
@@ -124,7 +126,9 @@ def test_a_label_knows_whom_it_covers_what_is_cut_and_which_lines_it_crosses():
     assert covered(at, half, boxes[:1]).tolist() == [1, 0, 0]
     assert cut(at, half, View(-2.0, -5.0, 10.0, 10.0)).tolist() == [0.0, 0.0, 3.5]
     lines = [np.array([[0.0, 1.0], [2.0, 1.0]]), np.array([[0.0, 2.0], [0.5, 2.0]])]
-    assert crossed(np.array([1.0, 0.0]), np.array([[1.0, 3.0], [1.0, 0.5], [0.0, 3.0]]), lines).tolist() == [
+    assert crossed(
+        np.array([1.0, 0.0]), np.array([[1.0, 3.0], [1.0, 0.5], [0.0, 3.0]]), lines
+    ).tolist() == [
         1,
         0,
         2,

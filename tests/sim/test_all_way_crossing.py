@@ -1,4 +1,6 @@
-"""A crossing without signs: agents from two to four arms, their seats, and no tell who goes first."""
+"""A crossing without signs: agents from two to four arms, their seats,
+and no tell who goes first.
+"""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -50,7 +52,9 @@ def scene(*ways):
     for n, way in enumerate(ways):
         x, y, heading = road.paths[way].at(ARM_M + JUNCTION_M - 25.0)
         part: Part = "helper" if n else "ego"
-        vehicles.append(VehicleState(f"v{n + 1}", "car", part, x, y, heading, 10.0, way[0], way[1], False))
+        vehicles.append(
+            VehicleState(f"v{n + 1}", "car", part, x, y, heading, 10.0, way[0], way[1], False)
+        )
     return WorldState(SCENARIO.name, 0, 0, 0.0, 10.0, tuple(vehicles), ())
 
 
@@ -122,8 +126,12 @@ def test_from_each_arm_the_road_is_the_same_turned():
             assert path.roles == south.paths[name].roles
         for key, at in road.crossings.items():
             here = south.crossings[key]
-            assert (at.x_m, at.y_m) == pytest.approx(np.array([here.x_m, here.y_m]) @ rotation, abs=1e-6)
-            assert (at.ego_arc_m, at.other_arc_m) == pytest.approx((here.ego_arc_m, here.other_arc_m))
+            assert (at.x_m, at.y_m) == pytest.approx(
+                np.array([here.x_m, here.y_m]) @ rotation, abs=1e-6
+            )
+            assert (at.ego_arc_m, at.other_arc_m) == pytest.approx(
+                (here.ego_arc_m, here.other_arc_m)
+            )
         assert road.zone_m == pytest.approx(np.array(south.zone_m) @ rotation, abs=1e-6)
         for sector, points in road.sectors.items():
             assert points == pytest.approx(south.sectors[sector] @ rotation, abs=1e-6)

@@ -25,7 +25,9 @@ def equipped(settings: str = "", **changed: Any) -> Scenario:
     return replace(scenario, parameters=whole)
 
 
-def states(scenario: Scenario, seed: int = 3, decisions: int = 2) -> Iterator[tuple[World, WorldState]]:
+def states(
+    scenario: Scenario, seed: int = 3, decisions: int = 2
+) -> Iterator[tuple[World, WorldState]]:
     world = World.start(scenario, seed)
     for _ in range(decisions):
         yield world, world.state()
@@ -67,7 +69,9 @@ def test_nobody_but_traffic_has_such_a_radio_and_without_one_nothing_changes() -
 def test_where_everything_is_known_a_radio_gives_the_exact_place() -> None:
     scenario = equipped(",perfect_knowledge=true")
     for world, state in states(scenario, decisions=1):
-        [node] = [node for node in graph_of(scenario, state).nodes if node.id == world.layout.danger_id]
+        [node] = [
+            node for node in graph_of(scenario, state).nodes if node.id == world.layout.danger_id
+        ]
         assert node.speed_mps == round(state.vehicle(node.id).speed_mps, 1)
 
 
@@ -75,7 +79,9 @@ def test_one_who_is_left_out_is_not_known_by_beacons_either() -> None:
     scenario = equipped()
     for world, state in states(scenario, decisions=1):
         danger = str(world.layout.danger_id)
-        assert danger not in {n.id for n in scene_graph(scenario, state, state.ego.id, [danger]).nodes}
+        assert danger not in {
+            n.id for n in scene_graph(scenario, state, state.ego.id, [danger]).nodes
+        }
 
 
 def test_traffic_without_a_radio_hears_nobody() -> None:
@@ -102,5 +108,6 @@ def test_each_vehicle_has_a_radio_with_the_share_that_is_declared() -> None:
     scenario = scenarios.get("parking-exit:radio_share=0.3")
     traffic: list[VehicleState] = []
     for seed in range(60):
-        traffic += [s for s in scenario.layout(seed, scenario.parameters).spawns if s.part == "other"]  # type: ignore[misc]
+        spawns = scenario.layout(seed, scenario.parameters).spawns
+        traffic += [spawn for spawn in spawns if spawn.part == "other"]  # type: ignore[misc]
     assert sum(v.radio for v in traffic) / len(traffic) == pytest.approx(0.3, abs=0.08)

@@ -55,7 +55,9 @@ def test_who_drives_on_at_constant_speed_is_where_the_last_beacon_says():
 
 
 def test_who_brakes_is_taken_to_drive_on_until_the_next_beacon():
-    """The ego brakes at 8 m/s² from 14 m/s. What was said 20 to 120 ms ago has it too fast and too far."""
+    """The ego brakes at 8 m/s² from 14 m/s.
+    What was said 20 to 120 ms ago has it too fast and too far.
+    """
     world = World.start(EXACT, 0)
     world.take("SLOWER")
     world.advance(25)
@@ -99,13 +101,19 @@ def test_each_vehicle_begins_at_a_time_of_its_own_and_all_have_been_heard_at_the
 
 @pytest.mark.slow
 def test_losses_make_what_is_known_older():
-    """Without losses the mean age is some 70 ms; each loss adds 100 ms, .08 + .08² + … of them on average."""
+    """Without losses the mean age is some 70 ms;
+    each loss adds 100 ms, .08 + .08² + … of them on average.
+    """
     seeds = range(60)
     least, usual, most = (list(ages_s(with_loss(loss), seeds)) for loss in (0.0, 0.08, 0.5))
     assert max(least) <= 0.12 + 1e-9
-    assert sum(usual) / len(usual) == pytest.approx(sum(least) / len(least) + 0.1 * 0.08 / 0.92, abs=0.008)
+    assert sum(usual) / len(usual) == pytest.approx(
+        sum(least) / len(least) + 0.1 * 0.08 / 0.92, abs=0.008
+    )
     assert sum(most) / len(most) == pytest.approx(sum(least) / len(least) + 0.1, abs=0.03)
-    assert all(more >= less - 1e-9 for more, less in zip(most, usual, strict=True)), "the draws are shared"
+    assert all(more >= less - 1e-9 for more, less in zip(most, usual, strict=True)), (
+        "the draws are shared"
+    )
 
 
 @pytest.mark.slow
@@ -115,12 +123,20 @@ def test_a_beacon_says_the_same_to_all_and_its_errors_are_those_declared():
         state = World.start(SCENARIO, seed).state()
         for beacon in state.beacons:
             if beacon.sender == "v1":
-                truth = World.start(replace(SCENARIO, parameters=EXACT.parameters), seed).state().ego
+                truth = (
+                    World.start(replace(SCENARIO, parameters=EXACT.parameters), seed).state().ego
+                )
                 errors.append(beacon.x_m - truth.x_m)
     assert math.sqrt(sum(e * e for e in errors) / len(errors)) == pytest.approx(0.2, rel=0.2)
 
 
-DIALS = ("beacon_loss=0", "beacon_loss=0.08", "beacon_loss=0.7", "beacon_rule=cam,beacon_loss=0.7", RADIO)
+DIALS = (
+    "beacon_loss=0",
+    "beacon_loss=0.08",
+    "beacon_loss=0.7",
+    "beacon_rule=cam,beacon_loss=0.7",
+    RADIO,
+)
 
 
 @pytest.mark.slow
@@ -199,7 +215,10 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
         ("beacon_delay_s=-0.1", "beacon_delay_s is -0.1; it must be seconds from 0 to 1"),
         ("perfect_knowledge=2", "perfect_knowledge is '2'; give true or false"),
         ("beacon_noise_m=much", "beacon_noise_m is 'much'; give a number"),
-        ("beacon_los=0.1", "unknown setting of scenario occluded-intersection 'beacon_los'; did you mean"),
+        (
+            "beacon_los=0.1",
+            "unknown setting of scenario occluded-intersection 'beacon_los'; did you mean",
+        ),
         ("danger_share=0.5", "unknown setting of scenario occluded-intersection 'danger_share'"),
         ("beacon_rule=often", "beacon_rule is often; it must be fixed or cam"),
         (
@@ -212,7 +231,9 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
     ],
 )
 def test_a_scenario_may_be_named_with_other_beacons_that_are_allowed(text, says):
-    changed = scenarios.get("occluded-intersection:beacon_loss=0.5,perfect_knowledge=true").parameters
+    changed = scenarios.get(
+        "occluded-intersection:beacon_loss=0.5,perfect_knowledge=true"
+    ).parameters
     assert (changed.beacon_loss, changed.perfect_knowledge) == (0.5, True)
     with pytest.raises(UserError) as refused:
         scenarios.get(f"occluded-intersection:{text}")
@@ -231,11 +252,14 @@ def test_any_rate_up_to_one_a_frame_has_everybody_heard_at_the_start(hz):
             assert all(0.1 - 1e-9 <= age <= 0.1 + 1 / hz + 0.02 for age in ages)
 
 
-# -- CAM: sent as the vehicle moves ------------------------------------------------------------------------
+# -- CAM: sent as the vehicle moves
+# ------------------------------------------------------------------------
 
 
 def cams(scenario, speeds_mps, turn_rad=0.0):
-    """Frames of one ego's CAMs that drives at these speeds, frame by frame, from the first in them."""
+    """Frames of one ego's CAMs that drives at these speeds, frame by frame,
+    from the first in them.
+    """
     heard, frames = tuple[Beacon, ...](), []
     x_m = heading_rad = 0.0
     for frame, speed in enumerate(speeds_mps):
@@ -259,7 +283,9 @@ CAM = replace(EXACT, parameters=replace(EXACT.parameters, beacon_rule="cam", bea
 def test_a_steady_vehicle_sends_when_a_check_finds_it_four_metres_on_and_once_a_second_at_least(
     speed_mps, every_s
 ):
-    """At 14 m/s 4 m take 286 ms, and the third check finds them; at 3 m/s the second is over before."""
+    """At 14 m/s 4 m take 286 ms, and the third check finds them;
+    at 3 m/s the second is over before.
+    """
     sent = cams(CAM, [speed_mps] * 250)
     assert set(np.diff(sent)) == {round(50 * every_s)}
 
@@ -279,7 +305,9 @@ def test_who_brakes_sends_at_every_check_three_times_more_after_it_and_then_by_d
 
 @pytest.mark.slow
 def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
-    """The next is measured from it, whoever heard it, so losses do not change when beacons are sent."""
+    """The next is measured from it, whoever heard it,
+    so losses do not change when beacons are sent.
+    """
 
     def times(loss):
         world = World.start(scenarios.get(f"{NAME},beacon_rule=cam,beacon_loss={loss}"), 0)
@@ -294,7 +322,8 @@ def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
     assert 5 < len(times(0)) < 30
 
 
-# -- beacons over a radio ----------------------------------------------------------------------------------
+# -- beacons over a radio
+# ----------------------------------------------------------------------------------
 
 
 def heard(dials, seeds=range(3)):
@@ -322,7 +351,9 @@ def test_on_a_strong_radio_beacons_get_through_and_on_a_feeble_one_only_the_firs
 @pytest.mark.slow
 def test_a_busier_channel_never_makes_anybody_hear_more():
     """The draws are shared, and so is the shadowing."""
-    quiet, busy = (heard(f"beacon_channel=its-g5+density_per_km={density}") for density in (10, 150))
+    quiet, busy = (
+        heard(f"beacon_channel=its-g5+density_per_km={density}") for density in (10, 150)
+    )
     assert all(busy[key] <= quiet[key] for key in quiet)
     assert busy != quiet
 
@@ -333,32 +364,48 @@ def test_an_environments_vehicles_beacon_over_a_radio_too():
     world.act("IDLE")
     state = world.state()
     assert state.helpers
-    assert all(0.02 <= state.time_s - last_heard(state, h.id, "v1").time_s <= 1.5 for h in state.helpers)
+    assert all(
+        0.02 <= state.time_s - last_heard(state, h.id, "v1").time_s <= 1.5 for h in state.helpers
+    )
 
 
 @pytest.mark.slow
 def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
-    """Where the radio says .3 for one link and 1 for the others, its share comes, and nothing else."""
+    """Where the radio says .3 for one link and 1 for the others, its share comes,
+    and nothing else.
+    """
     p, n = SCENARIO.parameters, 1000
     poses = np.zeros((5, 3, 4))
     came = 0
     for seed in range(n):
-        sent = broadcast(p, seed, (), ("v1", "v2", "v3"), 14.0, poses, 100, lambda _: np.array([0.3, 1.0]))
+        sent = broadcast(
+            p, seed, (), ("v1", "v2", "v3"), 14.0, poses, 100, lambda _: np.array([0.3, 1.0])
+        )
         came += sum(b.heard_by == ("v2",) for b in sent if b.sender == "v1")
-        assert not any("v3" in b.heard_by or b.sender == "v3" for b in sent), "the link fails both ways"
+        assert not any("v3" in b.heard_by or b.sender == "v3" for b in sent), (
+            "the link fails both ways"
+        )
     assert came / n == pytest.approx(0.7, abs=0.04)
 
 
 @pytest.mark.slow
 def test_times_between_beacons_that_get_through_are_geometric():
-    """Mean T / p; the share q is reached after ceil(log(1 - q) / log(1 - p)) periods: 3 at .95 and p = .7."""
+    """Mean T / p; the share q is reached after ceil(log(1 - q) / log(1 - p)) periods:
+    3 at .95 and p = .7.
+    """
     p, gaps = replace(SCENARIO.parameters, beacon_loss=0.3), []
     poses = np.zeros((1, 2, 4))
     for seed in range(40):
         before, times = tuple[Beacon, ...](), []
         for frame in range(450):
-            before = broadcast(p, seed, before, ("v1", "v2"), 0.0, poses, frame, lambda _: np.array([0.3]))
-            times += [b.time_s for b in before if b.sender == "v1" and b.heard_by and b.time_s not in times]
+            before = broadcast(
+                p, seed, before, ("v1", "v2"), 0.0, poses, frame, lambda _: np.array([0.3])
+            )
+            times += [
+                b.time_s
+                for b in before
+                if b.sender == "v1" and b.heard_by and b.time_s not in times
+            ]
         gaps += np.diff(times).tolist()
     assert np.mean(gaps) == pytest.approx(0.1 / 0.7, rel=0.03)
     assert np.quantile(gaps, 0.95) == pytest.approx(

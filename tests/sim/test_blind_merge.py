@@ -1,4 +1,6 @@
-"""The blind merge: what the wall hides, who sees it, and that a car on the other lane is harmless."""
+"""The blind merge: what the wall hides, who sees it,
+and that a car on the other lane is harmless.
+"""
 
 from dataclasses import replace
 
@@ -17,7 +19,9 @@ SCENARIO = former.scenes("blind-merge")
 P = SCENARIO.parameters
 LAYOUTS = {seed: layout(seed, P) for seed in range(200)}
 EGO = VehicleState("v1", "car", "ego", -50.0, RAMP_M, 0.0, 14.0, "ramp", "merge", False)
-TRUCK = VehicleState("v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight", False)
+TRUCK = VehicleState(
+    "v2", "truck", "helper", -95.0, -4.0, 0.0, 14.0, "main left", "straight", False
+)
 AHEAD = VehicleState("v3", "car", "helper", 5.0, 0.0, 0.0, 17.0, "main", "straight", False)
 COMES = VehicleState("v5", "car", "other", -55.0, 0.0, 0.0, 15.0, "main", "straight", False)
 BESIDE = structs.replace(COMES, y_m=-4.0, approach="main left")
@@ -47,13 +51,17 @@ def test_the_wall_hides_both_lanes_from_the_ego_and_helpers_see_which_lane_it_is
 
 def test_past_the_walls_end_the_ego_sees_who_is_beside_it():
     ego = structs.replace(EGO, x_m=-25.0, y_m=3.5)
-    assert "v5" in listed(scene_graph(SCENARIO, scene(structs.replace(COMES, x_m=-30.0), ego=ego), "v1"))
+    assert "v5" in listed(
+        scene_graph(SCENARIO, scene(structs.replace(COMES, x_m=-30.0), ego=ego), "v1")
+    )
 
 
 def test_it_lets_go_first_who_is_on_its_lane_and_minds_nobody_on_the_other():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(COMES))) == "SLOWER"
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(BESIDE))) == "IDLE"
-    assert plan(SCENARIO, truth_graph(SCENARIO, scene(structs.replace(COMES, x_m=-150.0)))) == "IDLE"
+    assert (
+        plan(SCENARIO, truth_graph(SCENARIO, scene(structs.replace(COMES, x_m=-150.0)))) == "IDLE"
+    )
 
 
 @pytest.mark.slow

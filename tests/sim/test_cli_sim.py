@@ -17,10 +17,15 @@ def test_scenarios_are_listed_and_shown_for_people_and_machines(harness):
     assert code == 0
     listed = [line.partition(": ")[0] for line in out.splitlines()]
     assert NAME in listed
-    assert [s["name"] for s in json.loads(harness("dataset", "scenario", "list", "--json")[1])] == listed
+    assert [
+        s["name"] for s in json.loads(harness("dataset", "scenario", "list", "--json")[1])
+    ] == listed
     _, out, _ = harness("dataset", "scenario", "show", NAME)
     assert "actions: SLOWER, IDLE, FASTER" in out
-    assert "ego_start_m = 61, 69\n    distance from the start to the centroid of the conflict zone." in out
+    assert (
+        "ego_start_m = 61, 69\n    distance from the start to the centroid of the conflict zone."
+        in out
+    )
     assert max(map(len, out.splitlines())) <= 110
 
 
@@ -29,7 +34,9 @@ def test_every_parameter_is_shown_with_value_and_meaning(harness):
     assert shown["actions"] == ["SLOWER", "IDLE", "FASTER"]
     assert shown["parameters"]["time_limit_s"]["value"] == 10.0
     assert shown["parameters"]["corner_m"]["value"] == [8.0, 15.0]
-    assert all(p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values())
+    assert all(
+        p["meaning"].endswith(".") and len(p["meaning"]) > 5 for p in shown["parameters"].values()
+    )
 
 
 def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
@@ -44,7 +51,17 @@ def test_the_answer_schemas_of_a_scenario_are_shown_and_hold(harness):
 @pytest.mark.slow
 def test_a_scenario_check_states_rates_intervals_and_n(harness):
     code, out, err = harness(
-        "dataset", "scenario", "drive", NAME, "--episodes", 3, "--seed", 178, "--workers", 1, "--json"
+        "dataset",
+        "scenario",
+        "drive",
+        NAME,
+        "--episodes",
+        3,
+        "--seed",
+        178,
+        "--workers",
+        1,
+        "--json",
     )
     found = json.loads(out)
     assert (code, err) == (0, "")
@@ -67,13 +84,26 @@ def test_a_scenario_check_states_rates_intervals_and_n(harness):
 def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     out_folder = tmp_path / "two-v1"
     code, out, _ = harness(
-        "dataset", "build", NAME, "--episodes", 2, "--seed", 179, "--workers", 1, "--out", out_folder
+        "dataset",
+        "build",
+        NAME,
+        "--episodes",
+        2,
+        "--seed",
+        179,
+        "--workers",
+        1,
+        "--out",
+        out_folder,
     )
     nodes = json.loads((out_folder / "manifest.json").read_text())["nodes"]
     assert (code, f": 2 layouts, {nodes} decision points, in " in out) == (0, True)
     assert out.startswith(f"wrote {printable(out_folder)} of {NAME}, scenes of v2v-safety-2")
     code, out, _ = harness("dataset", "check", out_folder)
-    assert (code, out.splitlines()[0]) == (0, f"two-v1 is sound: 2 layouts, {nodes} decision points")
+    assert (code, out.splitlines()[0]) == (
+        0,
+        f"two-v1 is sound: 2 layouts, {nodes} decision points",
+    )
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")
     ranked = json.loads(out)
     assert (code, ranked["episodes"]) == (0, 2)
@@ -128,7 +158,10 @@ def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
     [
         ("dataset scenario show occluded-crossing", "unknown scenario 'occluded-crossing'"),
         ("dataset scenario drive nowhere --episodes 1", "unknown scenario 'nowhere'"),
-        (f"dataset scenario drive {NAME} --episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
+        (
+            f"dataset scenario drive {NAME} --episodes 0",
+            "--episodes 0 is out of range; give 1 to 100000",
+        ),
         (
             f"dataset scenario drive {NAME} --episodes 1 --workers 0",
             "--workers 0: give 1 to 256 processes, or ray",
@@ -147,9 +180,15 @@ def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
         ("dataset rank SMALL --workers 0", "--workers 0: give 1 to 256 processes, or ray"),
         ("dataset show SMALL 00099-0 --out OUT.svg", "unknown scene '00099-0'"),
         ("dataset show SMALL 00000-0 --out OUT.gif", "end it in .svg or .png"),
-        ("dataset show SMALL 00000-0 --viewer v9 --out OUT.svg", "unknown viewer of scene 00000-0-"),
+        (
+            "dataset show SMALL 00000-0 --viewer v9 --out OUT.svg",
+            "unknown viewer of scene 00000-0-",
+        ),
         ("dataset show SMALL 00000-0 --camera --out OUT.svg", "end it in .png"),
-        ("dataset show SMALL 00000-0 --camera --viewer v9 --out OUT.png", "unknown viewer of scene 00000-0-"),
+        (
+            "dataset show SMALL 00000-0 --camera --viewer v9 --out OUT.png",
+            "unknown viewer of scene 00000-0-",
+        ),
         ("dataset show EMPTY 00000-0 --out OUT.svg", "is no dataset"),
     ],
 )
@@ -175,7 +214,9 @@ def test_a_scene_is_drawn_whole(harness, small_folder, tmp_path):
     pytest.importorskip("harness.report.drawing")
     for suffix, start in {"svg": b"<?xml", "png": b"\x89PNG"}.items():
         picture = tmp_path / f"scene.{suffix}"
-        code, out, _ = harness("dataset", "show", small_folder, "00000-0", "--viewer", "v2", "--out", picture)
+        code, out, _ = harness(
+            "dataset", "show", small_folder, "00000-0", "--viewer", "v2", "--out", picture
+        )
         assert (code, out) == (0, f"wrote {picture}\n")
         assert picture.read_bytes().startswith(start)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.png", "scene.svg"]

@@ -1,4 +1,6 @@
-"""Time to collision and post-encroachment time: by hand, against a search through all pairs, and together."""
+"""Time to collision and post-encroachment time:
+by hand, against a search through all pairs, and together.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,8 @@ Pose = tuple[float, float, float, float]
 
 
 LONG_S = 1e6  # rounding decides whether courses that are so alike ever meet
-FEW = ("do-not-pass", "occluded-intersection", "roundabout-entries")  # lane changes, crossings, curves
+# lane changes, crossings, curves
+FEW = ("do-not-pass", "occluded-intersection", "roundabout-entries")
 
 
 def ttc_s(ego: Pose, other: Pose, sizes: tuple[tuple[float, float], ...] = (CAR, CAR)) -> float:
@@ -44,7 +47,9 @@ def straight(start: Pose, frames: int) -> Floats:
     """A vehicle that keeps its heading and speed from its pose in frame 0 on."""
     x, y, heading, speed = start
     t = np.arange(frames) / HZ
-    track = np.stack([x + speed * np.cos(heading) * t, y + speed * np.sin(heading) * t, 0 * t, 0 * t], axis=1)
+    track = np.stack(
+        [x + speed * np.cos(heading) * t, y + speed * np.sin(heading) * t, 0 * t, 0 * t], axis=1
+    )
     track[:, 2:] = heading, speed
     return track
 
@@ -62,14 +67,16 @@ def measured(
 @pytest.mark.parametrize(
     ("other", "expected"),
     [
-        ((25.0, 0.0, 0.0, 4.0), 20.0 / 6.0),  # on a line: from bumper to bumper by the closing speed
+        # on a line: from bumper to bumper by the closing speed
+        ((25.0, 0.0, 0.0, 4.0), 20.0 / 6.0),
         ((25.0, 0.0, 0.0, 10.0), np.inf),  # as fast
         ((25.0, 0.0, 0.0, 12.0), np.inf),  # faster
         ((-25.0, 0.0, 0.0, 12.0), 20.0 / 2.0),  # it comes from behind
         ((25.0, 0.0, np.pi, 4.0), 20.0 / 14.0),  # it comes towards the ego
         ((25.0, 3.5, np.pi, 4.0), np.inf),  # in the next lane
         ((25.0, 3.5, 0.0, 0.0), np.inf),  # parallel, and passed
-        ((20.0, 20.0, NORTH, 10.0), 1.65),  # crossing: both bumpers are 16.5 m before the other's side
+        # crossing: both bumpers are 16.5 m before the other's side
+        ((20.0, 20.0, NORTH, 10.0), 1.65),
         ((20.0, 40.0, NORTH, 10.0), np.inf),  # crossing behind the ego
         ((20.0, 22.0, NORTH, 10.0), 1.85),  # it hits the ego's side: its bumper has 18.5 m
         ((4.0, 0.0, 0.0, 10.0), 0.0),  # they overlap
@@ -88,7 +95,9 @@ POSE = st.tuples(
 
 def moved(pose: Pose, seconds: float) -> Floats:
     x, y, heading, speed = pose
-    return np.array([[x + speed * np.cos(heading) * seconds, y + speed * np.sin(heading) * seconds, heading]])
+    return np.array(
+        [[x + speed * np.cos(heading) * seconds, y + speed * np.sin(heading) * seconds, heading]]
+    )
 
 
 @given(POSE, POSE)
@@ -97,7 +106,9 @@ def test_outlines_touch_at_the_time_to_collision_and_never_before(ego: Pose, oth
     time_s = ttc_s(ego, other, (CAR, TRUCK))
 
     def apart_m(seconds: float) -> float:
-        return float(separation_m(moved(ego, seconds), sizes[0], moved(other, seconds), sizes[1])[0])
+        return float(
+            separation_m(moved(ego, seconds), sizes[0], moved(other, seconds), sizes[1])[0]
+        )
 
     for seconds in np.linspace(0.0, min(time_s, 20.0), 50)[:-1]:
         assert time_s == 0.0 or apart_m(seconds) > -1e-6
@@ -130,7 +141,9 @@ def test_neither_order_nor_frame_of_reference_changes_it(
 
 
 def test_a_crossing_is_as_long_free_as_the_frames_between_say() -> None:
-    """The ego's tail leaves the other's strip after 1.35 s; the other reaches the ego's after 3.35 s."""
+    """The ego's tail leaves the other's strip after 1.35 s;
+    the other reaches the ego's after 3.35 s.
+    """
     ego, other = straight((10.0, 0.0, 0.0, 10.0), 50), straight((20.0, 37.0, NORTH, 10.0), 50)
     for first_ego in (True, False):
         poses = driven(*((ego, other) if first_ego else (other, ego)))
@@ -141,7 +154,9 @@ def test_a_crossing_is_as_long_free_as_the_frames_between_say() -> None:
     assert (before.pet_s, before.anew().pet_s) == (np.inf, np.inf)
 
 
-def test_vehicles_side_by_side_have_no_conflict_and_one_behind_the_other_have_a_gap_in_time() -> None:
+def test_vehicles_side_by_side_have_no_conflict_and_one_behind_the_other_have_a_gap_in_time() -> (
+    None
+):
     ego = straight((0.0, 0.0, 0.0, 10.0), 40)
     assert measured(driven(ego, straight((3.0, 3.5, 0.0, 12.0), 40))).pet_s == np.inf
     following = measured(driven(ego, straight((25.0, 0.0, 0.0, 10.0), 40)))
@@ -156,7 +171,9 @@ def test_what_comes_after_the_horizon_is_no_conflict() -> None:
         assert (conflicts.pet_s == np.inf) == missing
         assert missing or conflicts.pet_s == pytest.approx(HORIZON_S - 0.1, abs=2 / HZ)
     slow = straight((48.0, 0.0, 0.0, 1.0), 1), straight((50.0 + 43.0 + 5.0, 0.0, 0.0, 1.0), 1)
-    assert measured(driven(straight((0.0, 0.0, 0.0, 10.0), 1), slow[0])).ttc_s == pytest.approx(43.0 / 9.0)
+    assert measured(driven(straight((0.0, 0.0, 0.0, 10.0), 1), slow[0])).ttc_s == pytest.approx(
+        43.0 / 9.0
+    )
     assert measured(driven(straight((0.0, 0.0, 0.0, 10.0), 1), slow[1])).ttc_s == np.inf
 
 
@@ -168,7 +185,9 @@ def test_no_rate_of_frames_sees_beyond_the_horizon(hz: int) -> None:
     gone = np.array([(1000.0, 0.0, 0.0, 0.0)])
     for away in range(round(4.5 * hz), round(5.5 * hz)):
         ego = np.concatenate([np.repeat(stands, hz, axis=0), np.repeat(gone, away, axis=0)])
-        other = np.concatenate([np.repeat(-gone, len(ego) - every, axis=0), np.repeat(stands, every, axis=0)])
+        other = np.concatenate(
+            [np.repeat(-gone, len(ego) - every, axis=0), np.repeat(stands, every, axis=0)]
+        )
         pet_s = measured(driven(ego, other), hz=hz).pet_s
         assert pet_s == np.inf or pet_s <= HORIZON_S
         assert pet_s < np.inf or away > hz * HORIZON_S - 2 * every
@@ -182,7 +201,9 @@ def wandering(seed: int, vehicles: int, frames: int, hz: int = HZ) -> Floats:
         speed = np.abs(np.cumsum(rng.normal(0, 0.5, frames)) + rng.uniform(0, 12))
         heading = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(0, 0.05, frames))
         steps = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1) / hz
-        tracks.append(np.column_stack([rng.uniform(-20, 20, 2) + np.cumsum(steps, axis=0), heading, speed]))
+        tracks.append(
+            np.column_stack([rng.uniform(-20, 20, 2) + np.cumsum(steps, axis=0), heading, speed])
+        )
     return driven(*tracks)
 
 
@@ -225,20 +246,28 @@ def test_worlds_with_other_numbers_of_frames_and_vehicles_are_measured_as_alone(
     together = np.full((len(worlds), 60, 4, 4), np.nan)
     for n, poses in enumerate(worlds):
         together[n, : poses.shape[1], : poses.shape[2]] = poses[0]
-    found = observe([Conflicts()] * len(worlds), together, sizes, np.ones(len(worlds), dtype=int), HZ)
+    found = observe(
+        [Conflicts()] * len(worlds), together, sizes, np.ones(len(worlds), dtype=int), HZ
+    )
     alone = [measured(poses, (CAR,) * poses.shape[2]) for poses in worlds]
-    assert [(each.ttc_s, each.pet_s) for each in found] == [(each.ttc_s, each.pet_s) for each in alone]
+    assert [(each.ttc_s, each.pet_s) for each in found] == [
+        (each.ttc_s, each.pet_s) for each in alone
+    ]
     assert len({each.pet_s for each in alone}) > 4
 
 
 def test_who_leaves_is_forgotten_and_who_enters_has_been_nowhere() -> None:
     ego, other = straight((10.0, 0.0, 0.0, 10.0), 50), straight((20.0, 37.0, NORTH, 10.0), 50)
-    [begun] = observe([Conflicts()], driven(ego, other)[:, :30], np.array([(CAR, CAR)]), np.array([1]), HZ)
+    [begun] = observe(
+        [Conflicts()], driven(ego, other)[:, :30], np.array([(CAR, CAR)]), np.array([1]), HZ
+    )
     far = straight((10.0, 90.0, 0.0, 10.0), 50)
     later, sizes = driven(ego, far, other)[:, 30:], np.array([(CAR, CAR, CAR)])
     [kept] = observe([begun.recast([0, -1, 1])], later, sizes, np.array([31]), HZ)
     assert kept.pet_s == measured(driven(ego, other)).pet_s
-    [other_first] = observe([begun.recast([1, -1, 0])], later[:, :, [2, 1, 0]], sizes, np.array([31]), HZ)
+    [other_first] = observe(
+        [begun.recast([1, -1, 0])], later[:, :, [2, 1, 0]], sizes, np.array([31]), HZ
+    )
     assert other_first.pet_s == kept.pet_s
 
 

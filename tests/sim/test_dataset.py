@@ -1,4 +1,6 @@
-"""Frozen datasets: the same bytes however they are built, and nothing used that is not what it says."""
+"""Frozen datasets: the same bytes however they are built,
+and nothing used that is not what it says.
+"""
 
 import json
 import os
@@ -103,7 +105,11 @@ def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    for name, why in {"notes": "other files", "file": "no folder", "a b": "cannot name a dataset"}.items():
+    for name, why in {
+        "notes": "other files",
+        "file": "no folder",
+        "a b": "cannot name a dataset",
+    }.items():
         with pytest.raises(UserError, match=why):
             build(SCENARIO, tmp_path / name, 1, 0, 1, lambda done: None)
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "mine.txt", "notes"]
@@ -126,12 +132,17 @@ def test_a_built_dataset_is_sound_and_has_every_course(small, small_folder):
         assert sum(sizes) < 130
 
 
-def test_trees_and_scenes_that_were_forgotten_are_read_again_as_they_were(small, small_folder, monkeypatch):
+def test_trees_and_scenes_that_were_forgotten_are_read_again_as_they_were(
+    small, small_folder, monkeypatch
+):
     monkeypatch.setattr("harness.dataset.load.TREES_KEPT", 2)
     monkeypatch.setattr("harness.dataset.load.SCENES_KEPT", 3)
     data = load(small_folder)
     assert list(data.trees) == list(small.trees)
-    ids, records = small.forest.ids[::7], [scene.record for scene in small.scenes(small.forest.ids[::7])]
+    ids, records = (
+        small.forest.ids[::7],
+        [scene.record for scene in small.scenes(small.forest.ids[::7])],
+    )
     for _ in range(2):
         assert [scene.record for scene in data.scenes(ids)] == records
         assert len(data._scenes) == 3
@@ -167,7 +178,10 @@ def test_graphs_in_a_record_are_what_the_sensors_say_of_its_state(small):
 
 def test_no_graph_says_minus_zero(small):
     for scene in scenes_of(small):
-        assert re.search(r"-0\.0(?!\d)", canonical_json(msgspec.to_builtins(scene.record.graphs))) is None
+        assert (
+            re.search(r"-0\.0(?!\d)", canonical_json(msgspec.to_builtins(scene.record.graphs)))
+            is None
+        )
 
 
 def test_poses_are_kept_to_the_micrometre_so_that_other_machines_write_the_same(small):
@@ -274,7 +288,9 @@ def reseal(folder, entries, **changes):
         tree = json.loads(entries[f"{episode:05d}/tree.json"])
         if isinstance(tree, dict) and isinstance(tree.get("levels"), list):
             levels = [f"{episode:05d}/{step}.jsonl" for step in range(len(tree["levels"]))]
-            tree["scenes_sha256"] = [sha256_bytes(entries[name]) for name in levels if name in entries]
+            tree["scenes_sha256"] = [
+                sha256_bytes(entries[name]) for name in levels if name in entries
+            ]
             entries[f"{episode:05d}/tree.json"] = json.dumps(tree).encode()
         manifest["trees_sha256"][episode] = sha256_bytes(entries[f"{episode:05d}/tree.json"])
     with ZipFile(folder / "layouts.zip", "w") as file:
@@ -284,13 +300,17 @@ def reseal(folder, entries, **changes):
 
 
 def edit(folder, line, change):
-    """Replace a scene of the second layout's level 2 (from 1) by what `change` makes of it, and seal it."""
+    """Replace a scene of the second layout's level 2 (from 1) by what `change` makes of it, and
+    seal it.
+    """
 
     def of_lines(data):
         lines = data.splitlines(keepends=True)
         record = json.loads(lines[line - 1])
         changed = change(record)
-        lines[line - 1] = changed if isinstance(changed, bytes) else (json.dumps(record) + "\n").encode()
+        lines[line - 1] = (
+            changed if isinstance(changed, bytes) else (json.dumps(record) + "\n").encode()
+        )
         return b"".join(lines)
 
     reseal(folder, rewrite(folder, "00001/2.jsonl", of_lines))
@@ -303,7 +323,11 @@ def use(folder):
 
 
 def test_a_changed_byte_is_found_and_refused(copy):
-    rewrite(copy, "00001/2.jsonl", lambda data: data.replace(b'"speed_mps":14.0', b'"speed_mps":15.0', 1))
+    rewrite(
+        copy,
+        "00001/2.jsonl",
+        lambda data: data.replace(b'"speed_mps":14.0', b'"speed_mps":15.0', 1),
+    )
     changed = "layouts.zip 00001/2.jsonl: changed, its sha256 is not the one that was pinned"
     assert check(copy) == [changed]
     with pytest.raises(UserError, match=re.escape(changed)):
@@ -319,7 +343,8 @@ def test_a_missing_file_is_found_and_refused(copy, name):
 
 
 @pytest.mark.parametrize(
-    ("content", "why"), [(None, "No such file"), (b"", "not a zip file"), (b"PK\x03\x04" + bytes(99), "zip")]
+    ("content", "why"),
+    [(None, "No such file"), (b"", "not a zip file"), (b"PK\x03\x04" + bytes(99), "zip")],
 )
 def test_layouts_that_are_missing_or_no_archive_are_refused(copy, content, why):
     if content is None:
@@ -355,7 +380,9 @@ def test_a_level_that_claims_gigabytes_is_not_unpacked(copy, monkeypatch):
 
 
 def test_a_scene_taken_out_is_found(copy):
-    entries = rewrite(copy, "00001/2.jsonl", lambda data: b"".join(data.splitlines(keepends=True)[1:]))
+    entries = rewrite(
+        copy, "00001/2.jsonl", lambda data: b"".join(data.splitlines(keepends=True)[1:])
+    )
     reseal(copy, entries)
     assert check(copy) == ["layouts.zip 00001/2.jsonl: 4 scenes, the tree has 5"]
     with pytest.raises(UserError, match="4 scenes, the tree has 5"):
@@ -458,8 +485,12 @@ HOSTILE_TREES = {
     "a time out of this world": at("levels", 5, 0, "edges", 0, "end", "time_s", value=1e300),
     "an unknown field": at("more", value=1),
     "a time to collision in the past": at("levels", 0, 0, "edges", 0, "ttc_s", value=-1.0),
-    "an edge without the measures of the others": lambda tree: tree["levels"][0][0]["edges"][0].pop("pet_s"),
-    "a collision that is no conflict": at("levels", 5, 0, "edges", 0, "end", "result", value="collision"),
+    "an edge without the measures of the others": lambda tree: tree["levels"][0][0]["edges"][0].pop(
+        "pet_s"
+    ),
+    "a collision that is no conflict": at(
+        "levels", 5, 0, "edges", 0, "end", "result", value="collision"
+    ),
 }
 
 
@@ -523,7 +554,8 @@ def test_a_manifest_that_is_not_what_it_should_be_is_refused(copy, what):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[", "[" * 100_000, "null", "[]", '{"episodes": NaN}', "9" * 5000, '"\x00"', "\ud800"]
+    "text",
+    ["", "[", "[" * 100_000, "null", "[]", '{"episodes": NaN}', "9" * 5000, '"\x00"', "\ud800"],
 )
 def test_a_manifest_that_cannot_be_read_is_refused(copy, text):
     (copy / "manifest.json").write_bytes(text.encode(errors="surrogatepass"))

@@ -38,7 +38,9 @@ from harness.world.state import ActionsTaken, WorldState
 from harness.world.world import World
 
 OWN = "env:my_roads:breakdown-v0"
-SPEED_ONLY = {"action": {"type": "DiscreteMetaAction", "lateral": False, "target_speeds": [0, 4.5, 9]}}
+SPEED_ONLY = {
+    "action": {"type": "DiscreteMetaAction", "lateral": False, "target_speeds": [0, 4.5, 9]}
+}
 
 LANES_ONLY = {"action": {"type": "DiscreteMetaAction", "longitudinal": False}}
 
@@ -66,7 +68,9 @@ class Crashed(Breakdown):
 
     def _reset(self):
         super()._reset()
-        self.road.vehicles.append(Vehicle(self.road, self.vehicle.position + np.array([2.0, 0.0]), 0, 10))
+        self.road.vehicles.append(
+            Vehicle(self.road, self.vehicle.position + np.array([2.0, 0.0]), 0, 10)
+        )
 
 
 class Ghost(Vehicle):
@@ -167,8 +171,10 @@ class AbsentEgo(Breakdown):
 EGOS = {
     OwnEgo: "is a OwnVehicle, which has no target_speeds, speed_index; make it of self.action_type",
     IdmEgo: "is a IDMVehicle, which has no target_speeds, speed_index; make it of self.action_type",
-    PlainEgo: "is a Vehicle, which has no target_speeds, target_speed, speed_index, route; make it of",
-    SpeedlessEgo: "is a Speedless, which has target_speeds None, no speeds; make it of self.action_type",
+    PlainEgo: "is a Vehicle, which has no target_speeds, "
+    "target_speed, speed_index, route; make it of",
+    SpeedlessEgo: "is a Speedless, which has target_speeds None, no "
+    "speeds; make it of self.action_type",
     GhostEgo: "is a Through, which hits nothing; leave it collidable and solid",
     AbsentEgo: "is not on the road; append self.vehicle to self.road.vehicles",
 }
@@ -184,7 +190,9 @@ def test_an_ego_that_meta_actions_do_not_drive_is_named(kind, said):
 
 
 def test_an_ego_that_leaves_the_road_is_named():
-    with pytest.raises(UserError, match=r"its ego leaves the road in seed 0; keep it in self\.road"):
+    with pytest.raises(
+        UserError, match=r"its ego leaves the road in seed 0; keep it in self\.road"
+    ):
         examine(scenarios.get("env:vanishing-v0"), 0)
 
 
@@ -198,19 +206,28 @@ def test_who_turns_into_a_ghost_has_gone():
 
 
 def test_what_collides_with_nothing_hides_nothing_and_helps_nobody(tmp_path):
-    own, haunted = (scenarios.get(f"{name}:decisions=1,helpers=2") for name in (OWN, "env:haunted-v0"))
+    own, haunted = (
+        scenarios.get(f"{name}:decisions=1,helpers=2") for name in (OWN, "env:haunted-v0")
+    )
     seen = [World.start(each, 0).state() for each in (own, haunted)]
     assert (seen[1].vehicles, seen[1].buildings) == (seen[0].vehicles, seen[0].buildings)
-    graphs = [scene_graph(each, state, "v1") for each, state in zip((own, haunted), seen, strict=True)]
+    graphs = [
+        scene_graph(each, state, "v1") for each, state in zip((own, haunted), seen, strict=True)
+    ]
     assert graphs[0].sectors == graphs[1].sectors
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(
-    ("name", "config", "seed"), [("u-turn-v0", {}, "44"), ("highway-v0", {"vehicles_count": 6}, "3")]
+    ("name", "config", "seed"),
+    [("u-turn-v0", {}, "44"), ("highway-v0", {"vehicles_count": 6}, "3")],
 )
-def test_at_its_own_15_frames_a_second_it_freezes_as_it_drives(name, config, seed, tmp_path, harness):
-    """In these layouts a vehicle arrives 5.067 s after another: in 38 moments, and after the horizon."""
+def test_at_its_own_15_frames_a_second_it_freezes_as_it_drives(
+    name, config, seed, tmp_path, harness
+):
+    """In these layouts a vehicle arrives 5.067 s after another:
+    in 38 moments, and after the horizon.
+    """
     (tmp_path / "config.json").write_text(json.dumps(config))
     env = ("--env", f"{name}:decisions=3", "--env-config", "config.json", "--workers", "1")
     ask = ("--model", "local-view", "--condition", "single-local", "--seeds", "0")
@@ -223,7 +240,9 @@ def test_at_its_own_15_frames_a_second_it_freezes_as_it_drives(name, config, see
         assert code == 0, err
     walked, drove = (read(tmp_path / run) for run in ("walked", "drove"))
     for measure in ("failure", "time_s", "least_gap_m", "least_ttc_s", "least_pet_s"):
-        assert [getattr(e, measure) for e in walked.episodes] == [getattr(e, measure) for e in drove.episodes]
+        assert [getattr(e, measure) for e in walked.episodes] == [
+            getattr(e, measure) for e in drove.episodes
+        ]
     for measure in ("ttc_s", "pet_s"):
         np.testing.assert_array_equal(walked.decisions[measure], drove.decisions[measure])
 
@@ -231,13 +250,19 @@ def test_at_its_own_15_frames_a_second_it_freezes_as_it_drives(name, config, see
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "name",
-    sorted(name for name, spec in gymnasium.registry.items() if "highway_env" in str(spec.entry_point)),
+    sorted(
+        name for name, spec in gymnasium.registry.items() if "highway_env" in str(spec.entry_point)
+    ),
 )
 def test_every_environment_of_highway_env_freezes_or_says_why_not(name, tmp_path):
-    continuous = name.startswith(("parking", "racetrack", "lane-keeping")) or name == "intersection-v1"
+    continuous = (
+        name.startswith(("parking", "racetrack", "lane-keeping")) or name == "intersection-v1"
+    )
     says = pytest.raises(UserError, match="has no meta-actions but ContinuousAction; config")
     with says if continuous else nullcontext():
-        build(scenarios.get(f"env:{name}:decisions=2"), tmp_path / "set", 1, 0, 1, lambda done: None)
+        build(
+            scenarios.get(f"env:{name}:decisions=2"), tmp_path / "set", 1, 0, 1, lambda done: None
+        )
     assert continuous or check(tmp_path / "set") == []
 
 
@@ -257,12 +282,24 @@ def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_
     assert load(tmp_path / "set").lost == 2
     code, said, _ = harness("dataset", "check", tmp_path / "set")
     assert (code, "2 of 2 episodes are lost before the ego's first action" in said) == (0, True)
-    code, said, _ = harness("eval", "--model", "full-view", "--dataset", tmp_path / "set", "--out", "run")
+    code, said, _ = harness(
+        "eval", "--model", "full-view", "--dataset", tmp_path / "set", "--out", "run"
+    )
     assert code == 0
     lost = "2 of 2 episodes are lost before the ego's first action"
     assert lost in said
     assert lost in html.unescape((tmp_path / "run/report.html").read_text())
-    drive_it = ("drive", "--model", "full-view", "--env", "crashed-v0", "--episodes", "2", "--workers", "1")
+    drive_it = (
+        "drive",
+        "--model",
+        "full-view",
+        "--env",
+        "crashed-v0",
+        "--episodes",
+        "2",
+        "--workers",
+        "1",
+    )
     code, said, err = harness(*drive_it, "--first-seed", "0", "--seeds", "0", "--out", "driven")
     assert code == 0, err
     assert lost in " ".join(said.split())
@@ -299,7 +336,10 @@ def folder(tmp_path_factory):
     [
         "merge-v0",
         "two-way-v0",
-        *(pytest.param(env, marks=pytest.mark.exhaustive) for env in ("roundabout-v0", "highway-fast-v0")),
+        *(
+            pytest.param(env, marks=pytest.mark.exhaustive)
+            for env in ("roundabout-v0", "highway-fast-v0")
+        ),
     ],
 )
 def test_its_frames_are_those_of_its_own_step(env):
@@ -452,15 +492,26 @@ def test_its_dataset_is_sound_and_pins_its_configuration(folder):
     changed = folder.parent / "changed"
     changed.mkdir()
     (changed / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(UserError, match=r"its configuration has another stands_m; build the dataset again"):
+    with pytest.raises(
+        UserError, match=r"its configuration has another stands_m; build the dataset again"
+    ):
         load(changed)
 
 
 @pytest.mark.exhaustive
 def test_equal_builds_are_equal_bytes(folder, tmp_path):
     """The manifest has the digests of all bytes of each layout."""
-    build(scenarios.get(f"{OWN}:decisions=2,helpers=2"), tmp_path / "breakdown", 1, 0, 1, lambda done: None)
-    again, first = (json.loads((of / "manifest.json").read_text()) for of in (tmp_path / "breakdown", folder))
+    build(
+        scenarios.get(f"{OWN}:decisions=2,helpers=2"),
+        tmp_path / "breakdown",
+        1,
+        0,
+        1,
+        lambda done: None,
+    )
+    again, first = (
+        json.loads((of / "manifest.json").read_text()) for of in (tmp_path / "breakdown", folder)
+    )
     assert again["trees_sha256"] == first["trees_sha256"][:1]
     assert {key for key in first if again[key] != first[key]} == {
         "episodes",
@@ -481,13 +532,15 @@ def test_equal_builds_are_equal_bytes(folder, tmp_path):
 def test_stock_environments_freeze_as_they_drive_and_are_drawn(env, config, tmp_path):
     """`build` drives every reference driver too, and compares."""
     scenario = scenarios.get(named(env, config))
-    scenario = replace(scenario, parameters=replace(scenario.parameters, decisions=2, time_limit_s=4.0))
+    scenario = replace(
+        scenario, parameters=replace(scenario.parameters, decisions=2, time_limit_s=4.0)
+    )
     build(scenario, tmp_path / "stock", 1, 0, 1, lambda done: None)
     assert check(tmp_path / "stock") == []
     scenes = scenes_of(load(tmp_path / "stock"))
-    assert {driver for tree in load(tmp_path / "stock").trees for driver in tree.levels[0][0].drivers} == {
-        *DRIVERS
-    }
+    assert {
+        driver for tree in load(tmp_path / "stock").trees for driver in tree.levels[0][0].drivers
+    } == {*DRIVERS}
     picture = io.BytesIO()
     draw(scenes[0], picture, "svg")
     assert picture.getvalue().startswith(b"<?xml")
@@ -506,10 +559,22 @@ def test_the_commands_take_it_from_end_to_end(harness, folder, models):
         if model == "swarm-tiny":
             pytest.importorskip("torch")
         ran = harness(
-            "eval", "--model", model, "--dataset", folder, "--seeds", "0", "--condition", "6g", "--out", model
+            "eval",
+            "--model",
+            model,
+            "--dataset",
+            folder,
+            "--seeds",
+            "0",
+            "--condition",
+            "6g",
+            "--out",
+            model,
         )
         assert ran[0] == 0, ran
-        answers = [json.loads(line) for line in Path(model, "answers.jsonl").read_text().splitlines()]
+        answers = [
+            json.loads(line) for line in Path(model, "answers.jsonl").read_text().splitlines()
+        ]
         assert answers
     assert harness("report", *models, "--out", "page.html")[0] == 0
     drove = harness(
@@ -572,14 +637,22 @@ for kind in (Forgetful, Locked, Hasty, Broken, Rebuilt, Unlike):
         ("merge", {}, "give its version too, as in merge-v0"),
         ("mrge-v0", {}, "`mrge` doesn't exist"),
         ("no_such_package:MyEnv-v0", {}, "No module named 'no_such_package'; install the package"),
-        ("CartPole-v1", {}, "is a CartPoleEnv, no environment of highway-env; its class must be a subclass"),
+        ("CartPole-v1", {}, 
+            "is a CartPoleEnv, no environment of "
+            "highway-env; its class must be a subclass"),
         ("racetrack-v0", {}, "has no meta-actions but ContinuousAction; config"),
         ("intersection-v1", {}, "has no meta-actions but ContinuousAction; config"),
         ("racetrack-v0", SPEED_ONLY, "cannot be reset: AttributeError: 'functools.partial'"),
-        ("merge-v0", LANES_ONLY, "has no action FASTER, SLOWER; set `longitudinal` in its action config"),
-        ("merge-v0", {"policy_frequency": 2}, "simulation_frequency 15 is no multiple of policy_frequency 2"),
+        ("merge-v0", LANES_ONLY, 
+            "has no action FASTER, SLOWER; set "
+            "`longitudinal` in its action config"),
+        ("merge-v0", {"policy_frequency": 2}, 
+            "simulation_frequency 15 is no "
+            "multiple of policy_frequency 2"),
         ("merge-v0", {"policy_freqency": 1}, "did you mean 'policy_frequency'?"),
-        ("forgetful-v0", {}, "its traffic differs between two runs of seed 0; draw from env.np_random"),
+        ("forgetful-v0", {}, 
+            "its traffic differs between two runs of "
+            "seed 0; draw from env.np_random"),
         ("locked-v0", {}, "cannot be copied: TypeError: cannot pickle '_thread.lock' object"),
         ("hasty-v0", {}, "frame by frame its traffic is another than by its step()"),
         ("broken-v0", {}, "its step() fails: ZeroDivisionError: division by zero"),
@@ -597,8 +670,12 @@ def test_what_an_environment_lacks_is_said_in_a_line(env, config, said):
 def test_a_road_of_another_seed_is_refused():
     scenario = scenarios.get("env:rebuilt-v0")
     lanes = reset(scenario.name, 0).config["lanes_count"]
-    other = next(seed for seed in range(1, 9) if reset(scenario.name, seed).config["lanes_count"] != lanes)
-    with pytest.raises(UserError, match=rf"its road is another in seed {other} than in seed 0; fix it"):
+    other = next(
+        seed for seed in range(1, 9) if reset(scenario.name, seed).config["lanes_count"] != lanes
+    )
+    with pytest.raises(
+        UserError, match=rf"its road is another in seed {other} than in seed 0; fix it"
+    ):
         World.start(scenario, other)
 
 
@@ -608,7 +685,10 @@ def test_a_road_of_another_seed_is_refused():
         ((), "give either a scenario or --env"),
         (("do-not-pass", "--env", "merge-v0"), "give either a scenario or --env"),
         (("do-not-pass", "--env-config", "c.json"), "--env-config changes an environment"),
-        (("--env", "merge-v0", "--env-config", "missing.json"), "--env-config missing.json cannot be read"),
+        (
+            ("--env", "merge-v0", "--env-config", "missing.json"),
+            "--env-config missing.json cannot be read",
+        ),
         (("--env", "merge-v0", "--env-config", "list.json"), "its config is no JSON object"),
         (("--env", "merge-v0:decisions=0"), "decisions is 0; it must be from 1 to 10"),
         (("--env", "merge-v0:decisions=many"), "decisions is 'many'; give a number"),
@@ -636,18 +716,26 @@ def test_the_page_shows_the_environment_of_these_tests():
         ("env:os.path:breakdown-v0", "os.path"),
         (named("merge-v0", {"observation": {"type": "my_roads.Seen"}}), "my_roads"),
         (named("merge-v0", {"action": {"kinds": [{"type": "my-roads.Action"}]}}), "my-roads"),
-        (named("merge-v0", {"other_vehicles_type": "highway_environment.Car"}), "highway_environment"),
+        (
+            named("merge-v0", {"other_vehicles_type": "highway_environment.Car"}),
+            "highway_environment",
+        ),
     ],
 )
-def test_a_name_that_would_import_a_module_is_refused_unless_it_is_listed(name, module, monkeypatch):
+def test_a_name_that_would_import_a_module_is_refused_unless_it_is_listed(
+    name, module, monkeypatch
+):
     monkeypatch.setenv("SWARMDRIVE_IMPORTS", "other,my_road")
-    with pytest.raises(UserError, match=f"would import the module {module}; if you trust it, set SWARM"):
+    with pytest.raises(
+        UserError, match=f"would import the module {module}; if you trust it, set SWARM"
+    ):
         reset(name, 0)
     monkeypatch.setenv("SWARMDRIVE_IMPORTS", f"other, {module.partition('.')[0]}")
     said = ""
     try:
         reset(name, 0)
-    except (UserError, ValueError) as error:  # something else is wrong with it, now that it may be imported
+    # something else is wrong with it, now that it may be imported
+    except (UserError, ValueError) as error:
         said = str(error)
     assert not said if name == OWN else "would import" not in said
 

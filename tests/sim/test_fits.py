@@ -1,4 +1,6 @@
-"""What is read of a dataset is what its published JSON Schemas allow, as released and as written today."""
+"""What is read of a dataset is what its published JSON Schemas allow,
+as released and as written today.
+"""
 
 import copy
 import json
@@ -41,7 +43,13 @@ ANY_JSON = around(around(LEAF))
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The path of every member and item, however deep."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     return [p for key, inner in pairs for p in ((*path, key), *places(inner, (*path, key)))]
 
 
@@ -81,7 +89,11 @@ def released() -> dict[str, Any]:
 def test_the_published_schemas_are_schemas_and_allow_what_is_released(
     small: Dataset, released: dict[str, Any]
 ):
-    now = {"scene": record_schema(small.scenario), "tree": tree_schema(), "manifest": manifest_schema()}
+    now = {
+        "scene": record_schema(small.scenario),
+        "tree": tree_schema(),
+        "manifest": manifest_schema(),
+    }
     for name, value in released.items():
         for schema in (now[name], released_schema(name)):
             Draft202012Validator.check_schema(schema)
@@ -95,9 +107,13 @@ def test_every_frozen_record_and_tree_fits(small: Dataset):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(data=st.data())
-def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
+def test_a_changed_record_fits_where_the_published_schema_says_so(
+    small: Dataset, data: st.DataObject
+):
     record = changed(plain(data.draw(st.sampled_from(scenes_of(small))).record), data)
     valid = WholeNumbers(record_schema(small.scenario)).is_valid(record)
     if WholeNumbers(released_schema("scene")).is_valid(record):
@@ -106,9 +122,13 @@ def test_a_changed_record_fits_where_the_published_schema_says_so(small: Dataset
 
 
 @pytest.mark.slow
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(data=st.data())
-def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, data: st.DataObject):
+def test_a_changed_tree_fits_where_the_published_schema_says_so(
+    small: Dataset, data: st.DataObject
+):
     tree = msgspec.to_builtins(data.draw(st.sampled_from(small.trees)))
     # So that not every draw is of the middle of a large one.
     tree["levels"] = [level[:3] for level in tree["levels"][-2:]]
@@ -120,7 +140,9 @@ def test_a_changed_tree_fits_where_the_published_schema_says_so(small: Dataset, 
 
 
 @pytest.mark.slow
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(data=st.data())
 def test_a_changed_manifest_fits_where_the_published_schema_says_so(
     released: dict[str, Any], data: st.DataObject

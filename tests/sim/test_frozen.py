@@ -1,4 +1,6 @@
-"""The rule by which frozen episodes are judged, on trees drawn by hand and as properties of real ones."""
+"""The rule by which frozen episodes are judged,
+on trees drawn by hand and as properties of real ones.
+"""
 
 from dataclasses import replace
 
@@ -43,14 +45,18 @@ def two_steps() -> Forest:
     )
 
 
-def test_the_earliest_success_after_each_action_follows_from_the_leaves_backwards(two_steps: Forest) -> None:
+def test_the_earliest_success_after_each_action_follows_from_the_leaves_backwards(
+    two_steps: Forest,
+) -> None:
     assert two_steps.earliest_s.tolist() == [[4.6, 4.0], [5.2, 4.6], [np.inf, 4.0]]
 
 
 def test_an_action_is_safe_while_success_is_possible_and_its_delay_is_what_it_puts_off(
     two_steps: Forest,
 ) -> None:
-    """The full-view driver clears at 4 s, so 5 s is the latest: stopping twice is late, once is forgiven."""
+    """The full-view driver clears at 4 s, so 5 s is the latest:
+    stopping twice is late, once is forgiven.
+    """
     assert (two_steps.reference_s.tolist(), two_steps.limit_s.tolist()) == ([4.0], [5.01])
     assert two_steps.safe.tolist() == [[True, True], [False, True], [False, True]]
     assert two_steps.value.tolist() == [True, True, True]
@@ -75,7 +81,12 @@ def test_where_the_full_view_driver_fails_the_limit_is_that_of_time() -> None:
 
 def test_a_needless_stop_is_forgiven_in_danger_and_under_the_first_limits_only() -> None:
     start = point("start", GO, ends(STOP, "cleared", 4.6), ends(GO, "cleared", 4.0))
-    for limits, danger, safe in ((1, None, True), (1, "left", True), (2, "left", True), (2, None, False)):
+    for limits, danger, safe in (
+        (1, None, True),
+        (1, "left", True),
+        (2, "left", True),
+        (2, None, False),
+    ):
         tree = forest([start], limits=limits, danger=danger)
         assert tree.safe.tolist() == [[safe, True]]
         assert tree.false_alarm.tolist() == [[not safe, False]]
@@ -84,7 +95,9 @@ def test_a_needless_stop_is_forgiven_in_danger_and_under_the_first_limits_only()
 def test_a_decision_after_which_harm_is_inevitable_is_a_miss_and_one_that_is_late_alone_a_false_alarm() -> (
     None
 ):
-    """Stopping twice is late and can no longer collide; going collides only if the ego then stops."""
+    """Stopping twice is late and can no longer collide;
+    going collides only if the ego then stops.
+    """
     tree = forest(
         [point("start", GO, leads(STOP, 0), leads(GO, 1))],
         [
@@ -110,7 +123,9 @@ def test_where_nothing_can_be_saved_there_is_no_value_and_no_regret_to_come() ->
 
 
 def test_what_an_action_comes_to_with_the_full_view_driver_is_a_leaf(two_steps: Forest) -> None:
-    times = [[two_steps.end(edge).time_s for edge in row] for row in two_steps.then_full_view.tolist()]
+    times = [
+        [two_steps.end(edge).time_s for edge in row] for row in two_steps.then_full_view.tolist()
+    ]
     assert times == [[4.6, 4.0], [5.2, 4.6], [3.0, 4.0]]
 
 
@@ -118,7 +133,9 @@ def test_what_an_action_comes_to_with_the_full_view_driver_is_a_leaf(two_steps: 
 
 
 def test_a_course_is_lost_by_one_decision_or_was_lost_from_the_start(small: Dataset) -> None:
-    """Random walks: success is to have kept the value to the end, failure to have given it away once."""
+    """Random walks: success is to have kept the value to the end,
+    failure to have given it away once.
+    """
     f, rng = small.forest, np.random.default_rng(0)
     lost = 0
     for _ in range(200):
@@ -132,22 +149,30 @@ def test_a_course_is_lost_by_one_decision_or_was_lost_from_the_start(small: Data
     assert lost > 200
 
 
-def test_one_needless_stop_of_a_real_harmless_layout_is_late_under_the_second_limits(small: Dataset) -> None:
+def test_one_needless_stop_of_a_real_harmless_layout_is_late_under_the_second_limits(
+    small: Dataset,
+) -> None:
     harmless = [n for n, tree in enumerate(small.trees) if tree.danger.sector is None]
     for limits in (1, 2):
-        f = Forest.of(tuple(small.trees), small.actions, replace(small.scenario.parameters, limits=limits))
+        f = Forest.of(
+            tuple(small.trees), small.actions, replace(small.scenario.parameters, limits=limits)
+        )
         late = f.false_alarm[f.root[harmless], f.actions.index("SLOWER")]
         assert late.tolist() == [limits == 2] * len(harmless)
         assert f.driver_success("cruise")[harmless].all()
     assert harmless
 
 
-def test_harm_has_one_miss_and_lateness_one_false_alarm_unless_it_was_inevitable(small: Dataset) -> None:
+def test_harm_has_one_miss_and_lateness_one_false_alarm_unless_it_was_inevitable(
+    small: Dataset,
+) -> None:
     """Random walks, under both versions of the limits."""
     rng = np.random.default_rng(2)
     counts = {"unsafe": 0, "late": 0, "stuck": 0}
     for limits in (1, 2):
-        f = Forest.of(tuple(small.trees), small.actions, replace(small.scenario.parameters, limits=limits))
+        f = Forest.of(
+            tuple(small.trees), small.actions, replace(small.scenario.parameters, limits=limits)
+        )
         for _ in range(100):
             chosen = rng.integers(len(f.actions), size=len(f.ids))
             met, last = f.visited(chosen), f.last_edge(chosen)
@@ -173,7 +198,9 @@ def test_delays_along_a_success_add_up_to_what_it_is_behind_the_earliest(small: 
         chosen = rng.integers(len(f.actions), size=len(f.ids))
         last, met = f.last_edge(chosen), f.visited(chosen)
         success = f.succeeds(last, np.arange(len(f.root)))
-        delay_s = np.bincount(f.tree[met], weights=f.delay_s[met, chosen[met]], minlength=len(f.root))
+        delay_s = np.bincount(
+            f.tree[met], weights=f.delay_s[met, chosen[met]], minlength=len(f.root)
+        )
         behind_s = f.cleared_s[last] - f.earliest_s[f.root].min(axis=1)
         assert delay_s[success] == pytest.approx(behind_s[success])
 
@@ -182,4 +209,7 @@ def test_no_driver_beats_the_best_policy(small: Dataset) -> None:
     best = small.forest.value[small.forest.root]
     for driver in small.forest.drivers:
         assert (small.forest.driver_success(driver) <= best).all()
-    assert small.forest.driver_success("full-view").mean() > small.forest.driver_success("cruise").mean()
+    assert (
+        small.forest.driver_success("full-view").mean()
+        > small.forest.driver_success("cruise").mean()
+    )

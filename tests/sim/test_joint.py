@@ -159,7 +159,9 @@ def test_a_driver_that_does_better_is_the_best_found_and_one_as_good_leaves_the_
     worse, as_good = replace(plan, arrived=0.5, sum_s=NEVER_S + 5), replace(plan, lost_s=2.0)
     assert best_of({"cruise": worse, "full-view": as_good, JOINT: plan}) is plan
     better = replace(plan, sum_s=19.9)
-    assert best_of({"cruise": worse, "full-view": better, JOINT: plan}) == replace(better, exact=False)
+    assert best_of({"cruise": worse, "full-view": better, JOINT: plan}) == replace(
+        better, exact=False
+    )
     assert best_of({"cruise": plan, JOINT: worse}).success
 
 
@@ -180,7 +182,8 @@ def test_a_check_of_agents_states_figures_with_intervals_and_n(
         "--seed",
         2,
     )
-    code, out, _ = harness(*command, "--workers", 1, "--json")  # where it is slow, it says how far it is
+    # where it is slow, it says how far it is
+    code, out, _ = harness(*command, "--workers", 1, "--json")
     found = json.loads(out)
     assert (code, found["scenario"]) == (0, "all-way-crossing:agent_share=1")
     assert (found["unsolved"], found["inexact"]) == ([], [])
@@ -188,8 +191,13 @@ def test_a_check_of_agents_states_figures_with_intervals_and_n(
     assert found["policies"]["joint"]["success"]["value"] == 1.0
     code, out, _ = harness(*command, "--workers", 1)
     assert code == 0
-    assert "without a joint plan: 0\njoint is the best plan, searched to the end in all 1 episodes" in out
-    unproven = [of | {JOINT: replace(of[JOINT], exact=False)} for of in remembered(scenarios.get(TWO), [2])]
+    assert (
+        "without a joint plan: 0\njoint is the best plan, searched to the end in all 1 episodes"
+        in out
+    )
+    unproven = [
+        of | {JOINT: replace(of[JOINT], exact=False)} for of in remembered(scenarios.get(TWO), [2])
+    ]
     monkeypatch.setattr(policies, "drive_all", lambda *_: unproven)
     _, out, _ = harness(*command, "--workers", 1)
     assert "joint is the best found, and the best plan in 0 of 1 episodes" in out

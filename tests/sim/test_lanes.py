@@ -31,7 +31,9 @@ def car(x_m, y_m, speed_mps, heading_rad=0.0, way=("own", RIGHT), **more):
     )
 
 
-def test_a_change_of_lane_takes_the_ego_over_and_one_where_there_is_no_lane_leaves_it_there() -> None:
+def test_a_change_of_lane_takes_the_ego_over_and_one_where_there_is_no_lane_leaves_it_there() -> (
+    None
+):
     world = World.start(MOTORWAY, 2)
     assert (world.target(), world.target_after("LANE_RIGHT")) == ((RIGHT, 2), (RIGHT, 2))
     assert world.target_after("LANE_LEFT") == (LEFT, 2)
@@ -67,7 +69,8 @@ def test_the_planner_passes_a_car_that_stands_and_stays_where_the_lane_beside_is
     assert plan(MOTORWAY, on(MOTORWAY, stands)) == "LANE_LEFT"
     beside = structs.replace(stands, id="v6", x_m=-40.0, y_m=0.0, speed_mps=20.0, route=LEFT)
     assert plan(MOTORWAY, on(MOTORWAY, stands, beside)) == "SLOWER"
-    assert plan(MOTORWAY, on(MOTORWAY, structs.replace(stands, x_m=20.0))) == "IDLE"  # there is time
+    # there is time
+    assert plan(MOTORWAY, on(MOTORWAY, structs.replace(stands, x_m=20.0))) == "IDLE"
 
 
 def test_who_is_seen_to_brake_is_taken_to_stand_soon() -> None:
@@ -93,7 +96,9 @@ def test_the_van_hides_who_brakes_and_sees_it() -> None:
 
 def test_who_brakes_by_itself_comes_to_the_speed_it_was_given_and_no_lower() -> None:
     layout = MOTORWAY.layout(0, MOTORWAY.parameters)
-    spawns = [replace(s, brakes_at_s=1.0, brakes_mps2=4.0, brakes_to_mps=15.0) for s in layout.spawns[4:5]]
+    spawns = [
+        replace(s, brakes_at_s=1.0, brakes_mps2=4.0, brakes_to_mps=15.0) for s in layout.spawns[4:5]
+    ]
     alone = replace(MOTORWAY, layout=lambda *_: replace(layout, spawns=(layout.spawns[0], *spawns)))
     world = World.start(alone, 0)
     speeds = []
@@ -112,7 +117,9 @@ def outcome(world: World, *actions: str) -> Outcome:
 
 
 @pytest.mark.slow
-def test_passing_and_waiting_both_clear_where_they_should_and_waiting_for_nothing_never_does() -> None:
+def test_passing_and_waiting_both_clear_where_they_should_and_waiting_for_nothing_never_does() -> (
+    None
+):
     seeds = {TWO_WAY.layout(s, TWO_WAY.parameters).danger: s for s in range(20)}
     assert drive(TWO_WAY, "full-view", seeds[None]).success
     waits = outcome(World.start(TWO_WAY, seeds["oncoming"]), "IDLE")

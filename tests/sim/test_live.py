@@ -42,7 +42,9 @@ def test_a_check_counts_every_episode_once():
     alone = check(SCENARIO, 4, 5, 1, done.append)
     assert sum(done) == 4
     for driver in DRIVERS:
-        ends = [alone[driver][end] for end in ("success", "collision", "late", "time_out", "off_road")]
+        ends = [
+            alone[driver][end] for end in ("success", "collision", "late", "time_out", "off_road")
+        ]
         assert sum(e.value for e in ends) == 1.0
         assert {e.n for e in ends} == {4}
 
@@ -56,7 +58,15 @@ def test_a_summary_counts_ends_faults_and_crashes_of_others():
             Outcome("collision", 3.0, "v5", "other", "other"),
         ]
     )
-    rates = {end: found[end].value for end in ("success", "late", "collision", "time_out", "off_road")}
-    assert rates == {"success": 0.25, "late": 0.25, "collision": 0.5, "time_out": 0.0, "off_road": 0.0}
+    rates = {
+        end: found[end].value for end in ("success", "late", "collision", "time_out", "off_road")
+    }
+    assert rates == {
+        "success": 0.25,
+        "late": 0.25,
+        "collision": 0.5,
+        "time_out": 0.0,
+        "off_road": 0.0,
+    }
     assert (found["ego_at_fault"], found["other_at_fault"], found["other_crashes"]) == (1, 1, 2)
     assert 0.0 < found["success"].low < 0.25 < found["success"].high < 1.0

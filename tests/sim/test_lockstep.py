@@ -1,4 +1,6 @@
-"""Worlds that are simulated together are, to the last bit, what each becomes alone, and under highway-env."""
+"""Worlds that are simulated together are, to the last bit, what each becomes alone,
+and under highway-env.
+"""
 
 import numpy as np
 import one_way_crossing
@@ -39,7 +41,9 @@ def test_a_few_together_are_as_alone(name):
 
 
 def drive_apart_and_together(scenario, worlds):
-    """Whatever each decides, and whenever: none is in step with another, and they end one by one."""
+    """Whatever each decides, and whenever:
+    none is in step with another, and they end one by one.
+    """
     rng = np.random.default_rng(7)
     alone = [World.start(scenario, 2000 + n // 2) for n in range(worlds)]
     together, plain = ([world.branch() for world in alone] for _ in range(2))
@@ -57,7 +61,9 @@ def drive_apart_and_together(scenario, worlds):
                 highway_envs_frame(theirs)
         lockstep.advance(together, until)
         assert [poses(world) for world in plain] == [poses(world) for world in alone]
-        assert [world.outcome.result for world in plain] == [world.outcome.result for world in alone]
+        assert [world.outcome.result for world in plain] == [
+            world.outcome.result for world in alone
+        ]
         assert [everything(world) for world in together] == [everything(world) for world in alone]
     ends = {world.outcome.result for world in alone}
     assert len(ends) > 1, "no episode ended otherwise than the rest"

@@ -71,9 +71,13 @@ def test_a_danger_has_as_many_witnesses_as_are_declared(name: str, how: str) -> 
 def test_only_radios_move_with_the_number_of_witnesses(name: str) -> None:
     scenario = scenarios.get(name)
     for seed in range(4):
-        layouts = [layout(scenario, seed, witnesses=str(count), radio_share=0.0) for count in range(4)]
+        layouts = [
+            layout(scenario, seed, witnesses=str(count), radio_share=0.0) for count in range(4)
+        ]
         helpers = [{s.id for s in made.spawns if s.part == "helper"} for made in layouts]
-        places = [{replace(s, part="other") for s in made.spawns if s.part != "ego"} for made in layouts]
+        places = [
+            {replace(s, part="other") for s in made.spawns if s.part != "ego"} for made in layouts
+        ]
         assert places[3] < places[2] < places[1] < places[0]
         for fewer, more in pairwise(helpers):
             assert len(fewer & set(lookouts.LOOKOUTS)) + 1 == len(more & set(lookouts.LOOKOUTS))

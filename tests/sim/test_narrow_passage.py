@@ -64,11 +64,14 @@ def test_one_or_two_agents_come_from_either_side_one_behind_the_other():
     counts = set()
     for found in layouts():
         sides = [
-            [arrival_s(a) for a in agents(found) if (a.approach, a.route) == way] for way in (OWN, ONCOMING)
+            [arrival_s(a) for a in agents(found) if (a.approach, a.route) == way]
+            for way in (OWN, ONCOMING)
         ]
         for first_s, *second_s in map(sorted, sides):
             assert P.arrival_s[0] <= first_s <= P.arrival_s[1]
-            assert all(P.headway_s[0] - 1e-9 <= s - first_s <= P.headway_s[1] + 1e-9 for s in second_s)
+            assert all(
+                P.headway_s[0] - 1e-9 <= s - first_s <= P.headway_s[1] + 1e-9 for s in second_s
+            )
         assert agents(found)[0].id == "v1"
         assert arrival_s(agents(found)[0]) == min(sides[0])
         assert found.danger in (None, "right")
@@ -80,7 +83,9 @@ def test_neither_side_nor_id_tells_who_comes_first():
     first, seconds, by_id = [], [], {}
     for found in layouts():
         there = agents(found)
-        own, oncoming = ([arrival_s(a) for a in there if a.approach == way[0]] for way in (OWN, ONCOMING))
+        own, oncoming = (
+            [arrival_s(a) for a in there if a.approach == way[0]] for way in (OWN, ONCOMING)
+        )
         first.append(min(own) < min(oncoming))
         seconds.append((len(own), len(oncoming)))
         for one, other in combinations(there[1:], 2):

@@ -72,7 +72,8 @@ def test_a_failure_stays_what_it_is_and_makes_nobody_late(result):
 
 
 @pytest.mark.parametrize(
-    ("limits", "danger", "allowed_s"), [(1, None, 1.0), (1, "left", 1.0), (2, None, 0.25), (2, "left", 1.0)]
+    ("limits", "danger", "allowed_s"),
+    [(1, None, 1.0), (1, "left", 1.0), (2, None, 0.25), (2, "left", 1.0)],
 )
 def test_the_second_limits_forgive_less_where_there_is_no_danger(limits, danger, allowed_s):
     p = Parameters(limits=limits)

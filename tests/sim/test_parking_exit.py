@@ -1,4 +1,6 @@
-"""Pulling out between vans: what they hide, who sees it, and that a car that comes later is harmless."""
+"""Pulling out between vans: what they hide, who sees it,
+and that a car that comes later is harmless.
+"""
 
 from itertools import pairwise
 
@@ -67,7 +69,9 @@ def test_with_its_nose_in_the_lane_the_ego_sees_along_it():
 def test_it_waits_for_who_meets_it_and_for_nobody_who_comes_long_after_or_the_other_way():
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(VAN, COMES))) == "SLOWER"
     late = replace(COMES, x_m=-100.0)
-    oncoming = VehicleState("v7", "car", "other", 30.0, -3.5, np.pi, 9.0, "oncoming", "straight", False)
+    oncoming = VehicleState(
+        "v7", "car", "other", 30.0, -3.5, np.pi, 9.0, "oncoming", "straight", False
+    )
     assert plan(SCENARIO, truth_graph(SCENARIO, scene(VAN, late, oncoming))) == "IDLE"
 
 
@@ -86,7 +90,9 @@ def test_dangerous_and_later_cars_are_alike_but_for_when_they_come():
         for spawn in found.spawns:
             if (spawn.approach, spawn.part) == ("behind", "other"):
                 after_s = (meet.other_arc_m - spawn.arc_m) / spawn.speed_mps - ego_s
-                least_s, most_s = P.danger_offset_s if spawn.id == found.danger_id else P.late_offset_s
+                least_s, most_s = (
+                    P.danger_offset_s if spawn.id == found.danger_id else P.late_offset_s
+                )
                 assert least_s <= after_s <= most_s
                 assert P.lane_mps[0] <= spawn.speed_mps <= P.lane_mps[1]
 
@@ -95,7 +101,9 @@ def test_four_vans_and_the_ego_stand_in_a_row_and_do_not_touch():
     for found in LAYOUTS.values():
         path, ego = road().paths["kerb", "parked"], found.spawns[0]
         own = road().ego_path.at(ego.arc_m)[0]
-        row = [(path.at(s.arc_m)[0], SIZES_M["van"][0]) for s in found.spawns if s.approach == "kerb"]
+        row = [
+            (path.at(s.arc_m)[0], SIZES_M["van"][0]) for s in found.spawns if s.approach == "kerb"
+        ]
         row = sorted([*row, (own, SIZES_M["car"][0])])
         assert [length for _, length in row] == [6.5, 6.5, 6.5, 5.0, 6.5]
         for (x, length), (ahead, its_length) in pairwise(row):

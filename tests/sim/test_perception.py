@@ -1,4 +1,6 @@
-"""Sensors, lines of sight and scene graphs, on scenes placed by hand, and that nothing hidden leaks."""
+"""Sensors, lines of sight and scene graphs, on scenes placed by hand,
+and that nothing hidden leaks.
+"""
 
 import dataclasses
 import math
@@ -20,7 +22,9 @@ NORTH, EAST, SOUTH, WEST = -math.pi / 2, 0.0, math.pi / 2, math.pi
 EGO = VehicleState("v1", "car", "ego", 2.0, 52.0, NORTH, 14.0, "own", "straight", False)
 
 
-def other(x, y, heading=NORTH, speed=10.0, kind="car", approach="left", route="straight", vehicle="v5"):
+def other(
+    x, y, heading=NORTH, speed=10.0, kind="car", approach="left", route="straight", vehicle="v5"
+):
     return VehicleState(vehicle, kind, "other", x, y, heading, speed, approach, route, False)
 
 
@@ -37,7 +41,9 @@ def seen(state, viewer=None):
 def ahead(distance_m, off_axis_deg=0.0, **kwargs):
     """A car at a bearing from the ego's heading, clockwise."""
     angle = NORTH + math.radians(off_axis_deg)
-    return other(EGO.x_m + distance_m * math.cos(angle), EGO.y_m + distance_m * math.sin(angle), **kwargs)
+    return other(
+        EGO.x_m + distance_m * math.cos(angle), EGO.y_m + distance_m * math.sin(angle), **kwargs
+    )
 
 
 # Lines of sight.
@@ -52,7 +58,8 @@ def test_a_car_behind_a_building_is_not_seen_and_one_beside_it_is():
 
 
 def test_a_car_that_looks_out_from_behind_a_corner_is_seen():
-    # From (2, 52) the building's south-east corner (10, 30) hides what is west of x = 20.9 at y = 0.
+    # From (2, 52) the building's south-east corner (10, 30) hides what is west of x = 20.9 at y =
+    # 0.
     hidden, half = other(17.0, 0.0, heading=EAST), other(21.0, 0.0, heading=EAST)
     assert seen(scene(hidden, buildings=[WALL])) == {}
     assert seen(scene(half, buildings=[WALL])).keys() == {"v5"}
@@ -147,8 +154,12 @@ def test_a_truck_that_is_reported_hides_the_car_right_behind_it():
 
 
 def test_of_two_that_would_take_turns_in_hiding_each_other_none_is_reported():
-    # Crashed into each other far away: three rays come to each alone, and fewer to either beside the other.
-    one, two = other(1.204, -86.629, heading=-1.585), other(1.3734, -86.6521, heading=-1.519, vehicle="v6")
+    # Crashed into each other far away: three rays come to each alone, and fewer to either beside
+    # the other.
+    one, two = (
+        other(1.204, -86.629, heading=-1.585),
+        other(1.3734, -86.6521, heading=-1.519, vehicle="v6"),
+    )
     assert reported(scene(one)) == ["v5"]
     assert reported(scene(two)) == ["v6"]
     assert reported(scene(one, two)) == []
@@ -181,7 +192,8 @@ def test_lidar_noise_is_what_is_stated():
 def test_radar_noise_is_what_is_stated():
     found = draws(100.0)
     assert spread([d.y_m for d in found]) == pytest.approx(0.4, rel=0.06)  # range, straight ahead
-    assert spread([d.x_m for d in found]) == pytest.approx(100.0 * math.radians(1.0), rel=0.06)  # bearing
+    # bearing
+    assert spread([d.x_m for d in found]) == pytest.approx(100.0 * math.radians(1.0), rel=0.06)
     assert spread([d.range_rate_mps for d in found]) == pytest.approx(0.15, rel=0.06)
     assert spread([d.speed_mps for d in found]) == pytest.approx(0.2, rel=0.06)
 
@@ -347,7 +359,8 @@ def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions
     for world in worlds:
         state, danger = world.state(), world.layout.danger_id
         views = [
-            {n.id for n in scene_graph(SCENARIO, state, v.id).nodes} for v in (state.ego, *state.helpers)
+            {n.id for n in scene_graph(SCENARIO, state, v.id).nodes}
+            for v in (state.ego, *state.helpers)
         ]
         hidden += danger not in views[0]
         helped += any(danger in view for view in views[1:])

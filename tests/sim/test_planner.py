@@ -36,7 +36,9 @@ CLOSE = structs.replace(EGO, y_m=24.0)  # 22 m before
 
 
 def graph(*others, ego=EGO, target_mps=14.0, step=1):
-    return truth_graph(SCENARIO, WorldState("by hand", 0, step, float(step), target_mps, (ego, *others), ()))
+    return truth_graph(
+        SCENARIO, WorldState("by hand", 0, step, float(step), target_mps, (ego, *others), ())
+    )
 
 
 def from_left(x_m, speed_mps=10.0):
@@ -60,7 +62,9 @@ def test_on_an_empty_road_it_keeps_going():
 
 
 def test_it_speeds_up_on_an_empty_road_when_slow():
-    assert plan(SCENARIO, graph(ego=structs.replace(EGO, speed_mps=7.0), target_mps=7.0)) == "FASTER"
+    assert (
+        plan(SCENARIO, graph(ego=structs.replace(EGO, speed_mps=7.0), target_mps=7.0)) == "FASTER"
+    )
 
 
 def test_it_slows_for_a_car_that_it_would_meet_and_not_before_it_must():
@@ -80,7 +84,8 @@ def test_it_does_not_guess_at_what_the_graph_does_not_list():
 
 
 def test_where_every_way_ends_in_a_collision_it_takes_the_one_with_the_widest_gap():
-    # 14 m before the crossing, with a car 10 m from it: too late for anything but the least of evils.
+    # 14 m before the crossing, with a car 10 m from it: too late for anything but the least of
+    # evils.
     scene = graph(from_left(2.0 - 10.0), ego=structs.replace(EGO, y_m=16.0))
     gaps = {a: gap(travelled_m([(a,)], 5), scene)[0] for a in ACTIONS}
     assert max(gaps.values()) < 0.0
@@ -101,7 +106,8 @@ def test_its_model_of_motion_follows_the_simulator(first, second):
 
 
 def test_the_gap_to_a_car_standing_on_the_crossing_is_what_the_discs_leave():
-    # An ego that stays 20 m short of a car standing at the crossing; discs reach 5/3 m plus their radius.
+    # An ego that stays 20 m short of a car standing at the crossing; discs reach 5/3 m plus their
+    # radius.
     scene = graph(from_left(2.0, speed_mps=0.0))
     travelled = np.full((1, 90), scene.conflicts[0].ego.arc_m - 20.0)
     assert gap(travelled, scene) == pytest.approx([20.0 - 5.0 / 3 - TOUCHING_M], abs=0.1)
@@ -115,7 +121,9 @@ def test_an_ego_on_top_of_another_has_a_gap_below_zero():
 
 @pytest.mark.slow
 def test_who_overtakes_plans_the_way_back_under_limits_2():
-    """What comes late hinders one who does not: in all that it plays it stays on the wrong lane for good."""
+    """What comes late hinders one who does not:
+    in all that it plays it stays on the wrong lane for good.
+    """
     seeds = 200006, 201020, 202134  # no danger, and a car that comes long after
     for limits, results in ((1, ["time_out", "time_out", "collision"]), (2, ["cleared"] * 3)):
         scenario = scenarios.get(f"do-not-pass:{SETTINGS},limits={limits}")
@@ -126,7 +134,12 @@ def test_who_overtakes_plans_the_way_back_under_limits_2():
 def test_only_the_full_view_driver_reads_the_truth():
     hidden, truth = graph(ego=CLOSE), graph(from_left(2.0 - 15.7), ego=CLOSE)
     chosen = {driver: choose(SCENARIO, driver, hidden, truth) for driver in DRIVERS}
-    assert chosen == {"cruise": "IDLE", "brake": "SLOWER", "local-view": "IDLE", "full-view": "SLOWER"}
+    assert chosen == {
+        "cruise": "IDLE",
+        "brake": "SLOWER",
+        "local-view": "IDLE",
+        "full-view": "SLOWER",
+    }
     with pytest.raises(ValueError, match="not given the graph that it reads"):
         choose(SCENARIO, "full-view", hidden, None)
 
@@ -138,7 +151,9 @@ def test_many_graphs_are_planned_together_as_each_alone(name):
     states, worlds = [], [World.start(scenario, seed) for seed in range(4)]
     for step in range(3):
         states += [world.state() for world in worlds]
-        act_together(worlds, [scenario.actions[(seed + step) % len(scenario.actions)] for seed in range(4)])
+        act_together(
+            worlds, [scenario.actions[(seed + step) % len(scenario.actions)] for seed in range(4)]
+        )
     graphs = truth_graphs(scenario, states)
     assert plans(scenario, graphs) == [plan(scenario, graph) for graph in graphs]
 
@@ -146,7 +161,9 @@ def test_many_graphs_are_planned_together_as_each_alone(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", scenarios.names())
 def test_gaps_are_those_of_all_moments_wherever_the_ego_would_touch_somebody(name):
-    """Moments in which two are far apart are left out; what is left decides each gap that is not wide."""
+    """Moments in which two are far apart are left out;
+    what is left decides each gap that is not wide.
+    """
     scenario, rng = scenarios.get(name), np.random.default_rng(0)
     road, touched = scenario.road(), 0
     worlds = [World.start(scenario, seed) for seed in range(8)]
@@ -157,7 +174,9 @@ def test_gaps_are_those_of_all_moments_wherever_the_ego_would_touch_somebody(nam
         travelled = speeds * STEP_S * np.arange(1, 91)
         tried = Rollouts(travelled, None, np.arange(8))
         for motion in predicted(road, graph, 90):
-            near, all_moments = (least_gap(tried, motion, within_m=within_m) for within_m in (0.0, 1e4))
+            near, all_moments = (
+                least_gap(tried, motion, within_m=within_m) for within_m in (0.0, 1e4)
+            )
             assert np.array_equal(np.minimum(near, 0.0), np.minimum(all_moments, 0.0))
             touched += int((near < 0).sum())
     assert touched

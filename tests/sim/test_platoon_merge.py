@@ -1,4 +1,6 @@
-"""The merge into a platoon: rows of cars, who sees whom from which seat, and that somebody must give way."""
+"""The merge into a platoon: rows of cars, who sees whom from which seat,
+and that somebody must give way.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -57,7 +59,9 @@ def test_a_row_has_two_or_three_agents_and_one_place_more_that_may_be_taken():
     for found in layouts().values():
         counts[len(members(found))] += 1
         times = late_s(found)
-        row = [times[id_] for id_ in (*members(found), *([found.danger_id] if found.danger else []))]
+        row = [
+            times[id_] for id_ in (*members(found), *([found.danger_id] if found.danger else []))
+        ]
         steps = [later - earlier for earlier, later in pairwise(sorted(row))]
         wide = [step for step in steps if step > P.headway_s[1] + 1e-9]
         assert len(wide) <= (not found.danger)
@@ -65,7 +69,9 @@ def test_a_row_has_two_or_three_agents_and_one_place_more_that_may_be_taken():
         assert all(step >= P.headway_s[0] - 1e-9 for step in steps)
         assert {s.speed_mps for s in found.spawns} == {P.speed_mps}
         assert all(
-            road().paths[MAIN].at(s.arc_m)[0] < P.cleared_m for s in found.spawns if s.approach == "main"
+            road().paths[MAIN].at(s.arc_m)[0] < P.cleared_m
+            for s in found.spawns
+            if s.approach == "main"
         )
         if found.danger:
             assert P.offset_s[0] <= times[found.danger_id] <= P.offset_s[1]
@@ -117,14 +123,24 @@ def test_each_seat_has_its_words_and_its_goal():
 
 
 def test_a_car_on_the_left_lane_is_nobodys_business():
-    assert plan(SCENARIO, truth_graph(SCENARIO, scene(EGO, structs.replace(BESIDE, x_m=-50.0)))) == "IDLE"
-    assert plan(SCENARIO, truth_graph(SCENARIO, scene(EGO, structs.replace(OTHER, x_m=-50.0)))) == "SLOWER"
+    assert (
+        plan(SCENARIO, truth_graph(SCENARIO, scene(EGO, structs.replace(BESIDE, x_m=-50.0))))
+        == "IDLE"
+    )
+    assert (
+        plan(SCENARIO, truth_graph(SCENARIO, scene(EGO, structs.replace(OTHER, x_m=-50.0))))
+        == "SLOWER"
+    )
 
 
 @pytest.mark.exhaustive
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
-    met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
+    met = [
+        layouts()[seed].danger_id == out.partner
+        for seed, out in cruising.items()
+        if not out.success
+    ]
     assert 0.3 < len(met) / len(cruising) < 0.7
     assert 0.1 < sum(met) / len(met) < 0.9
     assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())

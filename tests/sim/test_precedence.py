@@ -1,4 +1,6 @@
-"""Drivers that keep a rule of the road: who goes first, and what a vehicle that gives way plans with."""
+"""Drivers that keep a rule of the road:
+who goes first, and what a vehicle that gives way plans with.
+"""
 
 from dataclasses import replace
 
@@ -49,10 +51,16 @@ def test_of_two_who_come_head_on_nearly_always_one_gives_way() -> None:
         world = World.start(scenarios.get(f"narrow-passage:{KNOWN}"), seed)
         for agent in world.journeys:
             seen = graph(world, agent)
-            kept = [c.vehicle for c in under("first-come", seat(world, agent), seen).conflicts if c.meets]
+            kept = [
+                c.vehicle
+                for c in under("first-come", seat(world, agent), seen).conflicts
+                if c.meets
+            ]
             met = {c.vehicle for c in seen.conflicts if c.meets and c.vehicle in ASKED}
             pairs |= {(seed, seen.viewer, other): kept.count(other) for other in met}
-    times = [sorted((count, pairs[seed, other, own])) for (seed, own, other), count in pairs.items()]
+    times = [
+        sorted((count, pairs[seed, other, own])) for (seed, own, other), count in pairs.items()
+    ]
     assert len(times) > 24
     assert times.count([0, 3]) > 0.9 * len(times)
 
@@ -106,6 +114,7 @@ def test_a_reference_driver_drives_every_agent() -> None:
     reference.finish(worlds, ["first-come"] * 4 + ["cruise"] * 4)
     assert all(world.ended for world in worlds)
     ended = [
-        sum(j.outcome.success for w in half for j in w.journeys.values()) for half in (worlds[:6], worlds[6:])
+        sum(j.outcome.success for w in half for j in w.journeys.values())
+        for half in (worlds[:6], worlds[6:])
     ]
     assert ended[0] > ended[1]

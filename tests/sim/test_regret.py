@@ -13,7 +13,9 @@ FAR, AWAY, HERE = (100.0, 0.0, 0.0), (-100.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
 def option(actions: str, arrives_s: float, *places: tuple[float, float, float]) -> Options:
-    """Return an agent's only option: a letter for each action, and where it is in each of four seconds."""
+    """Return an agent's only option: a letter for each action,
+    and where it is in each of four seconds.
+    """
     return Options(
         [tuple(actions)], np.array([arrives_s]), np.array(places)[None, :, None], np.ones((1, 2)), 1
     )
@@ -47,9 +49,11 @@ def test_regret_by_hand() -> None:
         return regret({0: own, 1: able(OTHER)}, {0: course, 1: OTHER})
 
     assert of_both(WAIT) == Regret(best_decisions=1.0, gave_away=0.0, regret_s=0.0)
-    assert of_both(WAIT_LONG) == Regret(best_decisions=3 / 4, gave_away=0.0, regret_s=(1.0 + 0.0) / 2)
-    # Who rushes could have waited: its first decision cost half a second, its second the arrival. The other
-    # could do nothing, so it is not judged.
+    assert of_both(WAIT_LONG) == Regret(
+        best_decisions=3 / 4, gave_away=0.0, regret_s=(1.0 + 0.0) / 2
+    )
+    # Who rushes could have waited: its first decision cost half a second, its second the arrival.
+    # The other could do nothing, so it is not judged.
     rushed = of_both(RUSH)
     assert (rushed.best_decisions, rushed.gave_away) == (0.0, 1.0)
     assert np.isnan(rushed.regret_s)

@@ -44,7 +44,8 @@ def test_the_right_of_way_is_highway_envs(network, approach, route):
 
 
 def test_conflict_points_lie_where_geometry_puts_them():
-    # Lane centres are 2 m off the centre lines; a left turn is a circle of radius 13 m about (11, ±11).
+    # Lane centres are 2 m off the centre lines; a left turn is a circle of radius 13 m about (11,
+    # ±11).
     dip = 11 - math.sqrt(13**2 - 9**2)
     turned = 13 * math.atan2(math.sqrt(13**2 - 9**2), 9)
     by_hand = {
@@ -53,7 +54,8 @@ def test_conflict_points_lie_where_geometry_puts_them():
         ("oncoming", "left"): (2.0, -dip, 111.0 + dip, 100.0 + turned),
         ("right", "left"): (2.0, dip, 111.0 - dip, 100.0 + 13 * math.pi / 2 - turned),
     }
-    assert road().crossings.keys() == by_hand.keys()  # the others merge with the ego's lane or never meet it
+    # the others merge with the ego's lane or never meet it
+    assert road().crossings.keys() == by_hand.keys()
     for key, expected in by_hand.items():
         c = road().crossings[key]
         assert (c.x_m, c.y_m, c.ego_arc_m) == pytest.approx(expected[:3], abs=0.005)
@@ -63,7 +65,9 @@ def test_arc_lengths_to_the_conflict_points_are_those_of_the_lanes():
     assert road().crossings["left", "straight"].other_arc_m == pytest.approx(113.0, abs=0.01)
     assert road().crossings["right", "straight"].other_arc_m == pytest.approx(109.0, abs=0.01)
     on_circle = 13 * math.atan2(math.sqrt(13**2 - 9**2), 9)
-    assert road().crossings["oncoming", "left"].other_arc_m == pytest.approx(100.0 + on_circle, abs=0.05)
+    assert road().crossings["oncoming", "left"].other_arc_m == pytest.approx(
+        100.0 + on_circle, abs=0.05
+    )
 
 
 def test_the_conflict_zone_is_the_centroid_of_the_three_dangers_conflict_points():
@@ -76,7 +80,9 @@ def test_the_conflict_zone_is_the_centroid_of_the_three_dangers_conflict_points(
 def test_a_point_beside_a_path_projects_back_to_its_foot(key, arc_m, aside_m):
     path = paths()[key]
     x, y, heading = path.at(arc_m)
-    found, lateral, along = path.project(x - aside_m * math.sin(heading), y + aside_m * math.cos(heading))
+    found, lateral, along = path.project(
+        x - aside_m * math.sin(heading), y + aside_m * math.cos(heading)
+    )
     assert found == pytest.approx(arc_m, abs=0.1)
     assert lateral == pytest.approx(abs(aside_m), abs=0.05)
     assert math.cos(along - heading) > 0.999
@@ -97,10 +103,14 @@ def test_lane_roles_are_named_from_the_egos_seat():
 
 
 @pytest.mark.parametrize("name", scenarios.names())
-def test_the_nearest_point_of_a_path_is_found_where_it_bends_and_where_it_does_not(name: str) -> None:
+def test_the_nearest_point_of_a_path_is_found_where_it_bends_and_where_it_does_not(
+    name: str,
+) -> None:
     draws = np.random.default_rng(0)
     for path in scenarios.get(name).road().paths.values():
-        between = (path.points[1:] + path.points[:-1])[draws.integers(len(path.points) - 1, size=50)] / 2
+        between = (path.points[1:] + path.points[:-1])[
+            draws.integers(len(path.points) - 1, size=50)
+        ] / 2
         x, y = np.concatenate([draws.normal(0, 80, (200, 2)), between, path.points[[0, -1]]]).T
         gaps = np.hypot(path.columns[0] - x[:, None], path.columns[1] - y[:, None])
         nearest = gaps.argmin(axis=1)

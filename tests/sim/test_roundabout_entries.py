@@ -1,4 +1,6 @@
-"""The roundabout with several agents: one scene from three arms, who meets whom, and what hedges hide."""
+"""The roundabout with several agents: one scene from three arms, who meets whom,
+and what hedges hide.
+"""
 
 import math
 from dataclasses import replace
@@ -73,7 +75,9 @@ def test_a_way_is_the_same_from_every_seat_whatever_its_name():
 def test_it_meets_who_passes_its_entry_and_whose_entry_it_passes(arm):
     meets = road(arm).crossings
     begin = road(arm).ego_path.ends_m
-    here = {key for key, meet in meets.items() if meet.ego_arc_m == pytest.approx(begin[1], abs=0.01)}
+    here = {
+        key for key, meet in meets.items() if meet.ego_arc_m == pytest.approx(begin[1], abs=0.01)
+    }
     assert here == {("left", "straight"), ("left", "left"), ("oncoming", "left")}
     assert meets.keys() - here == {("right", "straight"), ("right", "right")}
     assert {meets[key].ego_arc_m for key in meets.keys() - here} == {begin[3]}
@@ -81,7 +85,9 @@ def test_it_meets_who_passes_its_entry_and_whose_entry_it_passes(arm):
 
 
 def views(state, agent):
-    """An agent's scenario, the scene from its seat, what is true there and what it knows of agents."""
+    """An agent's scenario, the scene from its seat,
+    what is true there and what it knows of agents.
+    """
     scenario = seat_of(SCENARIO, state.vehicles[agent]).scenario if agent else SCENARIO
     mine = seated(SCENARIO, state, agent) if agent else state
     known = scene_graph(replace(scenario, parameters=KNOWN), mine, mine.ego.id)
@@ -98,7 +104,9 @@ def test_who_enters_gives_way_to_who_comes_round_from_whichever_seat(chain, agen
     ]
     scenario, mine, truth, known = views(scene(*sorted(cars, key=lambda v: v.id)), agent)
     for graph in (truth, known):
-        assert [(c.sector, c.route, c.kind) for c in graph.conflicts] == [("left", "straight", "merging")]
+        assert [(c.sector, c.route, c.kind) for c in graph.conflicts] == [
+            ("left", "straight", "merging")
+        ]
     assert plan(scenario, truth) == "SLOWER"
     assert plan(scenario, truth_graph(scenario, replaced(mine, vehicles=(mine.ego,)))) == "IDLE"
 
@@ -118,7 +126,10 @@ def test_a_car_that_leaves_before_the_ego_is_harmless_and_shows_it():
         _, _, truth, known = views(scene(*cars), 0)
         assert plan(SCENARIO, truth) == expected
         assert known.nodes == ()
-        assert {sector.sector for sector in known.sectors if sector.occluded} == {"left", "oncoming"}
+        assert {sector.sector for sector in known.sectors if sector.occluded} == {
+            "left",
+            "oncoming",
+        }
         assert truth.nodes[0].indicator == ("right" if leaves == 2 else "left")
 
 
@@ -176,7 +187,11 @@ def test_an_agent_has_cleared_where_it_has_left_the_ring_past_the_next_entry(arm
 @pytest.mark.exhaustive
 def test_who_sees_everything_clears_and_who_cruises_meets_agents_and_dangers():
     cruising = drive_together(SCENARIO, "cruise", range(60))
-    met = [layouts()[seed].danger_id == out.partner for seed, out in cruising.items() if not out.success]
+    met = [
+        layouts()[seed].danger_id == out.partner
+        for seed, out in cruising.items()
+        if not out.success
+    ]
     assert 0.6 < len(met) / len(cruising) < 0.95
     assert 0.1 < sum(met) / len(met) < 0.9
     assert all(out.success for out in drive_together(SCENARIO, "full-view", range(8)).values())

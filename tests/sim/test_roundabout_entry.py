@@ -1,4 +1,6 @@
-"""The roundabout: what hides who comes round, who sees it, and that a car which leaves is harmless."""
+"""The roundabout: what hides who comes round, who sees it,
+and that a car which leaves is harmless.
+"""
 
 import math
 from dataclasses import replace
@@ -31,15 +33,27 @@ def at(id_, part, way, arc_m, speed_mps):
 
 
 def scene(route, back_m=20.0, buildings=None):
-    """An ego 20 m before it enters, a car as far before the same place on the ring, and two helpers."""
+    """An ego 20 m before it enters, a car as far before the same place on the ring,
+    and two helpers.
+    """
     meet = road().crossings["left", "straight"]
     vehicles = (
         at("v1", "ego", ("own", "straight"), meet.ego_arc_m - 20.0, 8.0),
-        at("v2", "helper", ("oncoming", "right"), road().paths["oncoming", "right"].ends_m[-2] + 18.0, 6.0),
+        at(
+            "v2",
+            "helper",
+            ("oncoming", "right"),
+            road().paths["oncoming", "right"].ends_m[-2] + 18.0,
+            6.0,
+        ),
         at("v3", "helper", ("own", "left"), road().paths["own", "left"].ends_m[-2] + 12.0, 6.0),
         at("v5", "other", ("left", route), meet.other_arc_m - back_m, 8.0),
     )
-    found = layout(0, replace(P, hedge_end_m=(24.0, 24.0))).buildings if buildings is None else buildings
+    found = (
+        layout(0, replace(P, hedge_end_m=(24.0, 24.0))).buildings
+        if buildings is None
+        else buildings
+    )
     return WorldState("by hand", 0, 1, 1.0, 8.0, vehicles, found)
 
 
@@ -61,7 +75,9 @@ def test_the_hedge_hides_from_the_ego_what_two_helpers_see():
     assert "v5" not in listed(scene_graph(SCENARIO, hidden, "v1"))
     assert "v5" in listed(scene_graph(SCENARIO, scene("straight", buildings=()), "v1"))
     for helper in ("v2", "v3"):
-        (conflict,) = [c for c in scene_graph(SCENARIO, hidden, helper).conflicts if c.kind == "merging"]
+        (conflict,) = [
+            c for c in scene_graph(SCENARIO, hidden, helper).conflicts if c.kind == "merging"
+        ]
         assert (conflict.vehicle, conflict.sector) == ("v5", "left")
         assert conflict.ego.arc_m == pytest.approx(20.0, abs=0.5)
         assert conflict.other.arc_m == pytest.approx(20.0, abs=0.5)
@@ -121,7 +137,8 @@ def test_a_danger_is_where_the_ego_enters_within_the_drawn_offset_and_at_a_real_
 def test_who_begins_in_the_midst_of_its_way_keeps_to_it_and_so_does_its_copy():
     world = World.start(SCENARIO, seeds("oncoming")[0])
     helper, danger = (
-        next(v for v in world.road.vehicles if v.spawn.id == id_) for id_ in ("v3", world.layout.danger_id)
+        next(v for v in world.road.vehicles if v.spawn.id == id_)
+        for id_ in ("v3", world.layout.danger_id)
     )
     for _ in range(3):
         world.act("SLOWER")

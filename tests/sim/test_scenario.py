@@ -36,7 +36,8 @@ def test_an_unknown_scenario_is_an_error_that_names_the_nearest():
 def test_dangers_come_as_often_and_from_where_the_parameters_say(layouts):
     sectors = Counter(found.danger for found in layouts)
     dangerous = len(layouts) - sectors[None]
-    assert dangerous / len(layouts) == pytest.approx(P.danger_share, abs=0.033)  # three standard errors
+    # three standard errors
+    assert dangerous / len(layouts) == pytest.approx(P.danger_share, abs=0.033)
     for sector, share in zip(SECTORS, P.sector_shares, strict=True):
         assert sectors[sector] / dangerous == pytest.approx(share, abs=0.045)
 
@@ -95,7 +96,9 @@ def test_a_harmless_car_is_like_a_dangerous_one_but_late(layouts):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [range(20), pytest.param(range(20, 60), marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    "seeds", [range(20), pytest.param(range(20, 60), marks=pytest.mark.exhaustive)]
+)
 def test_nobody_touches_anybody_before_the_ego_does(seeds):
     worlds = [World.start(SCENARIO, seed) for seed in seeds]
     go_on_together(worlds, "IDLE")
@@ -105,12 +108,14 @@ def test_nobody_touches_anybody_before_the_ego_does(seeds):
 def test_a_car_from_the_left_passes_just_behind_the_truck_or_later():
     """The truck's centre is where their lanes cross after 4 s.
 
-    Its tail is off the car's way 6 m later, 0.75 s at 8 m/s. The car is on the truck's way from 3.8 m before,
-    0.38 s at 10 m/s, with 0.15 s to spare, and meets the ego 4 m on.
+    Its tail is off the car's way 6 m later, 0.75 s at 8 m/s. The car is on the truck's way from 3.8
+    m before, 0.38 s at 10 m/s, with 0.15 s to spare, and meets the ego 4 m on.
     """
     at = road().crossings["left", "straight"]
     here = road().paths["oncoming", "straight"].project(-2.0, at.y_m)[0]
-    assert behind_truck_s("left", 10.0, here - 32.0, 8.0) == pytest.approx(4 + 0.75 + 0.38 + 0.15 + 0.4)
+    assert behind_truck_s("left", 10.0, here - 32.0, 8.0) == pytest.approx(
+        4 + 0.75 + 0.38 + 0.15 + 0.4
+    )
 
 
 def test_ego_and_helpers_have_the_same_ids_in_every_episode(layouts):
@@ -136,7 +141,9 @@ def test_whatever_is_not_the_danger_is_where_it_would_be_without_it():
         with_danger, without = layout(seed, P), layout(seed, replace(P, danger_share=0.0))
         assert with_danger.buildings == without.buildings
         assert with_danger.spawns[:4] == without.spawns[:4]
-        assert {s for s in with_danger.spawns if s.id != with_danger.danger_id} == set(without.spawns)
+        assert {s for s in with_danger.spawns if s.id != with_danger.danger_id} == set(
+            without.spawns
+        )
 
 
 def test_one_dial_moves_one_thing():
@@ -161,8 +168,14 @@ def test_buildings_leave_the_road_free_and_stand_one_a_corner(layouts):
     [
         ({"simulation_hz": 1e9}, "simulation_hz is 1000000000; it must be from 1 to 1000"),
         ({"simulation_hz": 0.5}, "simulation_hz = 0.5; allowed: a whole number"),
-        ({"time_limit_s": 1e9}, "time_limit_s is 1000000000.0; it must be above 0, and 20000 frames at most"),
-        ({"time_limit_s": 1e3}, "time_limit_s is 1000.0; it must be above 0, and 20000 frames at most"),
+        (
+            {"time_limit_s": 1e9},
+            "time_limit_s is 1000000000.0; it must be above 0, and 20000 frames at most",
+        ),
+        (
+            {"time_limit_s": 1e3},
+            "time_limit_s is 1000.0; it must be above 0, and 20000 frames at most",
+        ),
         ({"time_limit_s": float("nan")}, "time_limit_s is nan"),
         ({"decisions": 10**9}, "decisions is 1000000000; it must be from 1 to 10"),
         ({"decision_period_s": 0}, "decision_period_s is 0.0; it must be seconds above 0"),
@@ -170,7 +183,10 @@ def test_buildings_leave_the_road_free_and_stand_one_a_corner(layouts):
         ({"danger_share": "0.5"}, "danger_share = '0.5'; allowed: a number"),
         ({"ego_start_m": [1]}, "ego_start_m = [1]; allowed: a list of length 2"),
         ({"ego_start_m": [1, "x"]}, "[ego_start_m]: 1 = 'x'; allowed: a number"),
-        ({"ego_start_m": [1, 1e9]}, "ego_start_m is (1.0, 1000000000.0); it must be from -1000 to 1000"),
+        (
+            {"ego_start_m": [1, 1e9]},
+            "ego_start_m is (1.0, 1000000000.0); it must be from -1000 to 1000",
+        ),
         ({"target_speeds_mps": []}, "target_speeds_mps is (); it must be 1 to 20 speeds"),
         ({"target_speeds_mps": [1] * 10_000}, "it must be 1 to 20 speeds"),
         ({"ambient": ["day"]}, "ambient = ['day']; allowed: a text"),
@@ -191,5 +207,7 @@ def test_a_parameter_that_a_file_states_has_a_type_and_bounds(stated, said):
 def test_what_a_scenario_states_is_read_back_as_it_was():
     for name in scenarios.names():
         scenario = scenarios.get(name)
-        stated = {k: float(v) if type(v) is int else v for k, v in scenario.parameters.stated().items()}
+        stated = {
+            k: float(v) if type(v) is int else v for k, v in scenario.parameters.stated().items()
+        }
         assert scenarios.stated(name, stated) == scenario

@@ -12,8 +12,12 @@ PAGE = (Path(__file__).parents[2] / f"docs/scenarios/{SCENARIO.name}.md").read_t
 
 
 def test_the_pages_table_has_the_dials_of_every_scenario_with_their_values():
-    rows = dict(line.strip("| ").split(" | ")[:2] for line in PAGE.splitlines() if line.count(" | ") == 2)
-    stated = {name.strip("`"): value.strip() for name, value in rows.items() if name.startswith("`")}
+    rows = dict(
+        line.strip("| ").split(" | ")[:2] for line in PAGE.splitlines() if line.count(" | ") == 2
+    )
+    stated = {
+        name.strip("`"): value.strip() for name, value in rows.items() if name.startswith("`")
+    }
     values = {
         name: ", ".join(v if isinstance(v, str) else f"{v:g}" for v in value)
         for name, stated_value in asdict(SCENARIO.parameters).items()

@@ -18,7 +18,9 @@ vehicles = st.builds(
     st.sampled_from(["ego", "helper", "other"]), numbers, numbers, numbers, numbers,
     st.sampled_from(APPROACHES), st.sampled_from(ROUTES), st.booleans(),
 )  # fmt: skip
-buildings = st.builds(Building, st.from_regex(r"b[1-9]", fullmatch=True), numbers, numbers, numbers, numbers)
+buildings = st.builds(
+    Building, st.from_regex(r"b[1-9]", fullmatch=True), numbers, numbers, numbers, numbers
+)
 states = st.builds(
     WorldState, st.text(), st.integers(0, 2**31), st.integers(0, 6), numbers, numbers,
     st.lists(vehicles, min_size=1, max_size=5).map(tuple), st.lists(buildings, max_size=4).map(tuple),
@@ -47,6 +49,7 @@ def test_corners_start_at_the_front_left_and_go_round_clockwise():
 
 def test_a_truck_is_longer_and_wider_than_a_car():
     car, truck = (
-        VehicleState("v5", kind, "other", 0, 0, 0, 0, "left", "straight", False) for kind in ("car", "truck")
+        VehicleState("v5", kind, "other", 0, 0, 0, 0, "left", "straight", False)
+        for kind in ("car", "truck")
     )
     assert (car.length_m, car.width_m, truck.length_m, truck.width_m) == (5.0, 2.0, 10.0, 2.6)

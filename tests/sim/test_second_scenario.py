@@ -1,4 +1,6 @@
-"""A scenario of another package, in one file, goes through all that the one that ships goes through."""
+"""A scenario of another package, in one file,
+goes through all that the one that ships goes through.
+"""
 
 import io
 import json
@@ -34,7 +36,8 @@ def installed(tmp_path_factory):
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: one-way\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\nbroken = one_way_crossing:NONE\n"
+        f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\nbroken = "
+        "one_way_crossing:NONE\n"
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
@@ -55,7 +58,9 @@ def frozen(folder):
 
 def test_a_package_that_does_not_load_is_one_line():
     assert "broken" in scenarios.names()
-    with pytest.raises(UserError, match=r"^plug-in 'broken' \(swarmdrive.scenarios\): .* does not load"):
+    with pytest.raises(
+        UserError, match=r"^plug-in 'broken' \(swarmdrive.scenarios\): .* does not load"
+    ):
         scenarios.get("broken")
 
 
@@ -99,13 +104,17 @@ def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
     assert [len(tree.levels) for tree in frozen.trees] == [4, 4]
     assert {s.record.danger.sector for s in scenes_of(frozen)} == {"west", None}
     build(SCENARIO, tmp_path / "one-way", 2, MEETING, 2, lambda done: None)
-    assert (tmp_path / "one-way/manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
+    assert (tmp_path / "one-way/manifest.json").read_bytes() == (
+        folder / "manifest.json"
+    ).read_bytes()
 
 
 def test_a_dataset_of_a_scenario_that_is_not_here_is_refused_in_a_line(folder, tmp_path):
     manifest = json.loads((folder / "manifest.json").read_text())
     (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "scenario": "one-way-crosing"}))
-    with pytest.raises(UserError, match=r"manifest.json: unknown scenario .*did you mean 'one-way-crossing'"):
+    with pytest.raises(
+        UserError, match=r"manifest.json: unknown scenario .*did you mean 'one-way-crossing'"
+    ):
         load(tmp_path)
 
 
@@ -143,7 +152,17 @@ def test_the_command_drives_and_evaluates_it_and_reports(harness, folder):
     assert ran[0] == 0, ran
     assert harness("report", "run", "--out", "page.html")[0] == 0
     drove = harness(
-        "drive", "--scenario", NAME, "--episodes", "2", "--seeds", "0", "--workers", "1", "--out", "driven"
+        "drive",
+        "--scenario",
+        NAME,
+        "--episodes",
+        "2",
+        "--seeds",
+        "0",
+        "--workers",
+        "1",
+        "--out",
+        "driven",
     )
     assert drove[0] == 0, drove
     assert harness("report", "driven", "--out", "driven.html")[0] == 0

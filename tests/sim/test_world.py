@@ -57,9 +57,15 @@ def test_actions_are_highway_envs_by_name_and_order():
 @pytest.mark.parametrize("seed", [NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING])
 def test_an_episode_starts_at_14_mps_in_the_egos_lane_before_the_first_decision(seed):
     state = World.start(SCENARIO, seed).state()
-    assert (state.ego.speed_mps, state.target_speed_mps, state.step, state.time_s) == (14.0, 14.0, 0, 0.0)
+    assert (state.ego.speed_mps, state.target_speed_mps, state.step, state.time_s) == (
+        14.0,
+        14.0,
+        0,
+        0.0,
+    )
     assert (state.ego.id, state.ego.x_m, state.ego.route) == ("v1", 2.0, "straight")
-    assert P.ego_start_m[0] <= state.ego.y_m + 0.54 <= P.ego_start_m[1]  # the conflict zone is 0.54 m north
+    # the conflict zone is 0.54 m north
+    assert P.ego_start_m[0] <= state.ego.y_m + 0.54 <= P.ego_start_m[1]
 
 
 @pytest.mark.slow
@@ -72,7 +78,8 @@ def test_the_ego_brakes_and_accelerates_within_its_limits():
             advance(world, 1)
             speeds.append(world.state().ego.speed_mps)
     changes = np.diff(speeds) * P.simulation_hz
-    assert changes.min() == pytest.approx(-P.braking_mps2)  # both limits are reached, neither is passed
+    # both limits are reached, neither is passed
+    assert changes.min() == pytest.approx(-P.braking_mps2)
     assert changes.max() == pytest.approx(P.acceleration_mps2)
 
 
@@ -104,7 +111,9 @@ def after_others(*names):
         drive(SCENARIO, "brake", 3)
         return digest(trajectory(ONCOMING))
     finally:
-        IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = defaults
+        IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN = (
+            defaults
+        )
 
 
 @pytest.mark.slow
@@ -128,7 +137,11 @@ def test_the_same_seed_is_the_same_episode_in_a_process_of_its_own():
 def test_a_world_leaves_highway_envs_classes_as_they_were():
     before = (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
     World.start(SCENARIO, FROM_LEFT).act("IDLE")
-    assert before == (IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MAX, IDMVehicle.COMFORT_ACC_MIN)
+    assert before == (
+        IDMVehicle.DISTANCE_WANTED,
+        IDMVehicle.COMFORT_ACC_MAX,
+        IDMVehicle.COMFORT_ACC_MIN,
+    )
 
 
 @pytest.mark.slow
@@ -140,7 +153,10 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
         *(
             pytest.param(seed, actions, marks=pytest.mark.exhaustive)
             for seed in (NO_DANGER, FROM_RIGHT, FROM_LEFT, ONCOMING, 3, 12)
-            for actions in (("IDLE",) * 6, ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE"))
+            for actions in (
+                ("IDLE",) * 6,
+                ("SLOWER", "FASTER", "SLOWER", "SLOWER", "FASTER", "IDLE"),
+            )
         ),
     ],
 )
@@ -166,7 +182,10 @@ def test_a_second_at_once_and_frame_by_frame_are_the_same_second(seed):
         frames.take(action)
         advance(frames, P.simulation_hz - P.lag_frames)
         assert frames.state().vehicles == whole.state().vehicles
-        assert (frames.outcome, frames.journey.hard_brakings) == (whole.outcome, whole.journey.hard_brakings)
+        assert (frames.outcome, frames.journey.hard_brakings) == (
+            whole.outcome,
+            whole.journey.hard_brakings,
+        )
 
 
 def test_braking_hard_is_counted_once_each_time_it_begins():
@@ -201,7 +220,9 @@ def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
     assert world.outcome.other_crashes == 0
 
 
-@pytest.mark.parametrize(("seed", "blamed"), [(FROM_RIGHT, "ego"), (FROM_LEFT, "ego"), (ONCOMING, "other")])
+@pytest.mark.parametrize(
+    ("seed", "blamed"), [(FROM_RIGHT, "ego"), (FROM_LEFT, "ego"), (ONCOMING, "other")]
+)
 def test_a_cruising_ego_owes_way_to_the_crossing_road_and_is_owed_it_by_a_left_turn(seed, blamed):
     assert drive(SCENARIO, "cruise", seed).fault == blamed
 
@@ -225,7 +246,11 @@ def test_running_into_the_car_ahead_is_the_egos_fault_and_its_partner_is_that_ca
     ahead.position, ahead.speed = ego.position - [0.0, 9.0], 4.0
     world.act("IDLE")
     assert world.outcome.result == "collision"
-    assert (world.outcome.partner, world.outcome.striker, world.outcome.fault) == ("v4", "ego", "ego")
+    assert (world.outcome.partner, world.outcome.striker, world.outcome.fault) == (
+        "v4",
+        "ego",
+        "ego",
+    )
 
 
 @pytest.mark.usefixtures("asleep_at_the_wheel")
@@ -241,7 +266,11 @@ def head_on(world, apart_m):
     """Two helpers drive into each other, far from the ego; `apart_m` is between their bumpers."""
     first, second = world.road.vehicles[1:3]
     first.position, first.heading, first.speed = np.array([-40.0, -2.0]), 0.0, 6.0
-    second.position, second.heading, second.speed = np.array([-35.0 + apart_m, -2.0]), np.pi - 0.3, 5.0
+    second.position, second.heading, second.speed = (
+        np.array([-35.0 + apart_m, -2.0]),
+        np.pi - 0.3,
+        5.0,
+    )
 
 
 @pytest.fixture
@@ -278,9 +307,12 @@ def alike(one, other):
 def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
     world = World.start(SCENARIO, seed)
     for behaviour in ("IDLE", "SLOWER", "SLOWER", "FASTER"):
-        thawed, originals = ([make(world) for _ in ACTIONS] for make in (through_json, World.branch))
+        thawed, originals = (
+            [make(world) for _ in ACTIONS] for make in (through_json, World.branch)
+        )
         for original in originals:
-            original.journey.outcome = Outcome()  # what happened before is not part of a frozen world
+            # what happened before is not part of a frozen world
+            original.journey.outcome = Outcome()
         for then in (ACTIONS, ("IDLE",) * len(ACTIONS)):
             act_together([*thawed, *originals], 2 * then)
             for one, other in zip(thawed, originals, strict=True):

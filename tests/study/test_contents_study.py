@@ -47,7 +47,11 @@ def played(done: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame
 def cell(
     points: pd.DataFrame, content: str, column: str, value: float | None = None, axis: str = "loss"
 ) -> float:
-    at = points.variable == "" if value is None else (points.variable == axis) & (points.value == value)
+    at = (
+        points.variable == ""
+        if value is None
+        else (points.variable == axis) & (points.value == value)
+    )
     return float(points[(points.content == content) & at][column].item())
 
 
@@ -82,10 +86,17 @@ def test_where_nothing_arrives_every_content_is_worth_nothing(played: pd.DataFra
     for content in contents:
         assert cell(played, content, "success", 4, "size") == cell(played, content, "success")
     assert cell(played, NOTHING, "bits_per_episode") == 0
-    assert all(cell(played, content, "bits_per_episode", 1) > 0 for content in contents if content != NOTHING)
-    assert cell(played, "objects", "off_lag_rate", 1) == 0  # nobody is heard, so it is not asked again
+    assert all(
+        cell(played, content, "bits_per_episode", 1) > 0
+        for content in contents
+        if content != NOTHING
+    )
+    # nobody is heard, so it is not asked again
+    assert cell(played, "objects", "off_lag_rate", 1) == 0
     assert (
-        cell(played, "objects", "off_lag_rate", 0) == cell(played, "objects", "deadline_miss_rate", 0) > 0.5
+        cell(played, "objects", "off_lag_rate", 0)
+        == cell(played, "objects", "deadline_miss_rate", 0)
+        > 0.5
     )
     assert cell(played, "objects", "over_intent", 1) == 0
 
@@ -93,11 +104,16 @@ def test_where_nothing_arrives_every_content_is_worth_nothing(played: pd.DataFra
 def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within_them() -> None:
     draws = np.random.default_rng(0)
     a, b = (
-        {name: (draws.random((2, n)) < share).astype(float) for name, n in (("one", 30), ("two", 90))}
+        {
+            name: (draws.random((2, n)) < share).astype(float)
+            for name, n in (("one", 30), ("two", 90))
+        }
         for share in (0.9, 0.4)
     )
     plain = {name: Success(np.zeros(values.shape[1], bool)) for name, values in a.items()}
-    better, worse = (Outcome({name: {SUCCESS: of} for name, of in each.items()}, plain) for each in (a, b))
+    better, worse = (
+        Outcome({name: {SUCCESS: of} for name, of in each.items()}, plain) for each in (a, b)
+    )
     each = [over_episodes(SUCCESS, values) for values in a.values()]
     assert better.estimate(SUCCESS) == mean_of(each)
     assert better.estimate(SUCCESS, "two") == each[1]
@@ -109,9 +125,14 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
     dangerous = {"one": np.arange(30) < 10, "two": np.arange(90) < 10}
     balanced = Outcome(better.families, {name: Success(of) for name, of in dangerous.items()})
     parts = [
-        over_episodes(SUCCESS, v[:, half]) for n, v in a.items() for half in (dangerous[n], ~dangerous[n])
+        over_episodes(SUCCESS, v[:, half])
+        for n, v in a.items()
+        for half in (dangerous[n], ~dangerous[n])
     ]
-    assert (balanced.lead, balanced.leading) == (BALANCED, mean_of([mean_of(parts[:2]), mean_of(parts[2:])]))
+    assert (balanced.lead, balanced.leading) == (
+        BALANCED,
+        mean_of([mean_of(parts[:2]), mean_of(parts[2:])]),
+    )
     of_two = (a["two"] - b["two"]).mean(axis=0)
     gains = paired_difference([of_two[dangerous["two"]], of_two[~dangerous["two"]]])
     assert balanced.over(worse, "two") == gains
@@ -126,7 +147,9 @@ def test_witnesses_are_the_helpers_that_list_the_danger(done: Path) -> None:
     assert ((counts == -1) == [danger is None for danger in forest.dangers]).all()
     [scene] = source.dataset.scenes([forest.ids[forest.root[int(np.argmax(counts))]]])
     danger = scene.record.danger.vehicle
-    lists = [danger in [node.id for node in scene.graphs[viewer].nodes] for viewer in scene.viewers[1:]]
+    lists = [
+        danger in [node.id for node in scene.graphs[viewer].nodes] for viewer in scene.viewers[1:]
+    ]
     assert counts.max() == sum(lists) > 0
 
 
@@ -137,7 +160,9 @@ def test_who_holds_nothing_asks_nobody() -> None:
 
 
 @pytest.mark.slow
-def test_no_more_is_asked_than_a_dry_run_counts(harness: Callable[..., Said], proxy_run: Path) -> None:
+def test_no_more_is_asked_than_a_dry_run_counts(
+    harness: Callable[..., Said], proxy_run: Path
+) -> None:
     here = shutil.copytree(proxy_run, Path("run"))
     code, out, err = harness("study", "contents", here, *VARIED, "--dry-run", "--json")
     assert (code, err) == (0, "")
@@ -148,7 +173,12 @@ def test_no_more_is_asked_than_a_dry_run_counts(harness: Callable[..., Said], pr
         "Intent or objects?\nproxy · v2 · json, 6g, points of balanced success over intents: "
     )
     page = (here / "contents" / "index.html").read_text()
-    for text in ("at the bits of intents", "at the age of intents", "by who sees the danger", "6g over loss"):
+    for text in (
+        "at the bits of intents",
+        "at the age of intents",
+        "by who sees the danger",
+        "6g over loss",
+    ):
         assert text in page
     asked = (here / "more-answers.jsonl").read_text().splitlines()
     assert 0 < len(asked) <= sum(most.values())

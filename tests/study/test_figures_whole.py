@@ -1,4 +1,6 @@
-"""Figures of studies: nothing sticks out of them, however long names are, and dark pages turn them dark."""
+"""Figures of studies: nothing sticks out of them, however long names are,
+and dark pages turn them dark.
+"""
 
 import re
 from collections.abc import Callable, Mapping
@@ -64,9 +66,13 @@ FIGURES: Mapping[str, Callable[[], Figure]] = {
     "operating points": lambda: operating_points(summary("", [0], ["run"])),
     "a sweep": lambda: over("loss"),
     "a sweep of three panels": lambda: over("loss", "size", "tau"),
-    "a sweep over words": lambda: along([summary("consensus", ["geometric-median", "linear"], ["run"])]),
+    "a sweep over words": lambda: along(
+        [summary("consensus", ["geometric-median", "linear"], ["run"])]
+    ),
     "two runs swept": lambda: along([summary("loss", [0.0, 0.5], ["proxy · v2 · json", LONG])]),
-    "crossed axes": lambda: heat_map({f"{LONG}, loss {n}": SHARES for n in "123"}, ["a", LONG], ["1", "2"]),
+    "crossed axes": lambda: heat_map(
+        {f"{LONG}, loss {n}": SHARES for n in "123"}, ["a", LONG], ["1", "2"]
+    ),
     "intervals": of_rows,
     "fronts": of_costs,
     "reception": of_radio,
@@ -79,7 +85,9 @@ def test_nothing_sticks_out_of_a_figure_and_no_title_lies_over_another(name: str
     check(FIGURES[name]())
 
 
-def test_a_condition_has_the_colour_that_reports_have_and_of_several_runs_each_curve_its_own() -> None:
+def test_a_condition_has_the_colour_that_reports_have_and_of_several_runs_each_curve_its_own() -> (
+    None
+):
     [axes, *_] = over("loss").axes
     colours = {line.get_label(): line.get_color() for line in axes.lines}
     assert colours["success, 6g"] == CONDITIONS["6g"]
@@ -103,7 +111,9 @@ def test_a_page_turns_a_figure_dark_and_its_file_stays_light(tmp_path: Path) -> 
     for colour in (PAGE["paper"][1], PAGE["ink"][1]):
         assert colour in rules
     assert f'[style*="fill: {INK}"]' in rules
-    assert page.count(f"fill: {PAGE['ink'][0].lower()}") > 3, "numbers on light cells, which no rule names"
+    assert page.count(f"fill: {PAGE['ink'][0].lower()}") > 3, (
+        "numbers on light cells, which no rule names"
+    )
     assert PAGE["ink"][0].lower() not in rules.lower()
 
 

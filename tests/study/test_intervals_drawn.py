@@ -14,7 +14,9 @@ COLOURS = {"a": "#112233", "b": "#445566"}
 
 
 def test_each_point_and_interval_is_where_its_estimate_says() -> None:
-    rows = Rows("share, %", ["one", "two", "three"], {"a": [HALF, None, NONE], "b": [None, LOW, HALF]})
+    rows = Rows(
+        "share, %", ["one", "two", "three"], {"a": [HALF, None, NONE], "b": [None, LOW, HALF]}
+    )
     figure = intervals([rows], COLOURS)
     axes: Any = figure.axes[0]
     a, b = axes.containers
@@ -22,7 +24,9 @@ def test_each_point_and_interval_is_where_its_estimate_says() -> None:
     assert b.lines[0].get_xdata() == pytest.approx([12.5, 50])
     assert [round(y) for y in a.lines[0].get_ydata()] == [0]
     assert [round(y) for y in b.lines[0].get_ydata()] == [1, 2]
-    assert a.lines[0].get_ydata()[0] != b.lines[0].get_ydata()[1] - 2, "series do not lie over each other"
+    assert a.lines[0].get_ydata()[0] != b.lines[0].get_ydata()[1] - 2, (
+        "series do not lie over each other"
+    )
     for drawn, ends in ((a, [[25, 87.5]]), (b, [[12.5, 12.5], [25, 87.5]])):
         [bars] = drawn.lines[2]
         assert [segment[:, 0].tolist() for segment in bars.get_segments()] == ends

@@ -72,7 +72,9 @@ def run(
     return server
 
 
-def test_a_study_asks_the_server_of_the_users_card(run: Server, harness: Callable[..., Said]) -> None:
+def test_a_study_asks_the_server_of_the_users_card(
+    run: Server, harness: Callable[..., Said]
+) -> None:
     assert harness(*STUDY)[0] == 0
     assert run.asked
 
@@ -84,7 +86,10 @@ def test_a_study_names_the_prompt_that_its_run_keeps(
 ) -> None:
     shutil.copytree(folder("prompts") / "v2", "prompts/mine")
     options = ("--limit", "1", "--seeds", "0:1", "--condition", "6g", "--out", "of-mine")
-    assert harness("eval", "--model", "mine", "--prompt", "mine", "--dataset", small_path, *options)[0] == 0
+    assert (
+        harness("eval", "--model", "mine", "--prompt", "mine", "--dataset", small_path, *options)[0]
+        == 0
+    )
     if changed:
         text = Path("prompts/mine/ego.j2").read_text()
         Path("prompts/mine/ego.j2").write_text(text.replace("You drive", "You now drive"))
@@ -99,7 +104,9 @@ def test_a_study_names_the_prompt_that_its_run_keeps(
     assert harness(*study)[0] == 0
 
 
-def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Callable[..., Said]) -> None:
+def test_what_the_run_says_of_a_server_changes_nothing(
+    run: Server, harness: Callable[..., Said]
+) -> None:
     """Its card may have moved: the identity of what is opened is compared."""
     with serving(lambda asked: asked.reply(completion(GOOD))) as theirs:
         state(base_url=theirs.url, key_env="HOME", timeout_s=1.0, retries=9)
@@ -110,7 +117,10 @@ def test_what_the_run_says_of_a_server_changes_nothing(run: Server, harness: Cal
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ('thinking = "always"\n', "its model mine is not what it was (thinking of your card differs)"),
+        (
+            'thinking = "always"\n',
+            "its model mine is not what it was (thinking of your card differs)",
+        ),
         (
             "max_new_tokens = 9\nthinking_tokens = 7\n",
             "(max_new_tokens, thinking_tokens of your card differs)",
@@ -126,7 +136,9 @@ def test_a_card_that_asks_otherwise_is_refused(
     assert said in err
 
 
-def test_another_identity_is_refused_before_a_question(run: Server, harness: Callable[..., Said]) -> None:
+def test_another_identity_is_refused_before_a_question(
+    run: Server, harness: Callable[..., Said]
+) -> None:
     with serving(lambda asked: asked.reply(completion(GOOD))) as other:
         Path("models/mine.toml").write_text(CARD.format(url=other.url, more=""))
         code, _, err = harness(*STUDY)
@@ -156,7 +168,10 @@ def test_a_model_that_is_no_card_is_not_asked_and_the_line_says_what_to_type(
     assert run.asked == []
     if code:  # a study that has all answers asks nothing
         assert (code, err.count("\n")) == (2, 1)
-        assert "run: its model mine is none of your cards; to ask it, give --model with its folder" in err
+        assert (
+            "run: its model mine is none of your cards; to ask it, give --model with its folder"
+            in err
+        )
     assert code == 2 or study[1] in ("trust", "schedule")
 
 
@@ -169,7 +184,9 @@ def test_a_replay_asks_no_server_that_its_run_names(
         "--condition", "6g:messages=blind", "--out", "replayed",
     )  # fmt: skip
     assert (code, run.asked) == (2, [])
-    assert "its model mine is none of your cards; write one of that name, or make the run again" in err
+    assert (
+        "its model mine is none of your cards; write one of that name, or make the run again" in err
+    )
 
 
 @pytest.mark.slow
@@ -195,8 +212,12 @@ def test_a_run_of_a_model_that_no_longer_ships_is_read_and_runs_again_with_its_c
 
 
 def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
-    stated = Card("proxy", "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1"))
-    with pytest.raises(UserError, match=r"proxy is not what it was \(\[server\] of your card differs\)"):
+    stated = Card(
+        "proxy", "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1")
+    )
+    with pytest.raises(
+        UserError, match=r"proxy is not what it was \(\[server\] of your card differs\)"
+    ):
         find_own(stated, (), "run", "")
     assert find_own(cards.load("proxy"), (), "run", "") == cards.load("proxy")
 
@@ -205,7 +226,9 @@ def test_a_name_of_a_shipped_card_does_not_lend_it_a_server() -> None:
     "name", ["../mine", "models/mine", "", "mine\0", "MINE", "proxy:", "a/b", "replay:run"]
 )
 def test_a_name_in_a_run_is_no_path(name: str, run: Server) -> None:
-    stated = Card(name, "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1"))
+    stated = Card(
+        name, "openai", "d", Latency("paper", None, "b"), "m", server=Place("http://evil/v1")
+    )
     with pytest.raises(UserError):
         find_own(stated, (), "run", "give --model")
 

@@ -1,4 +1,6 @@
-"""Repeats: one evaluation several times, with other draws of the model's answers; figures played by hand."""
+"""Repeats: one evaluation several times, with other draws of the model's answers;
+figures played by hand.
+"""
 
 import json
 import math
@@ -77,16 +79,23 @@ def wanderer(monkeypatch: pytest.MonkeyPatch) -> Wanderer:
 
 
 def hot(data: Dataset, **options: Any) -> Spec:
-    return spec_of(data, "swarm-tiny", **{"points": (POINTS["single-local"],), "temperature": 0.7, **options})
+    return spec_of(
+        data, "swarm-tiny", **{"points": (POINTS["single-local"],), "temperature": 0.7, **options}
+    )
 
 
 def repeated(
-    spec: Spec, out: Path, k: int = 3, done: Callable[[int], None] = lambda n: None, cache: Path | None = None
+    spec: Spec,
+    out: Path,
+    k: int = 3,
+    done: Callable[[int], None] = lambda n: None,
+    cache: Path | None = None,
 ) -> Repeats:
     return run_repeats(spec, k, out, Watched(done), cache)
 
 
-# -- figures ------------------------------------------------------------------------------------------------
+# -- figures
+# ------------------------------------------------------------------------------------------------
 
 
 def test_pairs_that_differ_are_counted() -> None:
@@ -114,7 +123,9 @@ def test_more_repeats_never_make_all_likelier_nor_any_less(wins: list[int]) -> N
 
 
 def test_variance_lies_between_episodes_or_within() -> None:
-    """By hand: means 1, 0.5, 0; between 2 * 0.5 / 2 = 0.5, within 0.5 / 3; (1/2 - 1/6) / (1/2 + 1/6)."""
+    """By hand: means 1, 0.5, 0; between 2 * 0.5 / 2 = 0.5, within 0.5 / 3;
+    (1/2 - 1/6) / (1/2 + 1/6).
+    """
     share = between_share(np.array([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]))
     assert share.value == pytest.approx(0.5)
     assert share.low < 0.5 < share.high <= 1
@@ -165,7 +176,9 @@ def test_repeats_played_by_hand(small: Dataset, tmp_path: Path, wanderer: Wander
     )
 
 
-def test_every_figure_has_its_n_and_interval(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
+def test_every_figure_has_its_n_and_interval(
+    small: Dataset, tmp_path: Path, wanderer: Wanderer
+) -> None:
     of = repeated(hot(course(small, 2, OUTCOMES)), tmp_path / "repeats")
     for score in of.scores:
         assert score.n > 1, score
@@ -173,7 +186,8 @@ def test_every_figure_has_its_n_and_interval(small: Dataset, tmp_path: Path, wan
     assert len(of.scores) == len({(s.condition, s.metric) for s in of.scores}) == 8 + 3
 
 
-# -- runs ---------------------------------------------------------------------------------------------------
+# -- runs
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_a_repeat_is_a_run_with_its_own_sampling_seed(
@@ -227,11 +241,14 @@ def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer:
     assert wanderer.asked
 
 
-# -- the command --------------------------------------------------------------------------------------------
+# -- the command
+# --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
+def test_the_folder_has_a_page_and_all_figures(
+    small: Dataset, tmp_path: Path, wanderer: Wanderer
+) -> None:
     of = repeated(hot(course(small, 2, OUTCOMES)), tmp_path / "repeats")
     assert "<a href=" not in write_study(repeats_study(of), of.path).read_text()
     (of.path / "repeat-2/report.html").write_text("what `harness report` wrote")
@@ -243,7 +260,8 @@ def test_the_folder_has_a_page_and_all_figures(small: Dataset, tmp_path: Path, w
     assert page.index("<img") < page.index("<table")
     drawn = (of.path / "repeats.svg").read_text()
     assert all(
-        f">{row}<" in drawn for row in ("decisions flip", "any@3", "succeed", "pass^2", *of.conditions)
+        f">{row}<" in drawn
+        for row in ("decisions flip", "any@3", "succeed", "pass^2", *of.conditions)
     )
     lines = (tmp_path / "repeats/repeats.csv").read_text().splitlines()
     assert len(lines) == 1 + len(of.scores)
@@ -257,5 +275,8 @@ def test_no_suite_is_repeated(harness: Callable[..., Said]) -> None:
     asked = ("eval", "--model", "swarm-tiny", "--dataset", "suite:v2v-safety", "--repeats", "3")
     code, out, err = harness(*asked, "--temperature", "1")
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "--repeats 3: needs one dataset, and --dataset names a suite; give one of its datasets" in err
+    assert (
+        "--repeats 3: needs one dataset, and --dataset names a suite; give one of its datasets"
+        in err
+    )
     assert not Path("reports").exists()

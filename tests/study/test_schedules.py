@@ -1,4 +1,6 @@
-"""Schedules on stored runs: choices against walks, the oracle as a bound, fronts and areas by hand."""
+"""Schedules on stored runs: choices against walks, the oracle as a bound,
+fronts and areas by hand.
+"""
 
 import json
 import shutil
@@ -59,7 +61,8 @@ def made(stored: ReplayedRun, text: str) -> Choices:
 
 
 @pytest.mark.parametrize(
-    "text", [*POINTS_PLAYED, *(pytest.param(text, marks=pytest.mark.exhaustive) for text in MORE_POINTS)]
+    "text",
+    [*POINTS_PLAYED, *(pytest.param(text, marks=pytest.mark.exhaustive) for text in MORE_POINTS)],
 )
 def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: ReplayedRun, text: str):
     """The oracle is at least as good in every episode, and needs as few messages for a success."""
@@ -74,7 +77,9 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: ReplayedRun, 
     assert np.array_equal(success, walked.ends["success_rate"])
     for cost, metric in (("messages", "messages_per_episode"), ("airtime_ms", "airtime_ms")):
         values = of_decisions(METRICS[metric], of, walked.places, success.size)
-        assert costs[..., COSTS.index(cost)] == pytest.approx(values.reshape(success.shape), abs=1e-3)
+        assert costs[..., COSTS.index(cost)] == pytest.approx(
+            values.reshape(success.shape), abs=1e-3
+        )
     mean = of_decisions(METRICS["latency_proxy_ms"], of, walked.places, success.size)
     latency, decisions = costs[..., COSTS.index("latency_ms")], costs[..., COSTS.index("decisions")]
     assert latency / decisions == pytest.approx(mean.reshape(success.shape), abs=1e-2)
@@ -85,7 +90,9 @@ def test_what_follows_from_choices_is_what_a_walk_comes_to(stored: ReplayedRun, 
 
 def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: ReplayedRun):
     every = made(stored, "6g:max_helpers=0")
-    [[alone]] = stored.walked([axes.Setting("", POINTS["single-local"], stored.vehicles)], stored.seeds)
+    [[alone]] = stored.walked(
+        [axes.Setting("", POINTS["single-local"], stored.vehicles)], stored.seeds
+    )
     success, costs = every.oracle()
     assert np.array_equal(success, alone.ends["success_rate"])
     assert not costs[..., 0].any()
@@ -135,23 +142,36 @@ def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
         assert sum(asked[0]) > 0
 
 
-# -- fronts and areas, by hand -----------------------------------------------------------------------------
+# -- fronts and areas, by hand
+# -----------------------------------------------------------------------------
 
 
 PLAIN = Success(np.zeros(4, dtype=bool))
 
 
 def play(
-    schedule: str, most: int, threshold: float | None, success: Any, messages: Any, counting: Success = PLAIN
+    schedule: str,
+    most: int,
+    threshold: float | None,
+    success: Any,
+    messages: Any,
+    counting: Success = PLAIN,
 ) -> Play:
     """One seed. An episode takes 10 J, and 5 J a message."""
     n, joules = len(success), 10.0 + 5.0 * np.array(messages)
     costs = np.array([messages, [0.1] * n, [150.0] * n, [1.0] * n, joules]).T
-    return Play(Candidate(schedule, threshold, most), np.array([success], dtype=float), costs[None], counting)
+    return Play(
+        Candidate(schedule, threshold, most),
+        np.array([success], dtype=float),
+        costs[None],
+        counting,
+    )
 
 
 def by_hand(tune: bool = True) -> Compared:
-    """Four episodes. Never: 1 succeeds. Always: 3 with 4 messages each. The oracle: 4 with 1 on average."""
+    """Four episodes. Never: 1 succeeds. Always: 3 with 4 messages each. The oracle:
+    4 with 1 on average.
+    """
     plays = {
         "entropy": [
             play("entropy", 2, 0.7, [1, 1, 0, 0], [4, 4, 2, 2]),
@@ -167,7 +187,9 @@ def by_hand(tune: bool = True) -> Compared:
     worse = [plays["entropy"][0], play("entropy", 1, 0.7, [0, 0, 0, 0], [1] * 4)]
     oracle = play("oracle", 2, None, [1, 1, 1, 1], [0, 1, 1, 2])
     point = SIXG.changed(max_helpers=2)
-    return Compared("x", point, ("entropy",), plays, {**plays, "entropy": worse} if tune else {}, oracle, 0.5)
+    return Compared(
+        "x", point, ("entropy",), plays, {**plays, "entropy": worse} if tune else {}, oracle, 0.5
+    )
 
 
 def test_a_setting_is_chosen_on_tune_layouts_within_the_budget():
@@ -180,7 +202,8 @@ def test_a_setting_is_chosen_on_tune_layouts_within_the_budget():
 
 
 def balanced() -> Compared:
-    """One episode of four has a danger. Entropy with two helpers wins more often, with one where it counts.
+    """One episode of four has a danger. Entropy with two helpers wins more often,
+    with one where it counts.
 
     Balanced, two helpers have 1/2 (1 + 0) and one has 1/2 (1/3 + 1).
     """
@@ -190,7 +213,9 @@ def balanced() -> Compared:
         play("entropy", 2, 0.7, [0, 1, 1, 1], [1] * 4, counting),
         play("entropy", 1, 0.7, [1, 1, 0, 0], [1] * 4, counting),
     ]
-    return replace(once, plays=plays, tune=plays, budget=1.0, oracle=replace(once.oracle, counting=counting))
+    return replace(
+        once, plays=plays, tune=plays, budget=1.0, oracle=replace(once.oracle, counting=counting)
+    )
 
 
 def test_balanced_success_chooses_ranks_and_is_averaged_over_budgets():
@@ -208,20 +233,28 @@ def test_balanced_success_chooses_ranks_and_is_averaged_over_budgets():
     assert one.closed.value == pytest.approx((1 / 6) / (1 / 2))
     assert (bound.success.value, compared.regret.value) == (1.0, 0.5)
     plain = replace(
-        compared, tune={name: [replace(p, counting=PLAIN) for p in of] for name, of in compared.tune.items()}
+        compared,
+        tune={name: [replace(p, counting=PLAIN) for p in of] for name, of in compared.tune.items()},
     )
     assert plain.chosen("entropy").candidate.most == 2, "as plain success chooses"
 
 
 def test_the_front_takes_what_was_best_on_tune_layouts():
     taken = by_hand().front("entropy")
-    assert [(p.candidate.schedule, p.candidate.most) for p in taken] == [("never", 1), ("entropy", 2)]
+    assert [(p.candidate.schedule, p.candidate.most) for p in taken] == [
+        ("never", 1),
+        ("entropy", 2),
+    ]
     flattered = by_hand(tune=False).front("entropy")
-    assert [(p.candidate.schedule, p.candidate.most) for p in flattered] == [("never", 1), ("entropy", 1)]
+    assert [(p.candidate.schedule, p.candidate.most) for p in flattered] == [
+        ("never", 1),
+        ("entropy", 1),
+    ]
 
 
 def test_areas_are_means_over_budgets_up_to_always_asking_all():
-    """Entropy on tune layouts: 1/4 below 3 messages of 4, then 2/4. The oracle: 1/4 from 0, 4/4 from 1 on.
+    """Entropy on tune layouts: 1/4 below 3 messages of 4, then 2/4. The oracle:
+    1/4 from 0, 4/4 from 1 on.
 
     A success for one message at most is one of three episodes at 2/4 messages.
     """
@@ -233,7 +266,9 @@ def test_areas_are_means_over_budgets_up_to_always_asking_all():
 
 
 def test_joules_are_a_budget_as_messages_are():
-    """Here as many joules go with each message, above those of never asking, so areas are the same."""
+    """Here as many joules go with each message, above those of never asking,
+    so areas are the same.
+    """
     compared = by_hand()
     assert compared.energy
     assert compared.paper.means["energy_j"] == 10 + 5 * 3
@@ -255,7 +290,9 @@ def test_random_at_as_many_messages_lies_between_its_neighbours():
 
 
 def test_the_table_says_how_much_of_the_gap_is_closed():
-    """The paper's 2/4, the oracle 4/4, the one chosen 3/4: half of the gap at a third of the messages."""
+    """The paper's 2/4, the oracle 4/4, the one chosen 3/4:
+    half of the gap at a third of the messages.
+    """
     paper, one, bound = by_hand().rows
     assert (paper.closed.value, one.closed.value, bound.closed.value) == (0, 0.5, 1)
     assert one.messages.value == pytest.approx(1 / 3)
@@ -274,14 +311,24 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
     )
 
 
-# -- the commands ------------------------------------------------------------------------------------------
+# -- the commands
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_schedules_are_compared_from_the_command_line(
     stored: ReplayedRun, two_run: Path, harness: Callable[..., Any], tmp_path: Path
 ):
-    typed = ("study", "schedule", "compare", stored.run.path, "--schedule", "entropy", "--schedule", "learnt")
+    typed = (
+        "study",
+        "schedule",
+        "compare",
+        stored.run.path,
+        "--schedule",
+        "entropy",
+        "--schedule",
+        "learnt",
+    )
     tune = shutil.copytree(two_run, tmp_path / "tune")
     assert harness(*typed, "--tune", tune, "--quiet", "--out", tmp_path / "tuned")[0] == 0
     code, said, _ = harness(*typed, "--json", "--seeds", "0:1", "--out", tmp_path / "out")
@@ -298,21 +345,34 @@ def test_schedules_are_compared_from_the_command_line(
 @pytest.mark.slow
 def test_the_same_twice(stored: ReplayedRun):
     once, twice = (
-        compare(stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, counted([stored]), lambda n: None)
+        compare(
+            stored, None, SIXG, ["random", "learnt"], (0, 1), 0.5, counted([stored]), lambda n: None
+        )
         for _ in range(2)
     )
     for name, plays in once.plays.items():
-        assert [np.array_equal(a.costs, b.costs) for a, b in zip(plays, twice.plays[name], strict=True)]
+        assert [
+            np.array_equal(a.costs, b.costs) for a, b in zip(plays, twice.plays[name], strict=True)
+        ]
 
 
-# -- learning ----------------------------------------------------------------------------------------------
+# -- learning
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def train(tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
     """A run on train layouts."""
     folder = tmp_path_factory.mktemp("train")
-    build(scenarios.get("occluded-intersection"), folder / "data", 1, 150_000, 1, lambda done: None, False)
+    build(
+        scenarios.get("occluded-intersection"),
+        folder / "data",
+        1,
+        150_000,
+        1,
+        lambda done: None,
+        False,
+    )
     return ReplayedRun(run(spec_of(load(folder / "data")), folder / "run").out)
 
 
@@ -368,11 +428,15 @@ def test_a_file_that_does_not_fit_is_one_line(tmp_path: Path, monkeypatch: pytes
     shipped = find("schedules", "learnt.toml").read_text()
     (tmp_path / "schedules").mkdir()
     (tmp_path / "schedules/odd.toml").write_text(shipped.replace('"entropy", ', ""))
-    with pytest.raises(UserError, match="has other inputs or sizes than the program; learn it again"):
+    with pytest.raises(
+        UserError, match="has other inputs or sizes than the program; learn it again"
+    ):
         named_point("6g:schedule=odd")
 
 
-def test_a_run_pins_the_file_of_its_schedule(small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_pins_the_file_of_its_schedule(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / MARKER).touch()
     (tmp_path / "schedules").mkdir()
@@ -403,7 +467,11 @@ def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_p
         device_profile=devices.load("agx-orin"), device_model="qwen3-4b",
     )  # fmt: skip
     done = run(spec, tmp_path / "run")
-    [energy] = [score for score in done.scores if score.metric == "energy_j" and score.interval == "episodes"]
+    [energy] = [
+        score
+        for score in done.scores
+        if score.metric == "energy_j" and score.interval == "episodes"
+    ]
     stored = ReplayedRun(done.out)
     every = made(stored, "6g")
     _, costs = every.played(every.scheduled(SIXG))
@@ -420,7 +488,9 @@ def test_a_model_is_opened_once_whatever_it_is_asked(
 ):
     opened: list[Any] = []
     out = run(spec_of(small, points=(POINTS["single-local"],)), tmp_path / "run").out
-    (out / "answers.jsonl").write_bytes(b"".join((out / "answers.jsonl").read_bytes().splitlines(True)[:1]))
+    (out / "answers.jsonl").write_bytes(
+        b"".join((out / "answers.jsonl").read_bytes().splitlines(True)[:1])
+    )
 
     def counting(card: Any, **options: Any) -> Any:
         opened.append(card.name)

@@ -36,8 +36,12 @@ def test_a_table_without_rows_has_its_names(tmp_path: Path) -> None:
 
 
 def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> None:
-    table = Table(HOSTILE, ("name", "value", "p"), [(HOSTILE, strong("1.0"), p_cell(0.0))], terminal=(0, 1))
-    study = Study("sweep", HOSTILE, [HOSTILE], [HOSTILE], [table], {}, {"a": 1}, {}, caveats=[HOSTILE])
+    table = Table(
+        HOSTILE, ("name", "value", "p"), [(HOSTILE, strong("1.0"), p_cell(0.0))], terminal=(0, 1)
+    )
+    study = Study(
+        "sweep", HOSTILE, [HOSTILE], [HOSTILE], [table], {}, {"a": 1}, {}, caveats=[HOSTILE]
+    )
     page = write_study(study, tmp_path).read_text()
     assert "<strong>1.0</strong>" in page
     assert "&lt; 0.001" in page
@@ -45,7 +49,10 @@ def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> N
     assert "</script>" not in page
     assert table.in_terminal == (["name", "value"], [[HOSTILE, "1.0"]])
     assert not isinstance(table.in_terminal[1][0][1], Markup)
-    assert json.loads((tmp_path / "sweep.json").read_text()) == {"format": "swarmdrive-sweep/1", "a": 1}
+    assert json.loads((tmp_path / "sweep.json").read_text()) == {
+        "format": "swarmdrive-sweep/1",
+        "a": 1,
+    }
 
 
 def test_a_column_of_sentences_begins_at_the_left_in_every_row(tmp_path: Path) -> None:
@@ -77,12 +84,16 @@ def test_a_study_is_not_written_over_a_run_or_another_study(tmp_path: Path) -> N
     assert write_study(study, out) == write_study(study, out) == out / "index.html"
 
 
-def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_ones(tmp_path: Path) -> None:
+def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_ones(
+    tmp_path: Path,
+) -> None:
     path, computed = tmp_path / "cells.jsonl", list[str]()
 
     def part(depends_on: str, n: int) -> object:
         values = {"n": n, "array": np.array([[0.1 + 0.2, np.nan]])}
-        kept = Cells(path, depends_on).part(("a", n), lambda: computed.append(f"{depends_on}{n}") or values)
+        kept = Cells(path, depends_on).part(
+            ("a", n), lambda: computed.append(f"{depends_on}{n}") or values
+        )
         np.testing.assert_array_equal(kept["array"], values["array"])
         return kept["n"]
 

@@ -42,7 +42,9 @@ def swept(source: ReplayedRun, out: Path, name: str, text: str | None = None) ->
 
 
 def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
-    rows = summary[(summary.value == at) & (summary.metric == metric) & (summary.interval == "episodes")]
+    rows = summary[
+        (summary.value == at) & (summary.metric == metric) & (summary.interval == "episodes")
+    ]
     return float(rows["mean"].item())
 
 
@@ -60,9 +62,15 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
     done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
     alone = figure(done, "single-local", "success_rate").value
-    assert value(swept(source, tmp_path / "a", "size", "1"), 1, "success_rate") == pytest.approx(alone)
-    assert value(swept(source, tmp_path / "b", "tau", "1.2"), 1.2, "success_rate") == pytest.approx(alone)
-    assert value(swept(source, tmp_path / "c", "loss", "1"), 1, "success_rate") == pytest.approx(alone)
+    assert value(swept(source, tmp_path / "a", "size", "1"), 1, "success_rate") == pytest.approx(
+        alone
+    )
+    assert value(swept(source, tmp_path / "b", "tau", "1.2"), 1.2, "success_rate") == pytest.approx(
+        alone
+    )
+    assert value(swept(source, tmp_path / "c", "loss", "1"), 1, "success_rate") == pytest.approx(
+        alone
+    )
 
 
 @pytest.mark.slow
@@ -79,7 +87,10 @@ def test_every_axis_gives_its_panels(
     names = {f"{table}.{kind}" for table in ("conditions", "episodes") for kind in ("csv", "jsonl")}
     names |= {"index.html", *(f"sweep.{kind}" for kind in ("json", "svg", "pdf", "png"))}
     assert {p.name for p in tmp_path.iterdir()} == names
-    assert json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"] == "linear"
+    assert (
+        json.loads((tmp_path / "sweep.json").read_text())["panels"]["consensus"][0]["value"]
+        == "linear"
+    )
 
 
 @pytest.mark.slow
@@ -87,7 +98,10 @@ def test_every_axis_gives_its_panels(
 def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     source: ReplayedRun, tmp_path: Path
 ) -> None:
-    axes, grids = [axis_of("attack"), AXES["consensus"]], [("none", "liar+spoof"), ("linear", "median")]
+    axes, grids = (
+        [axis_of("attack"), AXES["consensus"]],
+        [("none", "liar+spoof"), ("linear", "median")],
+    )
     points = {"attack × consensus": settings([source], axes, grids, ["6g"])}
     study = run_sweep([source], points, source.seeds, tmp_path, lambda n: None)
     page = write_study(study, tmp_path).read_text()
@@ -97,7 +111,9 @@ def test_axes_that_are_crossed_give_every_combination_what_it_has_alone(
     assert list(rows.value.unique()) == [f"{a} × {rule}" for a in grids[0] for rule in grids[1]]
     attacked = rows[(rows.attack == "liar+spoof") & (rows.consensus == "median")]
     alone = settings([source], axes[1:], grids[1:], ["6g:attack=liar+spoof"])
-    apart = run_sweep([source], {"consensus": alone}, source.seeds, tmp_path / "apart", lambda n: None)
+    apart = run_sweep(
+        [source], {"consensus": alone}, source.seeds, tmp_path / "apart", lambda n: None
+    )
     expected = apart.data["conditions"]
     expected = expected[expected.value == "median"]
     assert attacked["mean"].tolist() == expected["mean"].tolist()
@@ -120,7 +136,9 @@ OF_EACH_KIND = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "texts", [OF_EACH_KIND, pytest.param(TOGETHER, marks=pytest.mark.exhaustive)], ids=["some", "all"]
+    "texts",
+    [OF_EACH_KIND, pytest.param(TOGETHER, marks=pytest.mark.exhaustive)],
+    ids=["some", "all"],
 )
 @pytest.mark.parametrize("asks", [True, False])
 def test_points_that_are_walked_together_are_each_as_alone(
@@ -132,13 +150,17 @@ def test_points_that_are_walked_together_are_each_as_alone(
     names = [name for name in texts if asks or "blind" not in name]
     fewer = names if texts is TOGETHER else names[:2]
     points = [
-        Setting(name, named_point(name), vehicles) for vehicles, of in ((4, names), (2, fewer)) for name in of
+        Setting(name, named_point(name), vehicles)
+        for vehicles, of in ((4, names), (2, fewer))
+        for name in of
     ]
     source = ReplayedRun(few, asks=asks)
     together = list(source.walked(points, (0, 1, 5)))
     assert bool(source.left_out) != asks
     for setting, [walked] in zip(points, together, strict=True):
-        alone = ReplayedRun(Path(shutil.copytree(few, tmp_path / "copy", dirs_exist_ok=True)), asks=asks)
+        alone = ReplayedRun(
+            Path(shutil.copytree(few, tmp_path / "copy", dirs_exist_ok=True)), asks=asks
+        )
         [[expected]] = alone.walked([setting], (0, 1, 5))
         assert alone.left_out <= source.left_out
         for name, values in expected.ends.items():
@@ -209,7 +231,9 @@ def test_a_setting_that_is_refused_as_idle_changes_nothing(
     assert point.idle(axis.field)
     with pytest.raises(UserError, match=f"--over {name}: it changes nothing in {condition}: "):
         settings([source], [axis], [values], [condition])
-    both = [Setting(condition, axis.at(point, value), source.vehicles, name, value) for value in values]
+    both = [
+        Setting(condition, axis.at(point, value), source.vehicles, name, value) for value in values
+    ]
     [one], [two] = source.walked(both, source.seeds)
     assert np.isfinite(one.ends["success_rate"]).all()
     for of_one, of_two in ((one.ends, two.ends), (one.columns, two.columns)):

@@ -1,4 +1,6 @@
-"""The bench of rules under attack: its cells are runs, its figures paired, and it goes on when stopped."""
+"""The bench of rules under attack: its cells are runs, its figures paired,
+and it goes on when stopped.
+"""
 
 import json
 from collections.abc import Callable
@@ -51,10 +53,16 @@ def bench(done: Evaluated, tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return played(done, tmp_path_factory.mktemp("trust") / "bench")
 
 
-def test_its_cells_are_what_a_run_says_under_the_same_condition(done: Evaluated, bench: Bench) -> None:
-    assert bench.success("linear").value == pytest.approx(figure(done, "6g", "balanced_success_rate").value)
+def test_its_cells_are_what_a_run_says_under_the_same_condition(
+    done: Evaluated, bench: Bench
+) -> None:
+    assert bench.success("linear").value == pytest.approx(
+        figure(done, "6g", "balanced_success_rate").value
+    )
     attacked = bench.success("linear", "liar+spoof", THIRD)
-    assert attacked.value == pytest.approx(figure(done, ATTACKED.name, "balanced_success_rate").value)
+    assert attacked.value == pytest.approx(
+        figure(done, ATTACKED.name, "balanced_success_rate").value
+    )
     alone = bench.counting.mean(bench.alone)
     assert alone == pytest.approx(figure(done, "single-local", "balanced_success_rate").value)
 
@@ -179,7 +187,18 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
 ) -> None:
     monkeypatch.setattr(resources, "DATASET", str(small_path))
     typed = (
-        *("study", "trust", "--model", "proxy", "--prompt", "v4", "--attacks", "liar", "--rules", "trust"),
+        *(
+            "study",
+            "trust",
+            "--model",
+            "proxy",
+            "--prompt",
+            "v4",
+            "--attacks",
+            "liar",
+            "--rules",
+            "trust",
+        ),
         *("--share", "0,1/3", "--out", "bench"),
     )
     code, out, _ = harness(*typed)
@@ -198,7 +217,9 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
 
 
 @pytest.mark.slow
-def test_objects_are_attacked_by_the_usual_attacks_on_objects(done: Evaluated, tmp_path: Path) -> None:
+def test_objects_are_attacked_by_the_usual_attacks_on_objects(
+    done: Evaluated, tmp_path: Path
+) -> None:
     stored = ReplayedRun(done.out)
     bench = run_bench(stored, "6g:content=objects", (), (), (1.0,), (0,), tmp_path, Watched())
     assert (bench.rules, bench.attacks) == (("linear",), ("ghost", "hide", "shift"))
@@ -214,7 +235,12 @@ def test_objects_are_attacked_by_the_usual_attacks_on_objects(done: Evaluated, t
     ("condition", "rules", "attacks", "said"),
     [
         ("6g:content=oracle", (), (), "none of the usual attacks"),
-        ("6g:content=objects", ("trust",), (), "no rule changes anything: content objects holds no intents"),
+        (
+            "6g:content=objects",
+            ("trust",),
+            (),
+            "no rule changes anything: content objects holds no intents",
+        ),
         ("6g:content=objects", (), ("ghost", "liar"), "some of ghost, hide, shift and absent"),
     ],
 )
@@ -222,7 +248,9 @@ def test_what_no_message_holds_cannot_be_attacked(
     done: Evaluated, tmp_path: Path, condition: str, rules: Any, attacks: Any, said: str
 ) -> None:
     with pytest.raises(UserError, match=said) as problem:
-        run_bench(ReplayedRun(done.out), condition, rules, attacks, (THIRD,), (0,), tmp_path, Watched())
+        run_bench(
+            ReplayedRun(done.out), condition, rules, attacks, (THIRD,), (0,), tmp_path, Watched()
+        )
     assert "\n" not in str(problem.value)
     assert not [*tmp_path.iterdir()]
 

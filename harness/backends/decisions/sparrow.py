@@ -1,4 +1,6 @@
-"""The backend of sparrow-decider: decision models of a few megabytes, in this process, on numpy alone."""
+"""The backend of sparrow-decider: decision models of a few megabytes, in this process,
+on numpy alone.
+"""
 
 import time
 from collections.abc import Sequence
@@ -25,15 +27,20 @@ def find(card: Card) -> Path:
     weights = card.weights or ""
     if (own := Path(weights).expanduser()).suffix == SUFFIX:
         if not own.is_file():
-            raise UserError(f"{card.shown}: weights {printable(weights)} is no file; give one that is there")
+            raise UserError(
+                f"{card.shown}: weights {printable(weights)} is no file; give one that is there"
+            )
         return own
-    package = find_spec("sparrow_decider")  # an import would take NumPy, and lists only look for weights
+    # an import would take NumPy, and lists only look for weights
+    package = find_spec("sparrow_decider")
     assert package
     assert package.origin
     folder = Path(package.origin).parent / "models"
     shipped = {file.stem: file for file in sorted(folder.glob(f"*{SUFFIX}"))}
     if weights not in shipped:
-        raise unknown(f"weights of {card.shown}", weights, shipped, f"; or the path of a {SUFFIX} file")
+        raise unknown(
+            f"weights of {card.shown}", weights, shipped, f"; or the path of a {SUFFIX} file"
+        )
     return shipped[weights]
 
 
@@ -46,7 +53,8 @@ def open(card: Card, **_: Any) -> "Sparrow":
         model = Decider.load(str(file))
     except Exception as error:  # the file may be anything
         raise UserError(
-            f"{card.shown}: {printable(file)} is no model of sparrow-decider ({one_line(error)}); give "
+            f"{card.shown}: {printable(file)} is no model of sparrow-decider ({one_line(error)}); "
+            "give "
             "another"
         ) from None
     return Sparrow(model, file)
@@ -78,11 +86,18 @@ class Sparrow:
         """Return what each request asks, as JSON."""
         from harness.backends.decisions.wires import asked_of, questions
 
-        return [canonical_json({"state": asked_of(r).state, "questions": questions(r)}) for r in requests]
+        return [
+            canonical_json({"state": asked_of(r).state, "questions": questions(r)})
+            for r in requests
+        ]
 
     def identity(self) -> dict[str, Any]:
         """Return the package's version, and the model by its name and digest."""
         ours = {"engine": "sparrow", "answers": BUILT_IN["sparrow"].answers}
         package = version("sparrow-decider")
-        return {**ours, "package": package, "model": self._model.name,
-                "sha256": sha256_file(self._file, "weights")}  # fmt: skip
+        return {
+            **ours,
+            "package": package,
+            "model": self._model.name,
+            "sha256": sha256_file(self._file, "weights"),
+        }

@@ -1,9 +1,9 @@
 """The two ways to ask a server of decision models: System One's, and that of OpenAI's decisions.
 
-`POST /v1/systemone` is llama.cpp's (tools/server/README.md), Ollama's from 0.35 on, and what the server of
-sparrow-decider answers; `POST /v1/decisions` is OpenAI's (openai-python, types/decision_create_params.py and
-types/decision.py). Whatever a server promises, `harness.parsing.parse` judges the probabilities, which are
-kept as they are stated.
+`POST /v1/systemone` is llama.cpp's (tools/server/README.md), Ollama's from 0.35 on, and what the
+server of sparrow-decider answers; `POST /v1/decisions` is OpenAI's (openai-python,
+types/decision_create_params.py and types/decision.py). Whatever a server promises,
+`harness.parsing.parse` judges the probabilities, which are kept as they are stated.
 """
 
 import json
@@ -43,12 +43,20 @@ def questions(request: Request) -> dict[str, Any]:
     return {NAME: {"type": question.kind, "instructions": question.instructions, **criteria}}
 
 
-def _systemone(card: Card, server: Server, request: Request, url: Callable[[Image], str]) -> dict[str, Any]:
-    body = {"model": card.weights, "state": asked_of(request).state, "questions": questions(request)}
+def _systemone(
+    card: Card, server: Server, request: Request, url: Callable[[Image], str]
+) -> dict[str, Any]:
+    body = {
+        "model": card.weights,
+        "state": asked_of(request).state,
+        "questions": questions(request),
+    }
     return {**body, "images": [url(request.image)]} if request.image else body
 
 
-def _decisions(card: Card, server: Server, request: Request, url: Callable[[Image], str]) -> dict[str, Any]:
+def _decisions(
+    card: Card, server: Server, request: Request, url: Callable[[Image], str]
+) -> dict[str, Any]:
     question = asked_of(request)
     content: Any = question.state
     if request.image:
@@ -64,7 +72,10 @@ def _decisions(card: Card, server: Server, request: Request, url: Callable[[Imag
         asked |= {"type": "score", "levels": [{"label": m or a} for a, m in meant.items()]}
     else:  # a predicate has no place for what its outcomes mean
         described = [f"{action}: {meaning}" for action, meaning in meant.items() if meaning]
-        asked |= {"type": "predicate", "instructions": "\n".join([question.instructions, *described])}
+        asked |= {
+            "type": "predicate",
+            "instructions": "\n".join([question.instructions, *described]),
+        }
     return {"model": card.weights, "input": content, "questions": [asked]}
 
 
@@ -82,7 +93,9 @@ def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Co
     try:
         [answer] = payload["answers"]
         shares = _shares(
-            answer, "probability", lambda listed: [(each["value"], each["probability"]) for each in listed]
+            answer,
+            "probability",
+            lambda listed: [(each["value"], each["probability"]) for each in listed],
         )
     except (LookupError, TypeError, AttributeError, ValueError):
         return failed(request, "the answer is no decision: it has no probabilities of the question")
@@ -109,19 +122,25 @@ def _completion(payload: Mapping[str, Any], request: Request, shares: Shares | N
         return Completion(request.id, "", read, 0, "refusal", None, 1)
     # Written out, so that the parser sees an option that stands there twice.
     members = ",".join(f"{json.dumps(str(option))}:{json.dumps(share)}" for option, share in shares)
-    return Completion(request.id, f'{{"action_distribution":{{{members}}}}}', read, 0, "stop", None, 1)
+    return Completion(
+        request.id, f'{{"action_distribution":{{{members}}}}}', read, 0, "stop", None, 1
+    )
 
 
 def _remedy(reply: Reply) -> str:
     if reply.status == 501:
         return (
-            "its model is no decision model, or takes no pictures: serve another one, or give a card with "
+            "its model is no decision model, or takes no pictures: serve another one, or give a "
+            "card with "
             'engine = "openai", whose model decides by letters'
         )
     if reply.status == 404:
         return 'a card has engine = "systemone" for /v1/systemone and "decisions" for /v1/decisions'
     if reply.status in (400, 422):
-        return "it does not take this question, such as so many options, or options that are no single token"
+        return (
+            "it does not take this question, such as so many options, or options that are no "
+            "single token"
+        )
     return ""
 
 

@@ -15,8 +15,8 @@ from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import bytes_of, digest, replacing, sha256_file
 
-# Architectures whose adapters are understood, and the layers whose rows llama.cpp has in another order, by
-# the key of how many heads they have.
+# Architectures whose adapters are understood, and the layers whose rows llama.cpp has in another
+# order, by the key of how many heads they have.
 _PERMUTED: Mapping[str, Mapping[str, str]] = {
     "llama": {"q_proj": "attention.head_count", "k_proj": "attention.head_count_kv"},
     "qwen2": {},
@@ -27,8 +27,8 @@ _PERMUTED: Mapping[str, Mapping[str, str]] = {
 def find_adapter_gguf(card: Card, base: Path) -> Path | None:
     """Return the GGUF file of a card's adapter to the GGUF file `base`; None without an adapter.
 
-    It is the one in the adapter's folder, or else made of the safetensors file there. Raises UserError if it
-    cannot be made.
+    It is the one in the adapter's folder, or else made of the safetensors file there.
+    Raises UserError if it cannot be made.
     """
     if (folder := find_adapter(card)) is None:
         return None
@@ -42,7 +42,9 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
         values = read_metadata(base)
     except ValueError as error:
         shown = f"{card.shown} in {printable(base)}"
-        raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
+        raise UserError(
+            f"{shown} does not load: {error}; copy or download the file again"
+        ) from None
     architecture = str(values.get("general.architecture"))
     shape = [str(item) for item in values.items() if item[0].startswith(architecture)]
     made_by = kept.code_sha256("backends/llama_cpp/adapter.py")
@@ -58,20 +60,25 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
             _write(file, architecture, float(config["lora_alpha"]), layers)
         except OSError as error:
             raise UserError(
-                f"{card.shown}: its adapter cannot be written: {printable(error)}; SWARMDRIVE_CACHE names "
+                f"{card.shown}: its adapter cannot be written: {printable(error)}; "
+                "SWARMDRIVE_CACHE names "
                 "another folder"
             ) from None
     return file
 
 
 def _layers(file: Path, values: Mapping[str, Any]) -> dict[str, NDArray[np.float16]]:
-    """Return an adapter's matrices by llama.cpp's names for them. Raises ValueError if they are none."""
+    """Return an adapter's matrices by llama.cpp's names for them.
+    Raises ValueError if they are none.
+    """
     from gguf import MODEL_ARCH_NAMES, get_tensor_name_map
     from safetensors.numpy import load
 
     architecture = values["general.architecture"]
     if architecture not in _PERMUTED:
-        raise ValueError(f"adapters of {printable(architecture)} need llama.cpp's own .gguf file beside them")
+        raise ValueError(
+            f"adapters of {printable(architecture)} need llama.cpp's own .gguf file beside them"
+        )
     [kind] = [kind for kind, name in MODEL_ARCH_NAMES.items() if name == architecture]
     names = get_tensor_name_map(kind, values[f"{architecture}.block_count"])
     matrices: dict[str, NDArray[np.float16]] = {}
@@ -89,12 +96,16 @@ def _layers(file: Path, values: Mapping[str, Any]) -> dict[str, NDArray[np.float
 
 
 def _permuted(rows: NDArray[Any], heads: int) -> NDArray[Any]:
-    """Return rows (out, r) in the order in which llama.cpp turns the pairs of a head's positions."""
+    """Return rows (out, r) in the order in which llama.cpp turns the pairs of a head's
+    positions.
+    """
     halves = rows.reshape(heads, 2, len(rows) // heads // 2, -1)
     return np.ascontiguousarray(halves.swapaxes(1, 2).reshape(rows.shape))
 
 
-def _write(file: Path, architecture: str, alpha: float, layers: Mapping[str, NDArray[np.float16]]) -> None:
+def _write(
+    file: Path, architecture: str, alpha: float, layers: Mapping[str, NDArray[np.float16]]
+) -> None:
     """Write what llama.cpp's `convert_lora_to_gguf.py` makes of such an adapter."""
     from gguf import GGUFWriter, LlamaFileType
 

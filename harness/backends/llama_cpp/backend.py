@@ -1,6 +1,8 @@
-"""The backend of a GGUF file: llama.cpp in a child process, since an engine that crashes must end no run.
+"""The backend of a GGUF file: llama.cpp in a child process,
+since an engine that crashes must end no run.
 
-The process is spawned, so it loads only what its opener imports. Messages are pickled through a pipe.
+The process is spawned, so it loads only what its opener imports.
+Messages are pickled through a pipe.
 """
 
 import os
@@ -35,7 +37,9 @@ def open(
 ) -> "LlamaBackend":
     """Find and load a card's weights."""
     if dtype not in (None, "auto"):
-        raise UserError(f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto")
+        raise UserError(
+            f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto"
+        )
     return LlamaBackend(card, check_digest(card, find_gguf(card)), device, batch_size)
 
 
@@ -46,10 +50,10 @@ class _Died(Exception):
 class Child:
     """The backend that an opener returns, opened and asked in a child process.
 
-    The backend measures seconds inside the child. After a death, the same requests are asked again together,
-    since a different batch may move an answer by rounding. If that kills the engine, too, they are asked one
-    at a time, and a request that kills it again becomes a completion with an error. A process that stays
-    stopped is killed.
+    The backend measures seconds inside the child. After a death, the same requests are asked again
+    together, since a different batch may move an answer by rounding. If that kills the engine, too,
+    they are asked one at a time, and a request that kills it again becomes a completion with an
+    error. A process that stays stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
@@ -87,7 +91,9 @@ class Child:
                 return self._ask(attribute, *arguments, **options)
             except _Died as death:
                 last = death
-        raise UserError(f"model {printable(self._name)!r}: {last} of {attribute}; see `harness model check`")
+        raise UserError(
+            f"model {printable(self._name)!r}: {last} of {attribute}; see `harness model check`"
+        )
 
     def close(self) -> None:
         if self._running:
@@ -133,7 +139,8 @@ class Child:
         if not self._running:
             self._start()
         assert self._running
-        with suppress(BrokenPipeError, ConnectionResetError):  # it died while idle: `_receive` reports that
+        # it died while idle: `_receive` reports that
+        with suppress(BrokenPipeError, ConnectionResetError):
             self._running[1].send((attribute, arguments, options))
         return self._receive()
 
@@ -146,7 +153,9 @@ class Child:
             process.join()
             code = process.exitcode or 0
             self.close()
-            raise _Died(f"engine died: {f'signal {-code}' if code < 0 else f'exit code {code}'}") from None
+            raise _Died(
+                f"engine died: {f'signal {-code}' if code < 0 else f'exit code {code}'}"
+            ) from None
         except BaseException:  # Ctrl-C: the pending answer must not be taken for the next call's
             self.close()
             raise
@@ -163,7 +172,9 @@ class LlamaBackend(Child):
         super().__init__(
             card.name, "harness.backends.llama_cpp.engine:open_here", card, file, device, batch_size
         )
-        self.chat = Chat(card.name, _RemoteTokenizer(self), self.call("chat.image_token"), card.system)
+        self.chat = Chat(
+            card.name, _RemoteTokenizer(self), self.call("chat.image_token"), card.system
+        )
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
         log_p: Floats = self.call("next_log_probs", requests, vocabulary)
@@ -174,7 +185,8 @@ class _RemoteTokenizer:
     def __init__(self, child: Child) -> None:
         self._child = child
         stated = (
-            child.call(f"chat.tokenizer.{name}") for name in ("template", "specials", "bos", "vocabulary")
+            child.call(f"chat.tokenizer.{name}")
+            for name in ("template", "specials", "bos", "vocabulary")
         )
         self.template, self.specials, self.bos, self.vocabulary = stated
 
@@ -195,7 +207,9 @@ class _RemoteTokenizer:
 
 
 def _watch(pid: int) -> None:
-    """Kill a process that is found stopped twice in a row; otherwise its caller would wait forever."""
+    """Kill a process that is found stopped twice in a row;
+    otherwise its caller would wait forever.
+    """
     before = False
     with suppress(ChildProcessError, AttributeError):  # the process is gone, or this is Windows
         while True:
@@ -206,7 +220,9 @@ def _watch(pid: int) -> None:
             before = stopped
 
 
-def _serve(pipe: Connection, opener: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+def _serve(
+    pipe: Connection, opener: str, arguments: tuple[Any, ...], options: dict[str, Any]
+) -> None:
     """Open a backend and answer until the parent is gone. Runs in the child."""
     end_with_parent()
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
@@ -236,7 +252,8 @@ def _uninterrupted() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    resource_tracker.ensure_running()  # started by the first process otherwise, which would unblock SIGINT
+    # started by the first process otherwise, which would unblock SIGINT
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -24,15 +24,18 @@ _FIELDS = c.llama_batch._fields_
 class LlamaContext:
     """Sequences by number, 0 to n-1, each a list of `tokens` whose keys and values are computed.
 
-    Negative tokens are a picture's. A sequence may be cut before or after a picture, but not inside.
+    Negative tokens are a picture's. A sequence may be cut before or after a picture,
+    but not inside.
 
-    All sequences have equal room. (llama.cpp can also share one memory, but then each sequence would attend
-    to all the others' tokens, if only to mask them.) The memory is allocated when it is first needed. When a
-    sequence has filled its room, the memory is replaced by one of twice the size and filled again from the
-    tokens. Keys and values are `F32` for F32 weights, or else `F16`.
+    All sequences have equal room. (llama.cpp can also share one memory, but then each sequence
+    would attend to all the others' tokens, if only to mask them.) The memory is allocated when it
+    is first needed. When a sequence has filled its room, the memory is replaced by one of twice the
+    size and filled again from the tokens. Keys and values are `F32` for F32 weights, or else `F16`.
     """
 
-    def __init__(self, model: LlamaModel, sequences: int, projector: Projector | None = None) -> None:
+    def __init__(
+        self, model: LlamaModel, sequences: int, projector: Projector | None = None
+    ) -> None:
         self._model = model
         self._projector = projector
         self._sequences = sequences
@@ -71,7 +74,8 @@ class LlamaContext:
             self._make(room)
 
     def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
-        """Append a chunk, none empty, to each of some sequences; return the logits after it, (n, vocabulary).
+        """Append a chunk, none empty, to each of some sequences;
+        return the logits after it, (n, vocabulary).
 
         Raises RuntimeError if llama.cpp fails; all sequences are lost then.
         """
@@ -83,7 +87,9 @@ class LlamaContext:
                 self._fill()
                 logits = self._decode(chunks)
             if logits is None:
-                raise RuntimeError(f"llama.cpp finds no room in {self._room} tokens: {last_error()}")
+                raise RuntimeError(
+                    f"llama.cpp finds no room in {self._room} tokens: {last_error()}"
+                )
         except BaseException:
             self.free()
             raise
@@ -108,7 +114,8 @@ class LlamaContext:
         params.n_batch = params.n_ubatch = _BATCH
         params.n_seq_max = params.n_outputs_max = self._sequences
         params.kv_unified = False
-        params.swa_full = True  # otherwise a beginning is lost once the sliding window has passed it
+        # otherwise a beginning is lost once the sliding window has passed it
+        params.swa_full = True
         if self.cache_type == "F32":
             # As exact as the weights; llama.cpp's default and its fused attention round to F16.
             params.type_k = params.type_v = c.GGML_TYPE_F32
@@ -119,11 +126,15 @@ class LlamaContext:
         last_error()
         self._context = c.llama_init_from_model(self._model.pointer, params)
         if not self._context:
-            raise RuntimeError(f"no memory for {self._sequences} x {self._room} tokens: {last_error()}")
+            raise RuntimeError(
+                f"no memory for {self._sequences} x {self._room} tokens: {last_error()}"
+            )
         self._model.adapt(self._context)
 
     def _fill(self) -> None:
-        """Compute all sequences again, sorted, so that each shares its longest beginning with the last."""
+        """Compute all sequences again, sorted,
+        so that each shares its longest beginning with the last.
+        """
         sequences = sorted(self.tokens.items(), key=lambda item: item[1])
         before, self.tokens = sequences[0][0], {}
         for sequence, tokens in sequences:
@@ -138,14 +149,18 @@ class LlamaContext:
                 before = sequence
 
     def _decode(self, chunks: Mapping[int, Sequence[int]]) -> Logits | None:
-        """Append chunks and return the logits after each; without room, append nothing and return None."""
+        """Append chunks and return the logits after each;
+        without room, append nothing and return None.
+        """
         queues = {s: self._runs(chunk) for s, chunk in chunks.items()}
         ends = {s: self._ends[s][-1:] or [0] for s in chunks}
         logits = np.empty((len(chunks), self._model.vocabulary), dtype=np.float32)
         while fronts := {s: queue[0] for s, queue in queues.items() if queue}:
             texts = {s: run for s, run in fronts.items() if run.inputs.ndim == 1}
             now = texts or fronts  # one call of llama.cpp takes either texts or pictures
-            rows = [row if len(queues[s]) == 1 else None for row, s in enumerate(chunks) if s in now]
+            rows = [
+                row if len(queues[s]) == 1 else None for row, s in enumerate(chunks) if s in now
+            ]
             if not self._read(now, [ends[s][-1] for s in now], logits, rows):
                 return None
             for s, run in now.items():
@@ -170,11 +185,17 @@ class LlamaContext:
         return runs
 
     def _read(
-        self, runs: Mapping[int, Run], starts: Sequence[int], logits: Logits, rows: Sequence[int | None]
+        self,
+        runs: Mapping[int, Run],
+        starts: Sequence[int],
+        logits: Logits,
+        rows: Sequence[int | None],
     ) -> bool:
-        """Read a run of each of some sequences, all texts or all pictures; return whether there was room.
+        """Read a run of each of some sequences, all texts or all pictures;
+        return whether there was room.
 
-        `starts` has the position of each run's first token; `rows` its row of `logits`, None if not needed.
+        `starts` has the position of each run's first token;
+        `rows` its row of `logits`, None if not needed.
         """
         inputs = np.concatenate([run.inputs for run in runs.values()])
         places = [run.at(start) for run, start in zip(runs.values(), starts, strict=True)]
@@ -197,7 +218,9 @@ class LlamaContext:
                     logits[row] = np.ctypeslib.as_array(pointer, (self._model.vocabulary,))
         return True
 
-    def _call(self, inputs: NDArray[Any], place: Ints, owner: Ints, wanted: NDArray[np.int8]) -> int:
+    def _call(
+        self, inputs: NDArray[Any], place: Ints, owner: Ints, wanted: NDArray[np.int8]
+    ) -> int:
         """Call llama_decode on arrays of one length, without a copy."""
         # One address for each token, since it belongs to one sequence.
         owners = owner.ctypes.data + owner.itemsize * np.arange(len(owner), dtype=np.uintp)
@@ -208,6 +231,8 @@ class LlamaContext:
             "seq_id": owners,
             "logits": wanted,
         }
-        pointers = {name: arrays[name].ctypes.data_as(kind) for name, kind in _FIELDS if name in arrays}
+        pointers = {
+            name: arrays[name].ctypes.data_as(kind) for name, kind in _FIELDS if name in arrays
+        }
         code: int = c.llama_decode(self._context, c.llama_batch(n_tokens=len(inputs), **pointers))
         return code

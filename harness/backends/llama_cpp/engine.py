@@ -12,7 +12,13 @@ import numpy as np
 
 from harness.backends.card import Card
 from harness.backends.chat import Chat
-from harness.backends.engine import Session, check_logits, common_beginning, common_length, group_by_beginning
+from harness.backends.engine import (
+    Session,
+    check_logits,
+    common_beginning,
+    common_length,
+    group_by_beginning,
+)
 from harness.backends.language_model import LanguageModel
 from harness.backends.llama_cpp.adapter import find_adapter_gguf
 from harness.backends.llama_cpp.context import LlamaContext, Logits
@@ -32,7 +38,8 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
     """Load a GGUF file in this process, which llama.cpp may abort."""
-    os.environ.setdefault("GGML_NO_BACKTRACE", "1")  # a backtrace would start a debugger if there is one
+    # a backtrace would start a debugger if there is one
+    os.environ.setdefault("GGML_NO_BACKTRACE", "1")
     most = c.llama_max_parallel_sequences() - BEGINNINGS
     if batch_size > most:
         raise UserError(f"batch size {batch_size}; llama.cpp takes {most} at most")
@@ -57,11 +64,18 @@ class LlamaEngine:
     """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts."""
 
     def __init__(
-        self, card: Card, file: Path, model: LlamaModel, batch_size: int, projector: Projector | None = None
+        self,
+        card: Card,
+        file: Path,
+        model: LlamaModel,
+        batch_size: int,
+        projector: Projector | None = None,
     ) -> None:
         shown = [text for text in _PICTURES if projector and text in model.template]
         if projector and not shown:
-            raise UserError(f"{card.shown}: its chat template has none of {_PICTURES} for a picture")
+            raise UserError(
+                f"{card.shown}: its chat template has none of {_PICTURES} for a picture"
+            )
         self.chat = Chat(card.name, model, shown[0] if shown else None, card.system)
         self.context_tokens = card.context_tokens or model.trained_tokens
         self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
@@ -112,7 +126,9 @@ class LlamaEngine:
         for group in groups:
             for place in group.places[1:]:
                 self.context.fork(group.places[0], place, len(group.shared))
-        logits = self.context.extend({p: ids[len(self.context.tokens[p]) :] for p, ids in prompts.items()})
+        logits = self.context.extend(
+            {p: ids[len(self.context.tokens[p]) :] for p, ids in prompts.items()}
+        )
         for group in groups:
             if group.known:
                 self._used(group.nearest)
@@ -126,13 +142,17 @@ class LlamaEngine:
 
     def _nearest(self, shared: list[int], but: int | None = None) -> tuple[int, int]:
         """Return the kept beginning with most of some tokens, and how many: not `but` of them."""
-        kept = {b: common_length([self.context.tokens.get(b, []), shared]) for b in self._beginnings}
+        kept = {
+            b: common_length([self.context.tokens.get(b, []), shared]) for b in self._beginnings
+        }
         kept = {b: 0 if n == but else n for b, n in kept.items()}
         nearest = max(self._beginnings, key=kept.__getitem__)
         return nearest, kept[nearest]
 
     def _read_again(self, group: _Group) -> _Group:
-        """Leave what is kept of a whole prompt: if repeated alone, its time would not be an answer's time."""
+        """Leave what is kept of a whole prompt:
+        if repeated alone, its time would not be an answer's time.
+        """
         if self._projector and group.known == len(group.shared):
             self._projector.forget(group.shared)
         nearest, known = self._nearest(group.shared, but=len(group.shared))
@@ -143,7 +163,9 @@ class LlamaEngine:
         self._beginnings.append(beginning)
 
     def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
-        """Return the logits after some tokens more of sequences by place, which stay as they are."""
+        """Return the logits after some tokens more of sequences by place,
+        which stay as they are.
+        """
         lengths = {place: len(self.context.tokens[place]) for place in chunks}
         logits = self.context.extend(chunks)
         for place, length in lengths.items():
@@ -156,7 +178,9 @@ class LlamaEngine:
         self._free += places
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers: llama.cpp's build, and the file by hub commit or by content."""
+        """Return what decides the answers:
+        llama.cpp's build, and the file by hub commit or by content.
+        """
         commit = hub_commit(self._file.parent)
         return {
             "engine": "llama-cpp",
@@ -174,7 +198,11 @@ class LlamaEngine:
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
             **({"system": self.chat.system} if self.chat.system else {}),
-            **({"adapter_sha256": sha256_file(self._model.adapter_file)} if self._model.adapter_file else {}),
+            **(
+                {"adapter_sha256": sha256_file(self._model.adapter_file)}
+                if self._model.adapter_file
+                else {}
+            ),
         }
 
     @cached_property
@@ -217,7 +245,9 @@ class LlamaSession(Session):
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
         rows = [row for row, chunk in enumerate(chunks) if chunk]
         if rows:
-            self._logits[rows] = self._engine.context.extend({self._places[row]: chunks[row] for row in rows})
+            self._logits[rows] = self._engine.context.extend(
+                {self._places[row]: chunks[row] for row in rows}
+            )
 
     def keep(self, places: Sequence[int]) -> None:
         kept = [self._places[place] for place in places]

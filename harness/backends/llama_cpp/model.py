@@ -24,20 +24,28 @@ def keep_errors(level: int, text: bytes, _: Any) -> None:
 
 def last_error() -> str:
     """Return the first error that llama.cpp has logged since the last call, made safe to show."""
-    reason = printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
+    reason = (
+        printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
+    )
     _errors.clear()
     return reason
 
 
 class LlamaModel:
-    """A loaded model, perhaps with a LoRA adapter, and the `harness.backends.chat.Tokenizer` in its file."""
+    """A loaded model, perhaps with a LoRA adapter,
+    and the `harness.backends.chat.Tokenizer` in its file.
+    """
 
-    def __init__(self, name: str, file: Path, device: str | None, adapter: Path | None = None) -> None:
+    def __init__(
+        self, name: str, file: Path, device: str | None, adapter: Path | None = None
+    ) -> None:
         c.llama_log_set(keep_errors, ctypes.c_void_p(0))
         shown = f"model {name!r} in {printable(file)}"
         if device not in (None, "cpu") and not (device == "gpu" and c.llama_supports_gpu_offload()):
             known = "cpu, gpu" if c.llama_supports_gpu_offload() else "cpu"
-            raise UserError(f"device {printable(device)!r}; llama.cpp as it is built here has: {known}")
+            raise UserError(
+                f"device {printable(device)!r}; llama.cpp as it is built here has: {known}"
+            )
         params = c.llama_model_default_params()
         # ggml-org/llama.cpp#20824: repacked quantised weights crash on CPUs with AMX.
         params.use_extra_bufts = False
@@ -46,7 +54,9 @@ class LlamaModel:
         last_error()
         self.pointer = c.llama_model_load_from_file(bytes(file), params)
         if not self.pointer:
-            raise UserError(f"{shown} does not load: {last_error()}; copy or download the file again")
+            raise UserError(
+                f"{shown} does not load: {last_error()}; copy or download the file again"
+            )
         self.adapter_file = adapter
         self._adapter = adapter and c.llama_adapter_lora_init(self.pointer, bytes(adapter))
         if adapter and not self._adapter:
@@ -57,7 +67,9 @@ class LlamaModel:
             raise UserError(f"{shown} has no tokenizer; give a GGUF file of a chat model")
         template = c.llama_model_chat_template(self.pointer, None)
         if not template:
-            raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
+            raise UserError(
+                f"{shown} has no chat template; give the GGUF file of its instruct version"
+            )
         self.template: str = template.decode(errors="replace")
         self.trained_tokens: int = c.llama_model_n_ctx_train(self.pointer)  # length of its context
         # Number format of the weights, as llama.cpp names it.
@@ -71,10 +83,11 @@ class LlamaModel:
             if token >= 0
         }
         self.bos: int | None = bos if bos >= 0 else None
-        # Whether a sequence's state cannot be cut (recurrent layers), so that no beginning is shared.
-        self.whole_state: bool = c.llama_model_is_recurrent(self.pointer) or c.llama_model_is_hybrid(
+        # Whether a sequence's state cannot be cut (recurrent layers), so that no beginning is
+        # shared.
+        self.whole_state: bool = c.llama_model_is_recurrent(
             self.pointer
-        )
+        ) or c.llama_model_is_hybrid(self.pointer)
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
 
     def adapt(self, context: int) -> None:

@@ -1,4 +1,6 @@
-"""The projector of a model with vision: a second GGUF file, with which llama.cpp's mtmd encodes pictures."""
+"""The projector of a model with vision:
+a second GGUF file, with which llama.cpp's mtmd encodes pictures.
+"""
 
 import ctypes
 from collections.abc import Iterator, Sequence
@@ -30,13 +32,17 @@ class Run(NamedTuple):
     span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:
-        """Return the tokens' positions from `start`; the fourth row is not a position and stays 0."""
+        """Return the tokens' positions from `start`;
+        the fourth row is not a position and stays 0.
+        """
         shifted = self.places + np.int32(start)
         shifted[3:] = 0
         return shifted
 
     def ends(self, start: int) -> Sequence[int]:
-        """Return the position after each token; for a picture, the position after the whole picture."""
+        """Return the position after each token;
+        for a picture, the position after the whole picture.
+        """
         n = len(self.inputs)
         return range(start + 1, start + n + 1) if self.inputs.ndim == 1 else [start + self.span] * n
 
@@ -47,10 +53,14 @@ def text_run(ids: Sequence[int]) -> Run:
 
 
 class Projector:
-    """A loaded projector. It encodes a picture when its tokens are first read, in an answer's time."""
+    """A loaded projector. It encodes a picture when its tokens are first read,
+    in an answer's time.
+    """
 
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
-        """Load a projector. Raises UserError if it is none, not of this model, or not what the card says."""
+        """Load a projector. Raises UserError if it is none, not of this model,
+        or not what the card says.
+        """
         shown = f"model {name!r} with projector {printable(file)}"
         try:
             m = import_module("llama_cpp.mtmd_cpp")
@@ -74,46 +84,65 @@ class Projector:
         last_error()
         self._context = m.mtmd_init_from_file(bytes(file), model.pointer, params)
         if not self._context:
-            raise UserError(f"{shown} does not load: {last_error()}; give the mmproj file of this very model")
+            raise UserError(
+                f"{shown} does not load: {last_error()}; give the mmproj file of this very model"
+            )
         if not m.mtmd_support_vision(self._context):
             raise UserError(f"{shown} takes no pictures; give an mmproj file of a model that does")
         if m.mtmd_decode_use_non_causal(self._context, None):
-            raise UserError(f"{shown}: its pictures' tokens see those behind them, which is not done here")
+            raise UserError(
+                f"{shown}: its pictures' tokens see those behind them, which is not done here"
+            )
         self._mrope: bool = m.mtmd_decode_use_mrope(self._context)
         self._pictures = Pictures(lambda images: [self._encode(image) for image in images])
         self.forget = self._pictures.forget
         self._layouts: dict[tuple[int, ...], list[Sequence[int] | int]] = {}
-        count = sum(n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int))
+        count = sum(
+            n for n in self._layout((vision.height_px, vision.width_px)) if isinstance(n, int)
+        )
         if count != vision.tokens:
             raise UserError(
-                f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, and its "
+                f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, "
+                "and its "
                 f"card's [vision] {vision.tokens}; fix the card, or give the model's own projector"
             )
 
     def tokens(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
+        """Return the tokens that stand for a picture;
+        the `Image` must stay alive until they are read.
+        """
         layout = self._layout(image.pixels.shape[:2])
         tokens = self._pictures.add(image, sum(part for part in layout if isinstance(part, int)))
         remaining = iter(tokens)
-        return [t for part in layout for t in (islice(remaining, part) if isinstance(part, int) else part)]
+        return [
+            t
+            for part in layout
+            for t in (islice(remaining, part) if isinstance(part, int) else part)
+        ]
 
     def run(self, token: int) -> Run:
-        """Return the part of a picture that begins with a token. Raises LookupError if it is gone."""
+        """Return the part of a picture that begins with a token.
+        Raises LookupError if it is gone.
+        """
         number, place = locate_picture(token)
         [runs] = self._pictures.encodings([number])
         return runs[place]
 
     def _layout(self, shape: tuple[int, ...]) -> list[Sequence[int] | int]:
-        """Return each marker's token ids, but for the template's own, and each picture part's token count."""
+        """Return each marker's token ids, but for the template's own,
+        and each picture part's token count.
+        """
         if shape not in self._layouts:
             with self._chunks(shape, None) as chunks:
                 parts = [
-                    self._marker(chunk) or self._m.mtmd_input_chunk_get_n_tokens(chunk) for chunk in chunks
+                    self._marker(chunk) or self._m.mtmd_input_chunk_get_n_tokens(chunk)
+                    for chunk in chunks
                 ]
             self._layouts[shape] = [
                 part
                 for part in parts
-                if isinstance(part, int) or "".join(self._model.pieces(part)) not in self._model.template
+                if isinstance(part, int)
+                or "".join(self._model.pieces(part)) not in self._model.template
             ]
         return self._layouts[shape]
 
@@ -130,7 +159,9 @@ class Projector:
         pixels = np.ascontiguousarray(image.pixels)
         runs: dict[int, Run] = {}
         place = 0
-        with self._chunks(pixels.shape[:2], pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))) as chunks:
+        with self._chunks(
+            pixels.shape[:2], pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
+        ) as chunks:
             for chunk in chunks:
                 if not self._marker(chunk):
                     runs[place] = self._encoded_run(chunk)
@@ -142,7 +173,9 @@ class Projector:
             raise RuntimeError(f"llama.cpp cannot encode the picture: {last_error()}")
         n = self._m.mtmd_input_chunk_get_n_tokens(chunk)
         width = c.llama_model_n_embd_inp(self._model.pointer)
-        embeddings = np.ctypeslib.as_array(self._m.mtmd_get_output_embd(self._context), (n, width)).copy()
+        embeddings = np.ctypeslib.as_array(
+            self._m.mtmd_get_output_embd(self._context), (n, width)
+        ).copy()
         places = np.arange(n, dtype=np.int32)[None]
         if self._mrope:
             tokens = self._m.mtmd_input_chunk_get_tokens_image(chunk)
@@ -152,14 +185,18 @@ class Projector:
 
     @contextmanager
     def _chunks(self, shape: tuple[int, ...], pixels: Any) -> Iterator[list[int]]:
-        """Split a picture of (height, width) pixels with mtmd; without pixels, chunks have sizes only."""
+        """Split a picture of (height, width) pixels with mtmd;
+        without pixels, chunks have sizes only.
+        """
         marker = self._m.mtmd_default_marker()
         text = self._m.mtmd_input_text(marker, len(marker), False, True)
         bitmap = ctypes.c_void_p(self._m.mtmd_bitmap_init(shape[1], shape[0], pixels))
         chunks = self._m.mtmd_input_chunks_init()
         try:
             last_error()
-            if self._m.mtmd_tokenize(self._context, chunks, ctypes.byref(text), ctypes.byref(bitmap), 1):
+            if self._m.mtmd_tokenize(
+                self._context, chunks, ctypes.byref(text), ctypes.byref(bitmap), 1
+            ):
                 raise RuntimeError(f"llama.cpp cannot take the picture: {last_error()}")
             count = self._m.mtmd_input_chunks_size(chunks)
             yield [self._m.mtmd_input_chunks_get(chunks, i) for i in range(count)]

@@ -1,4 +1,6 @@
-"""The backend of a model behind any server that speaks OpenAI's chat completions, or another `Wire`."""
+"""The backend of a model behind any server that speaks OpenAI's chat completions,
+or another `Wire`.
+"""
 
 import asyncio
 import json
@@ -33,19 +35,23 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
-    """Connect to a card's servers. Raises UserError if none answers or takes the key, or models differ."""
+    """Connect to a card's servers. Raises UserError if none answers or takes the key,
+    or models differ.
+    """
     return OpenAIBackend(card, batch_size)
 
 
 class OpenAIBackend:
     """A model behind one or several servers.
 
-    Requests are sent concurrently, at most `window` at once and each by itself, so `complete` may be called
-    during another call. Connections stay open between calls.
+    Requests are sent concurrently, at most `window` at once and each by itself, so `complete` may
+    be called during another call. Connections stay open between calls.
     """
 
     def __init__(self, card: Card, batch_size: int, wire: Wire = CHAT) -> None:
-        """Connect to a card's servers. Raises what `open` raises, and ValueError without a server."""
+        """Connect to a card's servers.
+        Raises what `open` raises, and ValueError without a server.
+        """
         if (server := card.server) is None:
             raise ValueError(f"card {card.name} has no server")
         self._card = card
@@ -58,7 +64,9 @@ class OpenAIBackend:
         self._named_other = False  # whether a server was said to name another model
         self._cuts = False  # whether a server was said to cut prompts
         client = Client(server)
-        self._pool = ServerPool(client, server, card.name, card.weights or "", batch_size, wire.path)
+        self._pool = ServerPool(
+            client, server, card.name, card.weights or "", batch_size, wire.path
+        )
         self._prompts = PromptCheck(client, card, server)
         self._loop = _Loop(client)
         weakref.finalize(self, self._loop.end)
@@ -69,20 +77,26 @@ class OpenAIBackend:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         """Return one completion per request, in the same order.
 
-        If a server has one request alone, `seconds` is the time from sending it to the last byte, with failed
-        attempts and the waits between them; an answer that never came has its time, too. The first request
-        opens a connection, which later ones reuse. Only `timed` requests are streamed: in a stream some
-        servers count no tokens, or separate thoughts differently. Raises UserError if no server is left, or
-        one has come back with another model.
+        If a server has one request alone, `seconds` is the time from sending it to the last byte,
+        with failed attempts and the waits between them; an answer that never came has its time,
+        too. The first request opens a connection, which later ones reuse. Only `timed` requests are
+        streamed: in a stream some servers count no tokens, or separate thoughts differently. Raises
+        UserError if no server is left, or one has come back with another model.
         """
         return self._loop.run(self._all(requests))
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return the JSON that the server is sent for each request, with its picture as a digest."""
-        return [canonical_json(self._wire.body(self._card, self._server, r, digest_url)) for r in requests]
+        """Return the JSON that the server is sent for each request,
+        with its picture as a digest.
+        """
+        return [
+            canonical_json(self._wire.body(self._card, self._server, r, digest_url))
+            for r in requests
+        ]
 
     def identity(self) -> dict[str, Any]:
-        """Return the model's identity as its servers state it; what none of them states goes undetected.
+        """Return the model's identity as its servers state it;
+        what none of them states goes undetected.
 
         If any of several servers may answer, their URLs are not part of it: they are `several`.
         """
@@ -97,7 +111,9 @@ class OpenAIBackend:
 
     @property
     def several(self) -> Sequence[str]:
-        """The servers' addresses if any of them may answer; empty if there is one, which the identity has."""
+        """The servers' addresses if any of them may answer;
+        empty if there is one, which the identity has.
+        """
         return self._server.urls if self._server.any_may_answer else ()
 
     @property
@@ -129,11 +145,15 @@ class OpenAIBackend:
     async def _answer(self, request: Request, together: int) -> Completion:
         if not request.orders:
             return await self._answer_once(request, together)
-        orders = [request.alike(messages=each, orders=()) for each in (request.messages, *request.orders)]
+        orders = [
+            request.alike(messages=each, orders=()) for each in (request.messages, *request.orders)
+        ]
         if together == 1:  # asked alone, they are asked one after the other: their times add up
             completions = [await self._answer_once(order, together) for order in orders]
         else:
-            completions = await asyncio.gather(*(self._answer_once(order, together) for order in orders))
+            completions = await asyncio.gather(
+                *(self._answer_once(order, together) for order in orders)
+            )
         return _over_orders(request, completions)
 
     async def _answer_once(self, request: Request, together: int) -> Completion:
@@ -164,7 +184,9 @@ class OpenAIBackend:
         )
 
     def _note(self, request: Request, reply: Reply, answer: Completion) -> None:
-        """Keep which server gave an answer; say once if it names another model than it was asked for."""
+        """Keep which server gave an answer;
+        say once if it names another model than it was asked for.
+        """
         model, asked = answering_model(reply.payload), self._card.weights
         if model not in (None, asked, f"{asked}:latest", (self._pool.model.listed or {}).get("id")):
             model, url = printable(model), printable(reply.url)
@@ -184,7 +206,9 @@ class OpenAIBackend:
         return "; ".join(filter(None, (reply.fault, self._wire.remedy(reply))))
 
     async def _reply(self, request: Request, streamed: bool) -> Reply:
-        """Ask for a reply. If the server refuses to stream, ask again without, and stream no more."""
+        """Ask for a reply. If the server refuses to stream, ask again without,
+        and stream no more.
+        """
         json_body = partial(self._wire.body, self._card, self._server, request, data_url)
         decision = request.id.partition("/")[0]
         if not streamed or not self._streams or request.bare:
@@ -195,13 +219,19 @@ class OpenAIBackend:
             return reply
         self._streams = False
         plain = await self._pool.post(decision, json_body)
-        return structs.replace(plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s)
+        return structs.replace(
+            plain, retries=reply.retries + 1 + plain.retries, begun_s=reply.begun_s
+        )
 
 
 def _over_orders(request: Request, completions: Sequence[Completion]) -> Completion:
-    """Return the completion of a read-out over several orders; if one failed or is a refusal, that one."""
+    """Return the completion of a read-out over several orders;
+    if one failed or is a refusal, that one.
+    """
     retries = sum(completion.retries for completion in completions)
-    if broken := next((completion for completion in completions if completion.finish_reason != "stop"), None):
+    if broken := next(
+        (completion for completion in completions if completion.finish_reason != "stop"), None
+    ):
         return replace(broken, request_id=request.id, retries=retries)
 
     def total(values: Iterable[Any]) -> Any:

@@ -1,7 +1,8 @@
-"""The card of a model behind a URL: its server says what it serves, and what it answers tells its kind.
+"""The card of a model behind a URL: its server says what it serves,
+and what it answers tells its kind.
 
-A served model is `URL`, or `URL#NAME` where its server has several. `openai:NAME` is one at the base URL in
-`OPENAI_BASE_URL`, else at OpenAI's.
+A served model is `URL`, or `URL#NAME` where its server has several. `openai:NAME` is one at the
+base URL in `OPENAI_BASE_URL`, else at OpenAI's.
 """
 
 import asyncio
@@ -36,9 +37,9 @@ class _Listed(NamedTuple):
 def served_card(text: str) -> Card:
     """Return the card of a served model, after asking its server what it has.
 
-    The key in `OPENAI_API_KEY`, if there is one, goes to that server. Raises UserError if the text is no base
-    URL or does not say which of several models is meant, Unanswered if no server answers or it refuses the
-    key.
+    The key in `OPENAI_API_KEY`, if there is one, goes to that server. Raises UserError if the text
+    is no base URL or does not say which of several models is meant, Unanswered if no server answers
+    or it refuses the key.
     """
     address, _, name = text.partition("#")
     if address.startswith("openai:"):
@@ -83,7 +84,9 @@ async def _ask(server: Server, name: str) -> Card:
         weights=model.id,
         thinking="none" if model.decides else thinking,
         server=Server(server.base_url, kind),
-        system="first-user" if template and not model.decides and needs_first_user(template) else None,
+        system="first-user"
+        if template and not model.decides and needs_first_user(template)
+        else None,
     )
 
 
@@ -99,17 +102,22 @@ def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     listed = {model.id: model for model in _listed(reply.payload)}
     if not listed and not name:
         raise UserError(
-            f"{shown}/models lists no model ({reply.fault or 'the list is empty or none of OpenAI'}); give "
+            f"{shown}/models lists no model "
+            f"({reply.fault or 'the list is empty or none of OpenAI'}); give "
             f"the base URL up to and with /v1, or the model's name as well: --model {shown}#NAME"
         )
     alike = [
-        model for key, model in listed.items() if name in (key, _short(key), key.removesuffix(":latest"))
+        model
+        for key, model in listed.items()
+        if name in (key, _short(key), key.removesuffix(":latest"))
     ]
     if len(alike) == 1:
         return alike[0]
     if not listed:  # some servers have no list
         if len(name) > LONGEST or not name.isprintable():
-            raise UserError(f"--model: {printable(name)} is no model's name; give one that {shown} knows")
+            raise UserError(
+                f"--model: {printable(name)} is no model's name; give one that {shown} knows"
+            )
         return _Listed(name, "", False)
     if not name and len(listed) == 1:
         return next(iter(listed.values()))
@@ -117,7 +125,8 @@ def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     reason = f"has no model {printable(name)!r}" if name else f"serves {len(names)} models"
     raise UserError(
-        f"{shown} {reason}: {', '.join(names[:SHOWN])}{more}; give one, as --model '{shown}#{names[0]}'"
+        f"{shown} {reason}: {', '.join(names[:SHOWN])}{more}; give one, as --model "
+        f"'{shown}#{names[0]}'"
     )
 
 

@@ -1,6 +1,7 @@
 """The constraint that a server is sent for an answer, and whether the answer keeps to it.
 
-Servers differ in how they are asked, and one that does not know the field drops it and answers freely.
+Servers differ in how they are asked, and one that does not know the field drops it and answers
+freely.
 """
 
 import json
@@ -16,9 +17,13 @@ from harness.core.errors import printable
 from harness.core.files import canonical_json
 from harness.prompts.answer_schema import Shape, constrained_schema, number_texts
 
-# Kinds that are sent a pattern: compact JSON, members in order, two decimals. With a JSON Schema most servers
-# allow numbers of any length.
-_BY_PATTERN: Mapping[Kind, str] = {"vllm": "regex", "llama-server": "grammar", "llama-cpp-python": "grammar"}
+# Kinds that are sent a pattern: compact JSON, members in order, two decimals. With a JSON Schema
+# most servers allow numbers of any length.
+_BY_PATTERN: Mapping[Kind, str] = {
+    "vllm": "regex",
+    "llama-server": "grammar",
+    "llama-cpp-python": "grammar",
+}
 _DECIMALS = re.compile(r"0\.[0-9][0-9]|1\.00")
 _DECIMALS_BEGUN = re.compile(r"(?:0(?:\.[0-9]?)?|1(?:\.0?)?)?")
 _NUMBER = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
@@ -47,8 +52,8 @@ def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     """Return where an answer breaks the constraint that was sent, in words; None if it keeps to it.
 
-    `text` is without a thought that the server took out. If the model has not `ended` it, it need only be the
-    beginning of what fits.
+    `text` is without a thought that the server took out.
+    If the model has not `ended` it, it need only be the beginning of what fits.
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:
@@ -66,7 +71,8 @@ def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
 
 
 def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
-    """Write the compact JSON of a schema as a regular expression, or as a rule of llama.cpp's grammar.
+    """Write the compact JSON of a schema as a regular expression,
+    or as a rule of llama.cpp's grammar.
 
     For the parts of an answer the two differ only in how `literal` text is written.
     """
@@ -83,7 +89,11 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
         case "number" | "integer":
             return f"({'|'.join(map(literal, number_texts(schema)))})"
         case "array":
-            item, least, most = _pattern(schema["items"], literal), schema["minItems"], schema["maxItems"]
+            item, least, most = (
+                _pattern(schema["items"], literal),
+                schema["minItems"],
+                schema["maxItems"],
+            )
             items = f"({item}({literal(',')}{item}){{{max(least - 1, 0)},{most - 1}}})"
             return f"{literal('[')}{items}{'' if least else '?'}{literal(']')}"
     members = [
@@ -96,9 +106,9 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
 class _Reader:
     """Reads a text along a schema: closed objects, lists, bounded texts and numbers, choices.
 
-    Neither `re` nor a validator of JSON can say whether a text that was cut off may still become one that
-    fits. Each method raises EOFError if the text ends first, and ValueError if it cannot fit after `at`
-    characters.
+    Neither `re` nor a validator of JSON can say whether a text that was cut off may still become
+    one that fits. Each method raises EOFError if the text ends first, and ValueError if it cannot
+    fit after `at` characters.
     """
 
     def __init__(self, text: str, compact: bool) -> None:
@@ -173,6 +183,10 @@ class _Reader:
         open_ended = not match or not self._compact  # more digits or an exponent may follow
         if open_ended and begun.fullmatch(self._text, self.at):
             raise EOFError
-        if not match or not least <= (value := float(match[0])) <= most or (whole and not value.is_integer()):
+        if (
+            not match
+            or not least <= (value := float(match[0])) <= most
+            or (whole and not value.is_integer())
+        ):
             raise ValueError
         self.at = match.end()

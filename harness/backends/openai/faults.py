@@ -1,4 +1,5 @@
-"""Find the error in what a server says: its words, and its code as if that had been the HTTP status.
+"""Find the error in what a server says:
+its words, and its code as if that had been the HTTP status.
 
 Some servers and most routers answer HTTP 200 before they know that they cannot answer.
 """
@@ -16,7 +17,9 @@ _REASON = ("metadata", "raw")  # where a router puts the words of the server beh
 
 
 class Fault(NamedTuple):
-    """An error in the server's words, of any length, and the HTTP status that it would have had, if known."""
+    """An error in the server's words, of any length,
+    and the HTTP status that it would have had, if known.
+    """
 
     words: str
     code: int | None = None
@@ -24,7 +27,8 @@ class Fault(NamedTuple):
 
 
 def may_pass(status: int) -> bool:
-    """Return whether another attempt may succeed after an HTTP status: a server is busy or broke down.
+    """Return whether another attempt may succeed after an HTTP status:
+    a server is busy or broke down.
 
     What it never learnt to do (501) it does not do the next time.
     """
@@ -32,7 +36,9 @@ def may_pass(status: int) -> bool:
 
 
 def error_words(payload: Any) -> str:
-    """Return an error's words, which servers put at `error`, `error.message`, `message` or `detail`."""
+    """Return an error's words, which servers put at `error`, `error.message`,
+    `message` or `detail`.
+    """
     reason = None
     try:
         while isinstance(payload, dict):
@@ -46,10 +52,11 @@ def error_words(payload: Any) -> str:
 
 
 def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
-    """Return the error in a JSON value that came with HTTP 200, or in an event of a stream; None without one.
+    """Return the error in a JSON value that came with HTTP 200, or in an event of a stream;
+    None without one.
 
-    Where a chat completion is due (`of_chat`), a bare text, or words without any choice, are an error as
-    well.
+    Where a chat completion is due (`of_chat`), a bare text, or words without any choice,
+    are an error as well.
     """
     if of_chat and isinstance(payload, str) and payload.strip():
         return Fault(payload)
@@ -62,14 +69,22 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
             return Fault(error_words({"error": error}), _code(error) or _code(payload))
     finish = first.get("finish_reason") if isinstance(first, dict) else None
     if of_chat and ending(finish) == "broken":
-        return Fault(f"the answer was broken off (finish_reason {printable(finish, 40)})", again=True)
-    if of_chat and not choices and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:]):
+        return Fault(
+            f"the answer was broken off (finish_reason {printable(finish, 40)})", again=True
+        )
+    if (
+        of_chat
+        and not choices
+        and any(isinstance(payload.get(name), str | list) for name in _WORDS[1:])
+    ):
         return Fault(error_words(payload), _code(payload))
     return None
 
 
 def plain_text(data: bytes | bytearray) -> str | None:
-    """Return a body that is words of a server; None if it is empty, markup, broken JSON or no text."""
+    """Return a body that is words of a server;
+    None if it is empty, markup, broken JSON or no text.
+    """
     with suppress(UnicodeDecodeError):
         text = " ".join(data.decode().split())
         return text if text and text.isprintable() and text[0] not in "<{[" else None

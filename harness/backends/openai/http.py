@@ -30,7 +30,12 @@ MOST_SHOWN = 40  # characters of a body that is no JSON
 SHORTEST_SECRET = 8  # shorter keys are no secrets: many local servers are given `EMPTY`
 _HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 # Errors that mean that there was no connection.
-_UNREACHED = (aiohttp.ClientConnectorError, aiohttp.ConnectionTimeoutError, aiohttp.InvalidURL, UnicodeError)
+_UNREACHED = (
+    aiohttp.ClientConnectorError,
+    aiohttp.ConnectionTimeoutError,
+    aiohttp.InvalidURL,
+    UnicodeError,
+)
 
 
 class Reply(Struct, frozen=True):
@@ -50,7 +55,9 @@ class Reply(Struct, frozen=True):
 
 
 class Client:
-    """Sends requests to servers with one key. Redirects are not followed, since they would carry the key."""
+    """Sends requests to servers with one key.
+    Redirects are not followed, since they would carry the key.
+    """
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -80,9 +87,12 @@ class Client:
     async def post(self, base: str, path: str, content: bytes) -> Reply:
         return await self._once("POST", base, base + path, content, self._server.timeout_s)
 
-    async def _once(self, method: str, base: str, url: str, content: bytes | None, within_s: float) -> Reply:
+    async def _once(
+        self, method: str, base: str, url: str, content: bytes | None, within_s: float
+    ) -> Reply:
         try:
-            async with asyncio.timeout(within_s):  # for the whole attempt: a server may send bytes for ever
+            # for the whole attempt: a server may send bytes for ever
+            async with asyncio.timeout(within_s):
                 return await self._read(method, base, url, content)
         except (aiohttp.ClientError, UnicodeError) as error:
             kind, text = type(error).__name__, str(error)
@@ -93,7 +103,11 @@ class Client:
 
     async def _read(self, method: str, base: str, url: str, content: bytes | None) -> Reply:
         data, stream = bytearray(), Stream()
-        options: dict[str, Any] = {"data": content, "proxy": self._proxies[base], "allow_redirects": False}
+        options: dict[str, Any] = {
+            "data": content,
+            "proxy": self._proxies[base],
+            "allow_redirects": False,
+        }
         async with self._session.request(method, URL(url, encoded=True), **options) as response:
             status, after_s = response.status, _after_s(response.headers.get("retry-after"))
 
@@ -122,9 +136,13 @@ class Client:
             return Reply(payload, status=status, first_at_s=stream.first_at_s)
         payload, readable = self._payload(bytes(data))
         if status == 200:
-            error = fault_in(payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS))
+            error = fault_in(
+                payload if readable else plain_text(data), of_chat=url.endswith(COMPLETIONS)
+            )
             if error is None:
-                return Reply(payload, fault=None if readable else self._no_json(data), status=status)
+                return Reply(
+                    payload, fault=None if readable else self._no_json(data), status=status
+                )
             words = f"with HTTP 200: {self._shown(error.words)}"
             if error.code is None:
                 return fault(f"an error {words}", again=error.again)
@@ -135,7 +153,9 @@ class Client:
         return fault(f"HTTP {status}: {self._shown(message)}", again=may_pass(status))
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
-        """Parse JSON and remove the key from it, however it is escaped. Returns the value and the success."""
+        """Parse JSON and remove the key from it, however it is escaped.
+        Returns the value and the success.
+        """
         try:
             payload = json.loads(data.decode("utf-8-sig", "replace"))
             if self._key:
@@ -146,7 +166,9 @@ class Client:
         return payload, True
 
     def _no_json(self, data: bytes | bytearray) -> str:
-        """Return the fault of a body that is no JSON, with its beginning: it may be markup, or packed."""
+        """Return the fault of a body that is no JSON, with its beginning:
+        it may be markup, or packed.
+        """
         if not data:
             return "the answer is no JSON: it is empty"
         text = self._without_key(data[: MOST_SHOWN * 100].decode("utf-8", "replace"))
@@ -165,7 +187,9 @@ class Client:
 def _key(server: Server) -> str | None:
     key = server.key() or ""
     if not (key.isascii() and key.isprintable()) or " " in key:
-        raise UserError(f"the key in {server.key_env} holds characters that no key has; set it again")
+        raise UserError(
+            f"the key in {server.key_env} holds characters that no key has; set it again"
+        )
     return key or None
 
 
@@ -177,7 +201,9 @@ def _proxy(url: str) -> str | None:
 
 
 def _after_s(text: str | None) -> float | None:
-    """Return the seconds of a Retry-After header, which is a number or a date; None if it is unreadable."""
+    """Return the seconds of a Retry-After header, which is a number or a date;
+    None if it is unreadable.
+    """
     if text is None:
         return None
     try:

@@ -48,7 +48,9 @@ class LlamaServer(ServerKind):
         path = props.get("model_path")
         named = ("chat_template", "modalities", "bos_token", "eos_token")
         facts = {name: props.get(name) for name in named}
-        facts["file"] = path.replace("\\", "/").rpartition("/")[2] if isinstance(path, str) else None
+        facts["file"] = (
+            path.replace("\\", "/").rpartition("/")[2] if isinstance(path, str) else None
+        )
         facts["n_ctx"] = settings.get("n_ctx", props.get("n_ctx"))
         # What it does where a request says nothing: penalties, DRY, XTC.
         sampling = settings.get("params")
@@ -116,7 +118,9 @@ class VLLM(ServerKind):
         return fields_of(await ask("/version", None)).get("version"), {}
 
     async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
-        """Ask whether a request can turn thinking off: another prompt is made of the same messages then."""
+        """Ask whether a request can turn thinking off:
+        another prompt is made of the same messages then.
+        """
         chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
         counts = []
         for on in (True, False):
@@ -154,7 +158,9 @@ def fields_of(reply: Reply) -> dict[str, Any]:
 def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
     """Return the entry of a model in a list of models, or the only one; None if there is none."""
     listed = payload.get(key) if isinstance(payload, dict) else None
-    entries = [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
+    entries = (
+        [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
+    )
     for name in (model, f"{model}:latest"):  # Ollama adds the tag
         for entry in entries:
             if name in (entry.get("id"), entry.get("name"), entry.get("model")):

@@ -1,8 +1,10 @@
-"""One model behind one or several servers: distribute requests, retry, and set broken servers aside.
+"""One model behind one or several servers:
+distribute requests, retry, and set broken servers aside.
 
-Requests with the same key go to the same server, whose cache holds the beginning of their prompts: each key
-ranks the servers by a hash (rendezvous hashing), so that adding or removing one moves few keys. A server
-whose queue is empty takes requests from the end of the longest queue, so that none is idle.
+Requests with the same key go to the same server, whose cache holds the beginning of their prompts:
+each key ranks the servers by a hash (rendezvous hashing), so that adding or removing one moves few
+keys. A server whose queue is empty takes requests from the end of the longest queue, so that none
+is idle.
 """
 
 import asyncio
@@ -23,7 +25,8 @@ from harness.backends.servers import Server
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.parallel import share
 
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0  # wait before the first retry, doubled with each; and its limit
+# wait before the first retry, doubled with each; and its limit
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 30.0
 BROKEN = 3  # failures in a row after which a server is set aside
 
 
@@ -44,7 +47,9 @@ class _ServerState:
 
 @dataclass(eq=False)
 class _Pending:
-    """A pending request: its body, built when it is sent, the future of its reply, and failures by server."""
+    """A pending request: its body, built when it is sent, the future of its reply,
+    and failures by server.
+    """
 
     key: str
     body: Callable[[], Mapping[str, Any]]
@@ -69,10 +74,15 @@ class ServerPool:
     ) -> None:
         """Prepare a pool, which `open` connects.
 
-        One server gets `at_once` requests at most, from all workers together, each at the `path` behind its
-        base URL.
+        One server gets `at_once` requests at most, from all workers together,
+        each at the `path` behind its base URL.
         """
-        self._client, self._settings, self._name, self._weights = client, settings, printable(name), weights
+        self._client, self._settings, self._name, self._weights = (
+            client,
+            settings,
+            printable(name),
+            weights,
+        )
         self._at_once, self._path = at_once, path
         self._servers = [_ServerState(url) for url in settings.urls]
         self._pending: set[_Pending] = set()
@@ -86,10 +96,13 @@ class ServerPool:
     async def open(self) -> None:
         """Ask every server for its model. One that does not answer is set aside if another does.
 
-        Raises UserError if two have different models, Unanswered if none answers or one refuses the key.
+        Raises UserError if two have different models,
+        Unanswered if none answers or one refuses the key.
         """
         models = await asyncio.gather(*(self._look(server) for server in self._servers))
-        answering = {server: model for server, model in zip(self._servers, models, strict=True) if model}
+        answering = {
+            server: model for server, model in zip(self._servers, models, strict=True) if model
+        }
         if not answering:
             raise Unanswered(
                 f"no server answers at {self._faults()}; start the server, or fix --server or the "
@@ -105,10 +118,10 @@ class ServerPool:
     async def post(self, key: str, build: Callable[[], Mapping[str, Any]]) -> Reply:
         """Send a request; return the reply once there is an answer, or the retries are used up.
 
-        If a server is busy (429), breaks down (5xx), is not reached or takes too long, the request is tried
-        again: at once at another server, or at the same one after the wait that it asks for, or else a
-        doubling one. Raises UserError if one has come back with another model, Unanswered if no server is
-        left.
+        If a server is busy (429), breaks down (5xx), is not reached or takes too long, the request
+        is tried again: at once at another server, or at the same one after the wait that it asks
+        for, or else a doubling one. Raises UserError if one has come back with another model,
+        Unanswered if no server is left.
         """
         if self._refused:
             raise self._refused
@@ -120,16 +133,21 @@ class ServerPool:
         finally:
             self._pending.discard(pending)
 
-    # -- who is asked ---------------------------------------------------------------------------------------
+    # -- who is asked
+    # ---------------------------------------------------------------------------------------
 
     def _rank(self, key: str) -> list[_ServerState]:
         if len(self._servers) == 1:
             return self._servers
-        weights = {s: blake2b(f"{s.url} {key}".encode(), digest_size=8).digest() for s in self._servers}
+        weights = {
+            s: blake2b(f"{s.url} {key}".encode(), digest_size=8).digest() for s in self._servers
+        }
         return sorted(self._servers, key=weights.__getitem__)
 
     def _enqueue(self, *requests: _Pending) -> None:
-        """Queue requests at their key's server, or at the next that is up and has failed them less often."""
+        """Queue requests at their key's server,
+        or at the next that is up and has failed them less often.
+        """
         for pending in requests:
             queue = min(self._ranked(pending.key), key=lambda s: (s.aside, pending.failed[s])).queue
             queue.insert(0 if pending.failed else len(queue), pending)  # a retry goes first
@@ -139,7 +157,10 @@ class ServerPool:
 
     def _hand_out(self) -> None:
         self._woken = False
-        available, at_once = [server for server in self._servers if not server.aside], share(self._at_once)
+        available, at_once = (
+            [server for server in self._servers if not server.aside],
+            share(self._at_once),
+        )
         for take in (self._next, self._steal):  # first each server's own queue
             for server in available:
                 while server.busy < at_once and (pending := take(server)):
@@ -148,12 +169,15 @@ class ServerPool:
 
     def _next(self, server: _ServerState) -> _Pending | None:
         while server.queue:
-            if not (pending := server.queue.popleft()).reply.done():  # its caller may have been cancelled
+            # its caller may have been cancelled
+            if not (pending := server.queue.popleft()).reply.done():
                 return pending
         return None
 
     def _steal(self, server: _ServerState) -> _Pending | None:
-        """Take the next request from a server's own queue, or else one from the end of the longest queue."""
+        """Take the next request from a server's own queue,
+        or else one from the end of the longest queue.
+        """
         if server.aside:
             return None
         if pending := self._next(server):
@@ -177,15 +201,23 @@ class ServerPool:
         task.add_done_callback(self._tasks.discard)
 
     async def _ask(self, server: _ServerState, pending: _Pending) -> None:
-        """Send a request until it is answered, another server may answer it, or no attempt is left."""
+        """Send a request until it is answered, another server may answer it,
+        or no attempt is left.
+        """
         while True:
             server.sent += 1
             nth, first = server.sent, server.busy == 1
             pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
-            reply = await self._client.post(server.url, self._path, msgspec.json.encode(pending.body()))
+            reply = await self._client.post(
+                server.url, self._path, msgspec.json.encode(pending.body())
+            )
             alone = first and server.sent == nth and share(self._at_once) == self._at_once
             reply = msgspec.structs.replace(
-                reply, retries=pending.failed[server], begun_s=pending.begun_s, alone=alone, url=server.url
+                reply,
+                retries=pending.failed[server],
+                begun_s=pending.begun_s,
+                alone=alone,
+                url=server.url,
             )
             if not reply.again:
                 server.failures = server.pauses = 0
@@ -209,10 +241,13 @@ class ServerPool:
         if not pending.reply.done():
             pending.reply.set_result(reply)
 
-    # -- who breaks down ------------------------------------------------------------------------------------
+    # -- who breaks down
+    # ------------------------------------------------------------------------------------
 
     def _set_aside(self, server: _ServerState) -> None:
-        """Send a server no more requests until it answers again, and move its queue to other servers."""
+        """Send a server no more requests until it answers again,
+        and move its queue to other servers.
+        """
         server.aside = True
         if len(self._servers) > 1:
             self.say(f"server {printable(server.url)} is set aside ({server.fault})")
@@ -226,7 +261,9 @@ class ServerPool:
         self._enqueue(*waiting)
 
     async def _await(self, server: _ServerState) -> None:
-        """Ask a server that was set aside for its model, after longer and longer pauses, until it answers."""
+        """Ask a server that was set aside for its model, after longer and longer pauses,
+        until it answers.
+        """
         try:
             while True:
                 await asyncio.sleep(pause_s(server.pauses))
@@ -236,14 +273,18 @@ class ServerPool:
                     break
                 server.unreached += 1
                 if all(s.aside and s.unreached > self._settings.retries for s in self._servers):
-                    left = f"model {self._name!r}: no server is left: {self._faults()}; start one again"
+                    left = (
+                        f"model {self._name!r}: no server is left: {self._faults()}; start one "
+                        "again"
+                    )
                     self._end(Unanswered(left))
             self._agree(server, model)
         except Exception as error:  # a bug ends the run, too; nothing else awaits this task
             self._refused = error
             self._end(error)
             return
-        server.aside, server.unreached, server.failures = False, 0, BROKEN - 1  # one more sets it aside
+        # one more sets it aside
+        server.aside, server.unreached, server.failures = False, 0, BROKEN - 1
         if len(self._servers) > 1:
             self.say(f"server {printable(server.url)} is there again")
         self._enqueue_again(*(s for s in self._servers if s.aside))
@@ -259,7 +300,8 @@ class ServerPool:
     def say(self, line: str) -> None:
         print(f"harness: model {self._name!r}: {line}", file=sys.stderr)
 
-    # -- what they have -------------------------------------------------------------------------------------
+    # -- what they have
+    # -------------------------------------------------------------------------------------
 
     async def _look(self, server: _ServerState) -> Model | None:
         """Ask a server for its statement about the model; None if it does not answer."""
@@ -284,19 +326,25 @@ class ServerPool:
         url, weights = printable(server.url), printable(self._weights)
         if self._settings.any_may_answer and model.listed is None:
             raise UserError(
-                f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so it may have "
+                f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so it may "
+                "have "
                 "another model than others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
             first = f"server {printable(self._first.url)} has {_shown(self.model, model)}"
             raise UserError(
-                f"model {self._name!r}: {first}, and server {url} {_shown(model, self.model)}; serve "
+                f"model {self._name!r}: {first}, and server {url} {_shown(model, self.model)}; "
+                "serve "
                 "the same model, by the same version"
             )
 
 
 def _shown(model: Model, other: Model) -> str:
-    """Return a statement's name and version, and what else it states otherwise than another, in one line."""
+    """Return a statement's name and version, and what else it states otherwise than another,
+    in one line.
+    """
     differing = {k: v for k, v in model.states.items() if other.states.get(k) != v}
     facts = {**(model.listed or {}), "version": model.version, **differing}
-    return " ".join(f"{key}={printable(value, 80)}" for key, value in facts.items() if value is not None)
+    return " ".join(
+        f"{key}={printable(value, 80)}" for key, value in facts.items() if value is not None
+    )

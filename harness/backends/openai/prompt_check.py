@@ -1,4 +1,6 @@
-"""What a served model reads: a server that can tell is asked whether every message's text is among it."""
+"""What a served model reads: a server that can tell is asked whether every message's text is among
+it.
+"""
 
 import asyncio
 import json
@@ -19,15 +21,16 @@ LONGER = 1.5  # times as many characters have more tokens
 class PromptCheck:
     """Asks a model's servers, before the first answer of each role, what the model reads.
 
-    llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without an answer.
-    Of another server only the token counts of its answers are known: `fault` says if they do not grow with
-    the prompts. Prompts with pictures are not asked about.
+    llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without
+    an answer. Of another server only the token counts of its answers are known: `fault` says if
+    they do not grow with the prompts. Prompts with pictures are not asked about.
     """
 
     def __init__(self, client: Client, card: Card, server: Server) -> None:
         self._client, self._card, self._server = client, card, server
         self._asked: set[str] = set()  # roles
-        self._shortest = self._longest = (0, 0)  # characters and tokens of prompts that were answered
+        # characters and tokens of prompts that were answered
+        self._shortest = self._longest = (0, 0)
         self._alone = asyncio.Lock()
 
     async def check(self, requests: Sequence[Request]) -> None:
@@ -46,7 +49,11 @@ class PromptCheck:
 
         Some servers cut long prompts to their context in silence, as Ollama does.
         """
-        if tokens is None or request.image is not None or self._server.kind in ("llama-server", "vllm"):
+        if (
+            tokens is None
+            or request.image is not None
+            or self._server.kind in ("llama-server", "vllm")
+        ):
             return None
         here = sum(len(message["content"]) for message in request.messages), tokens
         self._shortest = min(self._shortest if self._shortest[0] else here, here)
@@ -55,8 +62,10 @@ class PromptCheck:
         if many < LONGER * few or many_tokens > few_tokens:
             return None
         return (
-            f"counts {few_tokens} tokens in a prompt of {few} characters and {many_tokens} in one of {many}; "
-            "it may cut prompts, or count only what it did not have in its cache: look at its context "
+            f"counts {few_tokens} tokens in a prompt of {few} characters and {many_tokens} in one "
+            f"of {many}; "
+            "it may cut prompts, or count only what it did not have in its cache: look at its "
+            "context "
             "length and log"
         )
 
@@ -76,7 +85,8 @@ class PromptCheck:
             way = "" if self._card.system else f'; or give its card system = "{FIRST_USER}"'
             raise UserError(
                 f"{self._card.shown}: the chat template at {printable(base)} leaves out or "
-                f"changes the {printable(lacking['role'])}'s text, so the model would not read what it is "
+                f"changes the {printable(lacking['role'])}'s text, so the model would not read "
+                "what it is "
                 f"asked; start the server with the template that the model was trained with{way}"
             )
 

@@ -1,17 +1,23 @@
-"""Read what a message of a server says: the answer, a thought that was taken out of it, and a refusal."""
+"""Read what a message of a server says:
+the answer, a thought that was taken out of it, and a refusal.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
 from harness.core.errors import printable
 
-THOUGHTS = ("reasoning_content", "reasoning")  # where servers put a thought; some send both, one of them null
+# where servers put a thought; some send both, one of them null
+THOUGHTS = ("reasoning_content", "reasoning")
 REFUSAL = "refusal"  # where they put the words of a model that refuses
 # The field of a message that a part of its content belongs to, by the part's type.
 _FIELDS = {
-    "text": "content", "output_text": "content", "thinking": THOUGHTS[0], "reasoning": THOUGHTS[0],
+    "text": "content",
+    "output_text": "content",
+    "thinking": THOUGHTS[0],
+    "reasoning": THOUGHTS[0],
     "refusal": REFUSAL,
-}  # fmt: skip
+}
 
 
 class NoText(TypeError):
@@ -19,7 +25,8 @@ class NoText(TypeError):
 
 
 def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a message, or a piece of one, whose content is a text even if it came as a list of parts.
+    """Return a message, or a piece of one,
+    whose content is a text even if it came as a list of parts.
 
     Thoughts and refusals among the parts go to their fields. Raises NoText for other parts.
     """
@@ -30,7 +37,9 @@ def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
         kind = part.get("type", "text") if isinstance(part, dict) else type(part).__name__
         field = _FIELDS.get(kind) if isinstance(kind, str) and isinstance(part, dict) else None
         if field is None:
-            raise NoText(f"the answer's content has a part that is no text but {printable(kind, 40)}")
+            raise NoText(
+                f"the answer's content has a part that is no text but {printable(kind, 40)}"
+            )
         texts[field] = texts.get(field, "") + _text(part, kind)
     stated = {name: value for name, value in message.items() if value and name != "content"}
     return {**message, **texts, **stated}

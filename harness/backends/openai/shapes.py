@@ -20,11 +20,14 @@ from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts.readout import letters, spelt, stated
 
-_REMEDY = "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
+_REMEDY = (
+    "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
+)
 MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
-MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer tokens has not counted
-# Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1, vLLM by
-# the checkpoint's generation_config.json), and JSON repeats itself.
+# of a token, on average over a text: whoever counts fewer tokens has not counted
+MOST_CHARACTERS = 16
+# Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1,
+# vLLM by the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
     "vllm": "repetition_penalty",
     "llama-server": "repeat_penalty",
@@ -50,7 +53,8 @@ def digest_url(image: Image) -> str:
 def body(
     card: Card, server: Server, request: Request, url: Callable[[Image], str] = data_url
 ) -> dict[str, Any]:
-    """Build the JSON request of one chat completion, not streamed; `url` gives the URL of its picture.
+    """Build the JSON request of one chat completion, not streamed;
+    `url` gives the URL of its picture.
 
     Raises UserError if it has a temperature, which the card leaves out.
     """
@@ -76,7 +80,11 @@ def body(
     if request.answer == "constrained":
         json_body |= constraint(server.kind, request.shape)
     if request.bare:
-        json_body |= {"max_tokens": 1, "logprobs": True, "top_logprobs": server.top_logprobs or MOST_LOGPROBS}
+        json_body |= {
+            "max_tokens": 1,
+            "logprobs": True,
+            "top_logprobs": server.top_logprobs or MOST_LOGPROBS,
+        }
     if server.fields is None:
         return json_body
     if request.temperature and server.fields.temperature is False:
@@ -90,8 +98,8 @@ def body(
 def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Read a chat completion, without its time.
 
-    A malformed one, or one that breaks the constraint that this kind of server was sent, is an error in one
-    sentence. The text of a refusal is that of the model that refuses.
+    A malformed one, or one that breaks the constraint that this kind of server was sent, is an
+    error in one sentence. The text of a refusal is that of the model that refuses.
     """
     try:
         choice = payload["choices"][0]
@@ -121,15 +129,21 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     if request.answer == "constrained" and (
         fault := broken(kind, request, content, ended=finish_reason == "stop")
     ):
-        return failed(request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}")
+        return failed(
+            request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}"
+        )
     text = _with_thought(thinks, content, finish_reason, request.thinking)
     return Completion(request.id, text, *tokens, finish_reason, None, 1)
 
 
-def _with_thought(thought: str | None, content: str, finish_reason: FinishReason, asked: bool) -> str:
-    """Restore the text as the model wrote it, if the server took out the thought: the parser looks for it.
+def _with_thought(
+    thought: str | None, content: str, finish_reason: FinishReason, asked: bool
+) -> str:
+    """Restore the text as the model wrote it, if the server took out the thought:
+    the parser looks for it.
 
-    An answer that was cut off with nothing after the thought was cut off inside it, so it stays open.
+    An answer that was cut off with nothing after the thought was cut off inside it,
+    so it stays open.
     """
     if not thought and not (asked and thought is not None):
         return content
@@ -139,13 +153,17 @@ def _with_thought(thought: str | None, content: str, finish_reason: FinishReason
 
 
 def _read_out(
-    choice: Mapping[str, Any], request: Request, prompt_tokens: int | None, completion_tokens: int | None
+    choice: Mapping[str, Any],
+    request: Request,
+    prompt_tokens: int | None,
+    completion_tokens: int | None,
 ) -> Completion:
     """Read the letters' probabilities from the list of the likeliest tokens.
 
-    A letter counts in each of its spellings, with a blank before it or without. One that is not listed is at
-    most as likely as the least likely listed token, and all such letters together have at most the remaining
-    probability; each gets the most that it can have. `label_mass` counts the listed letters only.
+    A letter counts in each of its spellings, with a blank before it or without. One that is not
+    listed is at most as likely as the least likely listed token, and all such letters together have
+    at most the remaining probability; each gets the most that it can have. `label_mass` counts the
+    listed letters only.
     """
     try:
         likeliest = choice["logprobs"]["content"][0]["top_logprobs"]
@@ -158,10 +176,14 @@ def _read_out(
     if not 0 < total <= 1.001:
         return failed(request, "the server's log-probabilities are none")
     if not mass:
-        return failed(request, f"none of the letters {names} is among the {len(listed)} likeliest tokens")
+        return failed(
+            request, f"none of the letters {names} is among the {len(listed)} likeliest tokens"
+        )
     missing = set(names) - {token for token, _ in listed}
     most_p = min(min(p for _, p in listed), max(0.0, 1.0 - total) / max(1, len(missing)))
-    text = stated(request.actions, [most_p if name in missing else letter_p[name] for name in names])
+    text = stated(
+        request.actions, [most_p if name in missing else letter_p[name] for name in names]
+    )
     tokens = prompt_tokens, completion_tokens
     return Completion(request.id, text, *tokens, "stop", None, 1, label_mass=min(1.0, mass))
 

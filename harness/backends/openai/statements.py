@@ -1,7 +1,8 @@
-"""What a server states of its model: weights, template, context and version, as far as its kind tells.
+"""What a server states of its model: weights, template, context and version,
+as far as its kind tells.
 
-All of it is part of the model's identity, so that other weights under the same name are asked again. What
-only says when or where a server was started, or what it is doing, is left out.
+All of it is part of the model's identity, so that other weights under the same name are asked
+again. What only says when or where a server was started, or what it is doing, is left out.
 """
 
 import json
@@ -16,16 +17,35 @@ from harness.core.files import sha256_bytes
 
 Fact = str | int | float | bool
 _LISTED = ("id", "owned_by", "root", "max_model_len")
-# Keys that say nothing of a model, at any depth: dates, permissions, prices, and what the server is doing.
-_PASSING = frozenset({
-    "active", "created", "created_at", "expires_at", "last_used", "loaded", "loaded_context_length",
-    "modified_at", "object", "per_request_limits", "permission", "permissions", "pricing", "state", "status",
-    "updated_at", "uptime",
-})  # fmt: skip
+# Keys that say nothing of a model, at any depth: dates, permissions, prices, and what the server is
+# doing.
+_PASSING = frozenset(
+    {
+        "active",
+        "created",
+        "created_at",
+        "expires_at",
+        "last_used",
+        "loaded",
+        "loaded_context_length",
+        "modified_at",
+        "object",
+        "per_request_limits",
+        "permission",
+        "permissions",
+        "pricing",
+        "state",
+        "status",
+        "updated_at",
+        "uptime",
+    }
+)
 _MOST_FACTS, _MOST_DEPTH = 64, 4
-_SHOWN = 100  # longest text that is kept as it is; of longer ones, such as templates, the digest is kept
+# longest text that is kept as it is; of longer ones, such as templates, the digest is kept
+_SHOWN = 100
 _EXACT = 2**53  # integers beyond are no JSON numbers that every program reads alike
-_WEIGHTS = ("digest", "n_params", "size")  # last names of facts that change if the weights do, as a rule
+# last names of facts that change if the weights do, as a rule
+_WEIGHTS = ("digest", "n_params", "size")
 
 
 class Model(NamedTuple):
@@ -37,25 +57,32 @@ class Model(NamedTuple):
 
     @property
     def tells_weights(self) -> bool:
-        """Whether other weights under the same name would show, as a rule: by a digest or their size."""
+        """Whether other weights under the same name would show, as a rule:
+        by a digest or their size.
+        """
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Return whether it states all that an earlier one did; a server that is loading states less."""
+        """Return whether it states all that an earlier one did;
+        a server that is loading states less.
+        """
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None
         return lists and tells_version and earlier.states.keys() <= self.states.keys()
 
 
 async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
-    """Return what a server states of a model, by its answer to `/v1/models` and what else it is asked.
+    """Return what a server states of a model,
+    by its answer to `/v1/models` and what else it is asked.
 
     A server with one model accepts any name for it.
     """
     if (entry := entry_of(models, "data", weights)) is None:
         return Model()
     listed = {
-        k: v if type(v) is int and abs(v) <= _EXACT else printable(v) for k in _LISTED if (v := entry.get(k))
+        k: v if type(v) is int and abs(v) <= _EXACT else printable(v)
+        for k in _LISTED
+        if (v := entry.get(k))
     }
     facts = {name: value for name, value in entry.items() if name not in _LISTED}
     version, more = await SERVER_KINDS[kind].states(weights, ask)

@@ -1,7 +1,7 @@
 """Assemble a streamed chat completion, and record when its first token came.
 
-Pieces are server-sent events (WHATWG HTML, 9.2), each a `data:` line of JSON, up to `[DONE]`. Nothing in a
-stream raises an exception: an error becomes a fault, in one sentence.
+Pieces are server-sent events (WHATWG HTML, 9.2), each a `data:` line of JSON, up to `[DONE]`.
+Nothing in a stream raises an exception: an error becomes a fault, in one sentence.
 """
 
 import json
@@ -12,7 +12,8 @@ from typing import Any
 from harness.backends.openai.faults import Fault, fault_in, may_pass
 from harness.backends.openai.said import REFUSAL, THOUGHTS, NoText, in_texts
 
-ASKED = {"stream": True, "stream_options": {"include_usage": True}}  # the last piece has the token counts
+# the last piece has the token counts
+ASKED = {"stream": True, "stream_options": {"include_usage": True}}
 BROKE_OFF = "the stream broke off"
 _TEXTS = ("content", *THOUGHTS, REFUSAL)  # of a message, which come in pieces
 _CUT_OFF = "the stream ends before the answer does"
@@ -25,7 +26,8 @@ class Stream:
         # Why it is no completion, with text of the server of any length; None once it is one.
         self.fault: str | None = _CUT_OFF
         self.again = True  # whether another attempt may succeed
-        self.code: int | None = None  # the HTTP status that an error in it would have had, if it states one
+        # the HTTP status that an error in it would have had, if it states one
+        self.code: int | None = None
         self._rest = b""
         self._begun = False  # whether its first line was read, before which a BOM may stand
         self._kind = b""  # of the event
@@ -45,7 +47,8 @@ class Stream:
             field, _, value = line.strip().partition(b":")
             if field in (b"event", b""):  # an empty line ends an event
                 self._kind = value.strip() if field else b""
-            if field == b"data" and self.fault in (None, _CUT_OFF):  # a comment keeps the connection alive
+            # a comment keeps the connection alive
+            if field == b"data" and self.fault in (None, _CUT_OFF):
                 self._event(value.strip().decode("utf-8", "replace"), at_s)
 
     def _event(self, text: str, at_s: float) -> None:
@@ -73,7 +76,8 @@ class Stream:
             return
         self._model = piece.get("model") or self._model
         self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
-        for choice in (piece.get("choices") or [])[:1]:  # the last piece may have token counts and no choice
+        # the last piece may have token counts and no choice
+        for choice in (piece.get("choices") or [])[:1]:
             delta = in_texts(choice.get("delta") or {})
             texts = {name: delta[name] for name in _TEXTS if delta.get(name) is not None}
             for name, text in texts.items():
@@ -89,7 +93,9 @@ class Stream:
 
     @property
     def first_at_s(self) -> float | None:
-        """When the first text came; None if all text came at once, so a buffer on the way hid the time."""
+        """When the first text came; None if all text came at once,
+        so a buffer on the way hid the time.
+        """
         return None if self._first_at_s == self._last_at_s else self._first_at_s
 
     def payload(self) -> dict[str, Any]:

@@ -16,20 +16,27 @@ class Unpacker:
     """Unpacks the bytes of one answer as they come."""
 
     def __init__(self, coding: str) -> None:
-        """Unpack by a Content-Encoding, empty for none. Raises Packed for one that is not known here."""
+        """Unpack by a Content-Encoding, empty for none.
+        Raises Packed for one that is not known here.
+        """
         self._coding = coding.strip().casefold()
         self._zlib = zlib.decompressobj(_EITHER) if self._coding in _ZLIB else None
         if self._zlib is None and self._coding not in ("", "identity"):
             raise Packed(
-                f"the answer is compressed (Content-Encoding: {printable(coding, 40)}), though it was asked "
+                f"the answer is compressed (Content-Encoding: {printable(coding, 40)}), though it "
+                "was asked "
                 "for as it is; have the server, or the proxy before it, leave it so"
             )
 
     def take(self, data: bytes, most: int) -> bytes:
-        """Return what further bytes unpack to, `most` bytes at most. Raises Packed if they are damaged."""
+        """Return what further bytes unpack to, `most` bytes at most.
+        Raises Packed if they are damaged.
+        """
         if self._zlib is None:
             return data
         try:
             return self._zlib.decompress(data, most)
         except zlib.error:
-            raise Packed(f"the answer is no {self._coding}, though its Content-Encoding says so") from None
+            raise Packed(
+                f"the answer is no {self._coding}, though its Content-Encoding says so"
+            ) from None

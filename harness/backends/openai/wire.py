@@ -1,4 +1,6 @@
-"""How a server is asked: the path beside its base URL, what it is sent, and how its answer is read."""
+"""How a server is asked: the path beside its base URL, what it is sent,
+and how its answer is read.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -20,12 +22,17 @@ class Wire(NamedTuple):
     path: str
     body: Callable[[Card, Server, Request, Callable[[Image], str]], dict[str, Any]]
     read: Callable[[Any, Request, Kind], Completion]
-    remedy: Callable[[Reply], str]  # what to do about a fault, after its words; empty if nobody knows
+    # what to do about a fault, after its words; empty if nobody knows
+    remedy: Callable[[Reply], str]
     decides: bool  # whether decision models are asked, which write nothing and render no chat
 
     def misfit(self, states: Mapping[str, Fact]) -> str | None:
-        """Return why a model is asked the wrong way, by what its server states of it; None if it does not."""
-        outputs = str(states.get("architecture.output_modalities", states.get("output_modalities", "")))
+        """Return why a model is asked the wrong way, by what its server states of it;
+        None if it does not.
+        """
+        outputs = str(
+            states.get("architecture.output_modalities", states.get("output_modalities", ""))
+        )
         if not outputs or ("decisions" in outputs) == self.decides:
             return None
         if self.decides:

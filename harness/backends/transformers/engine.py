@@ -14,7 +14,14 @@ from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import BUILT_IN
-from harness.backends.weights import check_digest, fetching, find_checkpoint, find_gguf, hub_commit, is_gguf
+from harness.backends.weights import (
+    check_digest,
+    fetching,
+    find_checkpoint,
+    find_gguf,
+    hub_commit,
+    is_gguf,
+)
 from harness.core.cores import threads
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import digest, sha256_bytes, sha256_file, text_of
@@ -41,7 +48,9 @@ def open(
 
 
 def checkpoint(card: Card) -> Path:
-    """Return the directory of a card's checkpoint, held to the card's digest; a GGUF file is unpacked."""
+    """Return the directory of a card's checkpoint, held to the card's digest;
+    a GGUF file is unpacked.
+    """
     if not is_gguf(card):
         where = find_checkpoint(card)
         check_digest(card, where / "model.safetensors")
@@ -49,12 +58,16 @@ def checkpoint(card: Card) -> Path:
     from harness.backends.transformers.unpack import unpack_checkpoint
 
     if card.vision:
-        raise UserError(f"{card.shown}: a GGUF file takes no pictures on transformers; use llama-cpp")
+        raise UserError(
+            f"{card.shown}: a GGUF file takes no pictures on transformers; use llama-cpp"
+        )
     return unpack_checkpoint(card, check_digest(card, find_gguf(card)))
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
-    """Load the tokenizer and the model of a checkpoint. Raises UserError if they do not go together."""
+    """Load the tokenizer and the model of a checkpoint.
+    Raises UserError if they do not go together.
+    """
     import transformers
 
     transformers.utils.logging.set_verbosity_error()
@@ -85,22 +98,25 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     rows = model.get_input_embeddings().num_embeddings
     if len(tokenizer) > rows:
         raise UserError(
-            f"{shown}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give both from "
+            f"{shown}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give "
+            "both from "
             "one checkpoint"
         )
     if not tokenizer.chat_template:
         raise UserError(
-            f"{shown} has no chat template; use its instruct version, or put a chat_template.jinja beside "
+            f"{shown} has no chat template; use its instruct version, or put a chat_template.jinja "
+            "beside "
             "its config.json"
         )
     return tokenizer, model
 
 
 def _check_config(card: Card, where: Path) -> None:
-    """Raise UserError if a checkpoint's config names a repository for its attention, or too many layers.
+    """Raise UserError if a checkpoint's config names a repository for its attention,
+    or too many layers.
 
-    Where the package `kernels` is installed, transformers fetches that repository and runs its code. It makes
-    the layers before it looks at the weights.
+    Where the package `kernels` is installed, transformers fetches that repository and runs its
+    code. It makes the layers before it looks at the weights.
     """
     shown = f"{card.shown} in {printable(where)}"
     try:
@@ -123,13 +139,16 @@ def _check_config(card: Card, where: Path) -> None:
                 is_count = any(word in key for word in ("layer", "depth", "expert"))
                 if is_count and isinstance(stated, int) and stated > MOST_LAYERS:
                     raise UserError(
-                        f"{shown}: {printable(key)} in its config.json is {printable(stated)}, and at most "
+                        f"{shown}: {printable(key)} in its config.json is {printable(stated)}, and "
+                        "at most "
                         f"{MOST_LAYERS}; {fetching(card)}"
                     )
 
 
 def choose_device(asked: str | None) -> str:
-    """Return the device that a user names; None means CUDA if there is any. Raises UserError if missing."""
+    """Return the device that a user names; None means CUDA if there is any.
+    Raises UserError if missing.
+    """
     import torch
 
     if asked is None:
@@ -152,7 +171,9 @@ def gpus() -> list[str]:
 
 
 class TransformersEngine:
-    """A transformers model with its tokenizer and, if it takes pictures, its image processor (`eyes`)."""
+    """A transformers model with its tokenizer and, if it takes pictures,
+    its image processor (`eyes`).
+    """
 
     def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
         from harness.backends.transformers.eyes import Eyes
@@ -167,8 +188,13 @@ class TransformersEngine:
             card.context_tokens or model.config.get_text_config().max_position_embeddings
         )
         listed = model.generation_config.eos_token_id or []
-        # A chat model's turn may end with a token that its generation config does not list: the template's.
-        ends = {*(listed if isinstance(listed, list) else [listed]), tokenizer.eos_token_id, *self.chat.ends}
+        # A chat model's turn may end with a token that its generation config does not list: the
+        # template's.
+        ends = {
+            *(listed if isinstance(listed, list) else [listed]),
+            tokenizer.eos_token_id,
+            *self.chat.ends,
+        }
         self.stops: Sequence[int] = sorted(ends - {None})
         self._reader = Reader(model, self.eyes)
 
@@ -181,7 +207,9 @@ class TransformersEngine:
         return self._reader.begin(prompts, exact)
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers; a hub checkpoint is named by its commit, others by their files."""
+        """Return what decides the answers;
+        a hub checkpoint is named by its commit, others by their files.
+        """
         commit = hub_commit(self.where)
         return {
             "engine": "transformers",

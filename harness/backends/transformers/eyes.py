@@ -1,4 +1,5 @@
-"""Vision of a transformers model: its image processor and encoder, and the tokens that stand for pictures.
+"""Vision of a transformers model: its image processor and encoder,
+and the tokens that stand for pictures.
 
 Importing this imports torch.
 """
@@ -26,12 +27,15 @@ class Processor:
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
         """Load the processor. Raises UserError if the checkpoint has none."""
-        from transformers import AutoConfig, AutoImageProcessor  # slow, and needed for pictures alone
+        # slow, and needed for pictures alone
+        from transformers import AutoConfig, AutoImageProcessor
 
         side = vision.scaled_to_px and {"longest_edge": max(vision.scaled_to_px)}
         limits = {"shortest_edge": vision.least_px or 1, "longest_edge": vision.most_px or 1 << 30}
         self._options = (
-            {"size": side, "max_image_size": side, "do_image_splitting": False} if side else {"size": limits}
+            {"size": side, "max_image_size": side, "do_image_splitting": False}
+            if side
+            else {"size": limits}
         )
         files = {"local_files_only": True, "trust_remote_code": False}
         try:
@@ -49,14 +53,18 @@ class Processor:
 
     def __call__(self, pictures: list[Pixels]) -> Mapping[str, torch.Tensor]:
         # A model that scales to one size takes one list of pictures for each row.
-        images = [[pixels] for pixels in pictures] if "max_image_size" in self._options else pictures
+        images = (
+            [[pixels] for pixels in pictures] if "max_image_size" in self._options else pictures
+        )
         inputs: Mapping[str, torch.Tensor] = self._processor(
             images=images, return_tensors="pt", **self._options
         )
         return inputs
 
     def measured(self, pixels: Pixels) -> tuple[int, Any]:
-        """Return the number of tokens of a picture of this size, and its grid of patches if it has one."""
+        """Return the number of tokens of a picture of this size,
+        and its grid of patches if it has one.
+        """
         if pixels.shape not in self._of_size:
             inputs, config = self([pixels]), self._config.vision_config
             grid = inputs.get("image_grid_thw")
@@ -70,10 +78,14 @@ class Processor:
 
 
 class Eyes:
-    """A loaded model's image processor and vision encoder; a picture is `image_token` in its template."""
+    """A loaded model's image processor and vision encoder;
+    a picture is `image_token` in its template.
+    """
 
     def __init__(self, name: str, where: Path, vision: Vision, tokenizer: Any, model: Any) -> None:
-        """Load the processor. Raises UserError if there is none, or it makes more or fewer tokens."""
+        """Load the processor. Raises UserError if there is none,
+        or it makes more or fewer tokens.
+        """
         self._processor = Processor(name, where, vision)
         if difference := vision.difference(self._processor.tokens):
             raise UserError(f"model {name!r}: {difference}")
@@ -85,7 +97,9 @@ class Eyes:
         self.forget = self._pictures.forget
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture; the `Image` must stay alive until they are read."""
+        """Return the tokens that stand for a picture;
+        the `Image` must stay alive until they are read.
+        """
         tokens = self._pictures.add(image, self._processor.measured(image.pixels)[0])
         return [*self._before, *tokens, *self._after]
 
@@ -97,7 +111,9 @@ class Eyes:
                 self._pictures.encodings(numbers)
 
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
-        """Return the model's inputs for tokens (n, width): their ids, and their pictures in order."""
+        """Return the model's inputs for tokens (n, width):
+        their ids, and their pictures in order.
+        """
         numbers = pictures_in(ids.flatten().tolist())
         token_ids = torch.where(ids < 0, self._filled, ids).to(self._model.device)
         inputs: dict[str, Any] = {"input_ids": token_ids}
@@ -108,7 +124,9 @@ class Eyes:
         return inputs
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
-        """Return positions in time, height and width, (3, tokens); None if the model numbers tokens."""
+        """Return positions in time, height and width, (3, tokens);
+        None if the model numbers tokens.
+        """
         if not hasattr(self._model.model, "get_rope_index"):
             return None
         ids = torch.tensor([list(prompt)])
@@ -116,7 +134,9 @@ class Eyes:
         grids = [self._processor.measured(image.pixels)[1] for image in images]
         filled, grid = torch.where(ids < 0, self._filled, ids), torch.cat(grids) if grids else None
         types = (ids < 0).int()
-        place, _ = self._model.model.get_rope_index(filled, mm_token_type_ids=types, image_grid_thw=grid)
+        place, _ = self._model.model.get_rope_index(
+            filled, mm_token_type_ids=types, image_grid_thw=grid
+        )
         positions: torch.Tensor = place[:, 0]
         return positions
 
@@ -124,17 +144,22 @@ class Eyes:
         """Return each layer's inputs for some pictures."""
         inputs = self._processor([image.pixels for image in images])
         features = self._model.model.get_image_features(
-            **{name: value.to(self._model.device) for name, value in inputs.items()}, return_dict=True
+            **{name: value.to(self._model.device) for name, value in inputs.items()},
+            return_dict=True,
         )
         layers = [features.pooler_output, *getattr(features, "deepstack_features", ())]
         return [[layer[i] for layer in layers] for i in range(len(images))]
 
 
 def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
-    """Return the markers before and after a picture that some models' processors write, and no template."""
+    """Return the markers before and after a picture that some models' processors write,
+    and no template.
+    """
     if not written:
         return [], []
-    around, whole = map(tokenizer.convert_tokens_to_ids, ("<fake_token_around_image>", "<global-img>"))
+    around, whole = map(
+        tokenizer.convert_tokens_to_ids, ("<fake_token_around_image>", "<global-img>")
+    )
     return [around, whole], [around]
 
 

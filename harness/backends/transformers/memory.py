@@ -1,4 +1,5 @@
-"""The keys and values of a transformers model: those of several batches as one, and of earlier prompts.
+"""The keys and values of a transformers model:
+those of several batches as one, and of earlier prompts.
 
 Importing this imports torch.
 """
@@ -17,7 +18,9 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 
 
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
-    """Return one cache of the rows of several, which are emptied, in an order; short rows end in zeros."""
+    """Return one cache of the rows of several, which are emptied, in an order;
+    short rows end in zeros.
+    """
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
         for name in ("keys", "values"):
@@ -30,7 +33,9 @@ def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
 
 
 class Prefix(NamedTuple):
-    """A beginning that was read: its tokens, and each layer's keys and values, (1, heads, tokens, dim)."""
+    """A beginning that was read: its tokens, and each layer's keys and values,
+    (1, heads, tokens, dim).
+    """
 
     ids: list[int]
     layers: list[tuple[Any, Any]]
@@ -46,7 +51,8 @@ class Prefixes:
         self._kept: list[Prefix] = []
 
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
-        """Return the longest known beginning of a sequence; `NOTHING` if it is below `LEAST_TOKENS`.
+        """Return the longest known beginning of a sequence;
+        `NOTHING` if it is below `LEAST_TOKENS`.
 
         `but` is a whole prompt that is ignored although it was read before.
         """

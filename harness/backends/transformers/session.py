@@ -1,12 +1,13 @@
 """Sequences that advance together through a transformers model, with cached keys and values.
 
-Sequences of different length are padded on the left of the new tokens, so pads lie between old and new ones.
-A mask hides the pads and positions skip them, so full attention gives the same result as without padding.
-Other kinds of layer do not (a sliding window counts pads, a recurrent state reads them): a model that has one
-reads each sequence on its own.
+Sequences of different length are padded on the left of the new tokens, so pads lie between old and
+new ones. A mask hides the pads and positions skip them, so full attention gives the same result as
+without padding. Other kinds of layer do not (a sliding window counts pads, a recurrent state reads
+them): a model that has one reads each sequence on its own.
 
-Prompts are read in groups that begin alike, and are joined when they advance: a batch of an ego's and its
-helpers' prompts reads neither system text again, and a short prompt is not padded to the longest of all.
+Prompts are read in groups that begin alike, and are joined when they advance: a batch of an ego's
+and its helpers' prompts reads neither system text again, and a short prompt is not padded to the
+longest of all.
 
 Importing this imports torch.
 """
@@ -23,14 +24,23 @@ from transformers.cache_utils import Cache, DynamicCache, DynamicLayer
 
 from harness.backends.engine import Session, check_logits, common_beginning, group_by_beginning
 from harness.backends.transformers.eyes import Eyes
-from harness.backends.transformers.memory import LEAST_TOKENS, NOTHING, Prefix, Prefixes, join_caches
+from harness.backends.transformers.memory import (
+    LEAST_TOKENS,
+    NOTHING,
+    Prefix,
+    Prefixes,
+    join_caches,
+)
 from harness.core.arrays import Floats
 
-CPU_TOKENS = 1024  # most tokens that a CPU reads together: what more of them need does not stay in its cache
+# most tokens that a CPU reads together: what more of them need does not stay in its cache
+CPU_TOKENS = 1024
 
 
 class Reader:
-    """A model that reads prompts; `together` if sequences can be padded, and so be read in one batch."""
+    """A model that reads prompts; `together` if sequences can be padded,
+    and so be read in one batch.
+    """
 
     def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
         self._model, self._eyes = model, eyes
@@ -45,9 +55,12 @@ class Reader:
         self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
-        """Read some prompts, none of them empty; until the next call, `exact` logits are float32's."""
+        """Read some prompts, none of them empty;
+        until the next call, `exact` logits are float32's.
+        """
         self._exact = list(exact)
-        if self._failed:  # perhaps because memory ran out; the failed call has released its own by now
+        # perhaps because memory ran out; the failed call has released its own by now
+        if self._failed:
             self._prefixes.clear()
             if self._model.device.type == "cuda":
                 torch.cuda.empty_cache()
@@ -57,7 +70,9 @@ class Reader:
         return session
 
     def _in_float32(self, head: Any, inputs: tuple[Any, ...], logits: Any) -> Any:
-        """Replace the exact tokens' logits: 16 bits leave steps of .06 to .13 between likely ones."""
+        """Replace the exact tokens' logits:
+        16 bits leave steps of .06 to .13 between likely ones.
+        """
         if not self._exact:
             return logits
         tokens = torch.tensor(self._exact, device=logits.device)
@@ -81,26 +96,35 @@ class Reader:
             prefix = self._prefix([beginnings[place] for place in group])
             for piece in self._pieces(group, [len(prompt) - len(prefix.ids) for prompt in prompts]):
                 at = positions and [positions[place] for place in piece]
-                parts.append((piece, Rows.read(self, prefix, [prompts[place] for place in piece], at)))
+                parts.append(
+                    (piece, Rows.read(self, prefix, [prompts[place] for place in piece], at))
+                )
         return Rows.join(parts, positions)
 
     def _read_alone(self, prompt: list[int], beginning: list[int]) -> Session:
         # A prompt that is repeated alone is read again, or its time would not be an answer's time.
         if self._eyes and self._prefixes.holds(prompt):
             self._eyes.forget(prompt)
-            beginning = beginning[: next((i for i, token in enumerate(prompt) if token < 0), len(prompt))]
+            beginning = beginning[
+                : next((i for i, token in enumerate(prompt) if token < 0), len(prompt))
+            ]
         prefix = self._prefixes.longest(beginning, but=prompt)
         rows = Rows.read(self, prefix, [prompt], self.positions([prompt]))
-        self._prefixes.keep(Prefix(prompt, rows.layers()))  # what the next prompt shares is not known yet
+        # what the next prompt shares is not known yet
+        self._prefixes.keep(Prefix(prompt, rows.layers()))
         return rows
 
     def _prefix(self, beginnings: list[list[int]]) -> Prefix:
-        """Return what some prompts begin with; what is read of it is kept, unless half of it was."""
+        """Return what some prompts begin with;
+        what is read of it is kept, unless half of it was.
+        """
         shared = common_beginning(beginnings)
         prefix = self._prefixes.longest(shared)
         known = len(prefix.ids)
         if len(beginnings) > 1 and len(shared) - known >= LEAST_TOKENS:
-            prefix = Prefix(shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers())
+            prefix = Prefix(
+                shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers()
+            )
             if 2 * known < len(shared):
                 self._prefixes.keep(prefix)
         return prefix
@@ -122,7 +146,9 @@ class Reader:
         return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
-        """Return the positions of each prompt's tokens, (3, tokens); None if they are consecutive."""
+        """Return the positions of each prompt's tokens, (3, tokens);
+        None if they are consecutive.
+        """
         if self._eyes is None or not any(token < 0 for prompt in prompts for token in prompt):
             return None
         places = [self._eyes.positions(prompt) for prompt in prompts]
@@ -134,19 +160,22 @@ class Reader:
         Args:
             cache: keys and values so far, to which the new ones are added.
             ids: tokens, (n, width), on the CPU.
-            mask: 1 for a token and 0 for a pad, (n, cached + width), or what each token sees, (n, 1, width,
-                cached + width), on the CPU.
+            mask: 1 for a token and 0 for a pad, (n, cached + width),
+                or what each token sees, (n, 1, width, cached + width), on the CPU.
             columns: after how many of the last columns, or after which.
             places: positions, (n, width) or (3, n, width); None if they are consecutive.
         """
         device = self._model.device
-        if mask.ndim == 4:  # added to what attention weighs: not every kind of it takes truth values
+        # added to what attention weighs: not every kind of it takes truth values
+        if mask.ndim == 4:
             mask = torch.where(mask, 0.0, torch.finfo(self._model.dtype).min).to(self._model.dtype)
         options = {"attention_mask": mask.to(device), "past_key_values": cache, "use_cache": True}
         if places is not None:
             options["position_ids"] = places.to(device)
         elif self._positions:
-            options["position_ids"] = (mask.cumsum(-1) - 1).clamp(min=0)[:, -ids.shape[1] :].to(device)
+            options["position_ids"] = (
+                (mask.cumsum(-1) - 1).clamp(min=0)[:, -ids.shape[1] :].to(device)
+            )
         try:
             with torch.inference_mode():
                 options |= self._eyes.inputs(ids) if self._eyes else {"input_ids": ids.to(device)}
@@ -162,14 +191,16 @@ class Rows:
     def __init__(self, reader: Reader, cache: Cache, mask: Any, logits: Any, places: Any) -> None:
         """Hold what was read, and the logits after each sequence.
 
-        The mask is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the positions of
-        each prompt's tokens; None if they are consecutive.
+        The mask is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the
+        positions of each prompt's tokens; None if they are consecutive.
         """
         self._reader, self._cache, self._mask, self._logits = reader, cache, mask, logits
         self._places = places
 
     @classmethod
-    def read(cls, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]], places: Any) -> "Rows":
+    def read(
+        cls, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]], places: Any
+    ) -> "Rows":
         """Read prompts that all begin with `prefix` and are longer."""
         n, known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
@@ -188,13 +219,17 @@ class Rows:
         mask = torch.cat([pad(rows._mask, (0, columns - rows._mask.shape[1])) for _, rows in parts])
         logits = torch.cat([rows._logits for _, rows in parts])
         cache = join_caches([rows._cache for _, rows in parts], order)
-        return cls(parts[0][1]._reader, cache, mask[order], logits[order.to(logits.device)], positions)
+        return cls(
+            parts[0][1]._reader, cache, mask[order], logits[order.to(logits.device)], positions
+        )
 
     def copy(self) -> "Rows":
         return Rows(self._reader, deepcopy(self._cache), self._mask, self._logits, self._places)
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Return each layer's keys and values, (n, heads, tokens, dim); advancing never alters them."""
+        """Return each layer's keys and values, (n, heads, tokens, dim);
+        advancing never alters them.
+        """
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
@@ -210,9 +245,13 @@ class Rows:
         return _log_probs(self._logits, tokens)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        # All chunks of a sequence stand side by side in its row, and a token sees those of its own chunk
-        # alone: the sequence's keys and values are neither copied nor read again.
-        n, count, width = len(chunks), len(chunks[0]), max(len(chunk) for each in chunks for chunk in each)
+        # All chunks of a sequence stand side by side in its row, and a token sees those of its own
+        # chunk alone: the sequence's keys and values are neither copied nor read again.
+        n, count, width = (
+            len(chunks),
+            len(chunks[0]),
+            max(len(chunk) for each in chunks for chunk in each),
+        )
         ids = torch.zeros(n, count, width, dtype=torch.long)
         own = torch.zeros(n, count, width, dtype=torch.bool)
         for row, each in enumerate(chunks):
@@ -230,7 +269,10 @@ class Rows:
         places = (starts[:, None, None] + (own.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
         if self._places is not None:
             places = places.expand(3, -1, -1)
-        mask, last = torch.cat([before, among], dim=-1)[:, None], torch.arange(1, count + 1) * width - 1
+        mask, last = (
+            torch.cat([before, among], dim=-1)[:, None],
+            torch.arange(1, count + 1) * width - 1,
+        )
         logits = self._reader.forward(self._cache, ids.reshape(n, -1), mask, last, places)
         return _log_probs(logits.flatten(0, 1), tokens).reshape(n, count, -1)
 
@@ -239,9 +281,13 @@ class Rows:
             return
         logits = self._append(chunks, 1)[:, -1]
         advanced = torch.tensor([[bool(chunk)] for chunk in chunks], device=logits.device)
-        self._logits = logits if self._logits is None else torch.where(advanced, logits, self._logits)
+        self._logits = (
+            logits if self._logits is None else torch.where(advanced, logits, self._logits)
+        )
 
-    def follow(self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]) -> list[int]:
+    def follow(
+        self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]
+    ) -> list[int]:
         widest = max(map(len, guesses))
         both = [[*chunk, *guess] for chunk, guess in zip(chunks, guesses, strict=True)]
         logits = self._append(both, 1 + widest)
@@ -259,12 +305,16 @@ class Rows:
         return counts
 
     def _append(self, chunks: Sequence[Sequence[int]], columns: int) -> Any:
-        """Read tokens and return the logits after each of the last columns, (n, columns, vocabulary)."""
+        """Read tokens and return the logits after each of the last columns,
+        (n, columns, vocabulary).
+        """
         width = max(map(len, chunks))
         ids = torch.tensor([[0] * (width - len(chunk)) + list(chunk) for chunk in chunks])
         new = torch.tensor([[0] * (width - len(chunk)) + [1] * len(chunk) for chunk in chunks])
         self._mask = torch.cat([self._mask, new], dim=1)
-        return self._reader.forward(self._cache, ids, self._mask, columns, self._positions(chunks, width))
+        return self._reader.forward(
+            self._cache, ids, self._mask, columns, self._positions(chunks, width)
+        )
 
     def _positions(self, chunks: Sequence[Sequence[int]], width: int) -> Any:
         """Return the positions of new tokens, (3, n, width); None if they are consecutive."""
@@ -303,7 +353,9 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
 
 
 class Apart(Session):
-    """Sequences that are each read on their own: what a window or a recurrent state reads stays read."""
+    """Sequences that are each read on their own:
+    what a window or a recurrent state reads stays read.
+    """
 
     def __init__(self, sessions: Sequence[Rows]) -> None:
         self._sessions = sessions

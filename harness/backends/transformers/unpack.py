@@ -1,7 +1,7 @@
 """A GGUF file as a checkpoint that transformers loads: its weights as float32, made once and kept.
 
-The file is read in Python and numpy. Its tokenizer is `harness.backends.tokens`' own, which splits text as
-llama.cpp does.
+The file is read in Python and numpy. Its tokenizer is `harness.backends.tokens`' own,
+which splits text as llama.cpp does.
 """
 
 import io
@@ -27,7 +27,9 @@ _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
 def unpack_checkpoint(card: Card, file: Path) -> Path:
-    """Return the checkpoint of a GGUF file, made if it is not kept. Raises UserError if it cannot be."""
+    """Return the checkpoint of a GGUF file, made if it is not kept.
+    Raises UserError if it cannot be.
+    """
     from transformers import __version__
 
     made_by = [__version__, BUILT_IN["transformers"].answers]
@@ -46,7 +48,8 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
                     shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
         raise UserError(
-            f"{shown}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a weight in "
+            f"{shown}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a "
+            "weight in "
             f"{printable(to.parent)}; SWARMDRIVE_CACHE names another folder"
         ) from None
     return to
@@ -59,7 +62,9 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
     try:
         values = read_metadata(file, arrays=True)
     except ValueError as error:
-        raise UserError(f"{shown} does not load: {error}; copy or download the file again") from None
+        raise UserError(
+            f"{shown} does not load: {error}; copy or download the file again"
+        ) from None
     if not isinstance(values.get("tokenizer.chat_template"), str):
         raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
     loaded = tokenizer(file)
@@ -74,14 +79,16 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
                 file.parent, gguf_file=file.name, output_loading_info=True, **options
             )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
-        if isinstance(error, OSError) and error.errno is not None:  # the disk, and not transformers' words
+        # the disk, and not transformers' words
+        if isinstance(error, OSError) and error.errno is not None:
             raise
         fault = f"{shown} does not load with transformers: {one_line(error)}"
         raise UserError(f"{fault}; run it on llama-cpp") from error
     if report["missing_keys"]:
         absent = sorted(report["missing_keys"])
         raise UserError(
-            f"{shown} lacks {len(absent)} of its weights ({printable(absent[0])}); download the file again, "
+            f"{shown} lacks {len(absent)} of its weights ({printable(absent[0])}); download the "
+            "file again, "
             "or run it on llama-cpp"
         )
     model.hf_quantizer = None

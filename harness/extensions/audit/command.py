@@ -1,4 +1,6 @@
-"""`harness dataset scenario audit`: whether a scenario's hidden danger can be told from what is in sight."""
+"""`harness dataset scenario audit`: whether a scenario's hidden danger can be told from what is in
+sight.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -19,18 +21,22 @@ if TYPE_CHECKING:
 def command(
     name: options.Scenario,
     layouts: int = typer.Option(300, help="Number of layouts to look at."),
-    seed: int = typer.Option(FIRST["report"], help="Layout seed of the first layout; the others follow."),
+    seed: int = typer.Option(
+        FIRST["report"], help="Layout seed of the first layout; the others follow."
+    ),
     workers: options.Workers = "2",
     as_json: options.Json = False,
 ) -> None:
     """Test whether the ego's view gives the hidden danger away. Exit code 1 if it does.
 
-    A classifier tries to predict the danger from the ego's view alone; above chance, the scenario leaks it.
+    A classifier tries to predict the danger from the ego's view alone;
+    above chance, the scenario leaks it.
     """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
     if scenario.is_environment:
         raise UserError(
-            f"{printable(name)} is an environment without a known danger, so there is nothing to audit; "
+            f"{printable(name)} is an environment without a known danger, so there is nothing to "
+            "audit; "
             "give a scenario"
         )
     from harness.extensions.audit.tells import audit
@@ -39,10 +45,18 @@ def command(
     with bar(f"auditing {name}", layouts, as_json) as progress:
         result = audit(scenario, layouts, seed, progress, who)
     if as_json:
-        echo_json({
-            "scenario": name, "layouts": layouts, "seed": seed, "steps": result.steps, "tells": result.tells,
-            "worst": result.worst, "auc": result.auc, "told_by": result.told_by,
-        })  # fmt: skip
+        echo_json(
+            {
+                "scenario": name,
+                "layouts": layouts,
+                "seed": seed,
+                "steps": result.steps,
+                "tells": result.tells,
+                "worst": result.worst,
+                "auc": result.auc,
+                "told_by": result.told_by,
+            }
+        )
     else:
         typer.echo(printable(scenarios.title(scenario)))
         _print(result)
@@ -59,7 +73,9 @@ def _print(result: "Audit") -> None:
     )
     text = console()
     text.print(f"n = {result.layouts} layouts, {stated(result.seed, result.layouts)};")
-    text.print(f"decision points {result.steps[0]} to {result.steps[-1]}, while the danger is out of sight")
+    text.print(
+        f"decision points {result.steps[0]} to {result.steps[-1]}, while the danger is out of sight"
+    )
     if not result.tells:
         text.print(f"no tell: every AUC is {MOST_AUC:.2f} or less")
         return

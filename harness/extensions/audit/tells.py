@@ -1,13 +1,14 @@
-"""Audit whether a scenario gives its hidden danger away: what the ego sees must not tell what it cannot see.
+"""Audit whether a scenario gives its hidden danger away:
+what the ego sees must not tell what it cannot see.
 
-A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of sight,
-whether there is a danger and where it comes from. A layout is never on both sides of the cross-validation.
-Only decision points of one step are compared, since fewer dangers are still hidden at later steps, and only
-answers of one fold's model. If the classifier does better than chance, any model can: then an ego alone is
-not blind.
+A small classifier learns, from the numbers of the ego's own scene graph while the danger is out of
+sight, whether there is a danger and where it comes from. A layout is never on both sides of the
+cross-validation. Only decision points of one step are compared, since fewer dangers are still
+hidden at later steps, and only answers of one fold's model. If the classifier does better than
+chance, any model can: then an ego alone is not blind.
 
-Beacons of traffic (`radio_share`) are left out: who hears the car that would be the danger, and hears that it
-is none, knows that and has not guessed it.
+Beacons of traffic (`radio_share`) are left out: who hears the car that would be the danger, and
+hears that it is none, knows that and has not guessed it.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,7 +35,8 @@ FOLDS = 5
 RESAMPLES = 1999
 BLIND = ("cruise", "local-view")  # drivers that cannot know of what the ego does not see
 DANGER, NONE = "danger", ""
-Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]  # a danger's sector; steps and numbers
+# a danger's sector; steps and numbers
+Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,12 @@ class Audit:
     scenario: str  # name of the scenario
     layouts: int  # number of layouts
     seed: int  # layout seed of the first one
-    # decision points that were compared: those at which at least half of the dangers are hidden. Later, an
-    # empty road is an observation and gives nothing away
+    # decision points that were compared: those at which at least half of the dangers are hidden.
+    # Later, an empty road is an observation and gives nothing away
     steps: tuple[int, ...]
-    # for each question (`danger`, and each sector that it can come from) the probability that a layout with
-    # it ranks above one without. Intervals are a bootstrap over layouts, for these models
+    # for each question (`danger`, and each sector that it can come from) the probability that a
+    # layout with it ranks above one without. Intervals are a bootstrap over layouts, for these
+    # models
     auc: Mapping[str, Estimate]
     # the numbers that gave it away, with the AUC lost without each; empty unless it `tells`
     told_by: Mapping[str, float]
@@ -74,11 +77,16 @@ class HiddenPoints:
 
 
 def audit(
-    scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers = 1
+    scenario: Scenario,
+    layouts: int,
+    seed: int,
+    progress: Callable[[int], None],
+    workers: Workers = 1,
 ) -> Audit:
     """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
 
-    Raises UserError without scikit-learn, or if too few layouts have a danger, or too few have none.
+    Raises UserError without scikit-learn, or if too few layouts have a danger,
+    or too few have none.
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
@@ -89,7 +97,8 @@ def audit(
 
 
 def _hidden(scenario: Scenario, seed: int) -> Hidden:
-    """Return the sector of a layout's danger, and the ego's numbers at every step until it is in sight.
+    """Return the sector of a layout's danger,
+    and the ego's numbers at every step until it is in sight.
 
     A braking vehicle counts as the danger in sight, since it may brake for the danger.
     """
@@ -116,12 +125,15 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
 
 
 def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
-    """Return all layouts' decision points at the steps where at least half of the dangers are hidden."""
+    """Return all layouts' decision points at the steps where at least half of the dangers are
+    hidden.
+    """
     dangers = sum(danger != NONE for danger, _ in layouts)
     for count, what in ((dangers, "have a danger"), (len(layouts) - dangers, "have none")):
         if count < FOLDS:
             raise UserError(
-                f"{count} of {len(layouts)} layouts of {scenario.name} {what}; an audit needs {FOLDS}, "
+                f"{count} of {len(layouts)} layouts of {scenario.name} {what}; an audit needs "
+                f"{FOLDS}, "
                 "give more with --layouts"
             )
     hidden = [0] * scenario.parameters.decisions
@@ -138,7 +150,8 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
     ]
     if not rows:
         raise UserError(
-            f"scenario {scenario.name} hides no danger: most are in sight from the start, so there is "
+            f"scenario {scenario.name} hides no danger: most are in sight from the start, so there "
+            "is "
             "nothing to audit"
         )
     layout, step, danger, values = zip(*rows, strict=True)
@@ -146,14 +159,18 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
     return HiddenPoints(np.array(layout), np.array(step), np.array(danger), tuple(values[0]), table)
 
 
-def judge(points: HiddenPoints, sectors: tuple[str, ...]) -> tuple[dict[str, Estimate], dict[str, float]]:
+def judge(
+    points: HiddenPoints, sectors: tuple[str, ...]
+) -> tuple[dict[str, Estimate], dict[str, float]]:
     """Return the AUC of each question, and what gave the best answered one away (`Audit`)."""
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.model_selection import StratifiedGroupKFold
 
     layout, step, danger = points.layout, points.step, points.danger
     known, classes = ~np.isnan(points.numbers), np.unique(danger)
-    folds = list(StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(known, danger, layout))
+    folds = list(
+        StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(known, danger, layout)
+    )
     # Learning fails on a number that is unknown wherever a model learns.
     varies = []
     for k, column in enumerate(points.numbers.T):
@@ -161,7 +178,9 @@ def judge(points: HiddenPoints, sectors: tuple[str, ...]) -> tuple[dict[str, Est
         if known_where_learnt and len(np.unique(column[known[:, k]])) > 1:
             varies.append(k)
     table, names = points.numbers[:, varies], [points.names[k] for k in varies]
-    trees = partial(HistGradientBoostingClassifier, max_leaf_nodes=8, early_stopping=False, random_state=0)
+    trees = partial(
+        HistGradientBoostingClassifier, max_leaf_nodes=8, early_stopping=False, random_state=0
+    )
     models = [trees(max_iter=40).fit(table[learnt], danger[learnt]) for learnt, _ in folds]
 
     def answers(table: Floats) -> Floats:
@@ -210,7 +229,8 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 class Ranks:
     """Comparisons between layouts with the danger in question and layouts without."""
 
-    # number of pairs of points in which the layout with it ranks higher, (with, without); a tie counts half
+    # number of pairs of points in which the layout with it ranks higher, (with, without); a tie
+    # counts half
     above: Floats
     pairs: Floats  # number of all compared pairs of points, (with, without)
 
@@ -224,7 +244,9 @@ class Ranks:
         above, pairs = np.zeros((2, len(have), len(have_not)))
         for k in np.unique(alike):
             with_it, without = (np.flatnonzero((alike == k) & side) for side in (there, ~there))
-            at = np.ix_(np.searchsorted(have, layout[with_it]), np.searchsorted(have_not, layout[without]))
+            at = np.ix_(
+                np.searchsorted(have, layout[with_it]), np.searchsorted(have_not, layout[without])
+            )
             apart = score[with_it][:, None] - score[without]
             np.add.at(above, at, (apart > 0) + 0.5 * (apart == 0))
             np.add.at(pairs, at, 1.0)
@@ -254,12 +276,18 @@ class OfDatasets:
         extras.need("an audit", "sklearn")
 
     def found(
-        self, scenario: Scenario, layouts: int, seed: int, progress: Callable[[int], None], workers: Workers
+        self,
+        scenario: Scenario,
+        layouts: int,
+        seed: int,
+        progress: Callable[[int], None],
+        workers: Workers,
     ) -> str:
         auc = audit(scenario, layouts, seed, progress, workers).auc[DANGER]
         return (
             "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
-            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, n = "
+            f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, "
+            "n = "
             f"{auc.n} layouts; .50 is a guess)."
         )
 

@@ -1,4 +1,6 @@
-"""Run editions of a benchmark, pack results into one file, and compute, check and rank those of others."""
+"""Run editions of a benchmark, pack results into one file, and compute,
+check and rank those of others.
+"""
 
 from harness.core.extensions import Extension
 

@@ -28,8 +28,8 @@ class Line:
     """One entry."""
 
     entry: Rescored  # the file of results, computed again
-    # one more than the number of ranked entries that are clearly better; None of one that sees what no
-    # vehicle can see, which is no contestant
+    # one more than the number of ranked entries that are clearly better; None of one that sees what
+    # no vehicle can see, which is no contestant
     rank: int | None
     success: Mapping[str, Score | None]  # by condition, means over families, that to rank by first
     gain: Score | None  # of that one over `BASELINE`
@@ -45,7 +45,9 @@ class Line:
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:
-    """Return the entries of one edition, the best first. Raises UserError if they are of several, or none."""
+    """Return the entries of one edition, the best first.
+    Raises UserError if they are of several, or none.
+    """
     named = {entry.edition.name: entry.edition for entry in entries}
     if len(named) != 1:
         raise UserError(
@@ -59,7 +61,10 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
         Line(
             entry,
             None if _privileged(entry.suite) else _rank(entry.suite, ranked, edition, lead),
-            {name: entry.suite.score(name, lead) for name in dict.fromkeys((by, *edition.condition))},
+            {
+                name: entry.suite.score(name, lead)
+                for name in dict.fromkeys((by, *edition.condition))
+            },
             _gain(entry.suite, edition, lead),
         )
         for entry in entries
@@ -77,7 +82,9 @@ def _value(score: Score | None) -> float:
 
 def _rank(suite: SuiteRun, ranked: Sequence[SuiteRun], edition: Edition, lead: str) -> int:
     others = [other for other in ranked if other is not suite]
-    differences = [edition.difference(_pairs(other, suite, edition.ranked_by, lead)) for other in others]
+    differences = [
+        edition.difference(_pairs(other, suite, edition.ranked_by, lead)) for other in others
+    ]
     return 1 + sum(difference.low > 0 for difference in differences)
 
 
@@ -120,25 +127,41 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
         )
         for line in ordered
     ]
-    heads = ("entry", "rank", by, "on one scale", f"gain over {BASELINE}", *others, "computed again here")
+    heads = (
+        "entry",
+        "rank",
+        by,
+        "on one scale",
+        f"gain over {BASELINE}",
+        *others,
+        "computed again here",
+    )
     layouts = sum(len(run.grid.episodes) for run in suite.runs.values())
     about = (
         f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
-        f"{amount(layouts, 'layout')} × {amount(len(suite.manifest.seeds), 'channel seed')} in all, with "
+        f"{amount(layouts, 'layout')} × {amount(len(suite.manifest.seeds), 'channel seed')} in "
+        "all, with "
         f"95 % intervals over layouts. The edition's digest is {edition.digest}."
     )
     note = (
-        f"Rank: one more than the number of entries that are clearly better under {by}, whose difference, "
-        "paired by layout, has a 95 % interval above 0. Entries of one rank are not shown to be equal, and "
-        "the intervals are not corrected for the number of pairs. A dash: it sees what no vehicle can see, "
-        "and is no contestant. Who made a file is in their own words. Computed again here: whether the "
-        "figures that the file states follow from the answers in it; this page has those that do. It does "
-        "not show that the model named wrote the answers, nor that it never saw these layouts, whose seeds "
+        f"Rank: one more than the number of entries that are clearly better under {by}, whose "
+        "difference, "
+        "paired by layout, has a 95 % interval above 0. Entries of one rank are not shown to be "
+        "equal, and "
+        "the intervals are not corrected for the number of pairs. A dash: it sees what no vehicle "
+        "can see, "
+        "and is no contestant. Who made a file is in their own words. Computed again here: whether "
+        "the "
+        "figures that the file states follow from the answers in it; this page has those that do. "
+        "It does "
+        "not show that the model named wrote the answers, nor that it never saw these layouts, "
+        "whose seeds "
         "are public."
     )
     if edition.gains == pinned.KIND:
         note += (
-            " Gains and ranks are by the intervals that this edition pins, in which each half of each family "
+            " Gains and ranks are by the intervals that this edition pins, in which each half of "
+            "each family "
             "has one of its own: those of all layouts together, as in v2v-safety-1.1, are narrower."
         )
     table = Table(f"Entries by {lead} under {by}", heads, rows, note, left=True)

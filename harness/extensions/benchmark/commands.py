@@ -1,4 +1,6 @@
-"""`harness benchmark`: run an edition, pack its results into one file, verify and rank such files."""
+"""`harness benchmark`: run an edition, pack its results into one file,
+verify and rank such files.
+"""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -25,10 +27,13 @@ if TYPE_CHECKING:
 
 EDITION = "v2v-safety-1.1"  # taken if none is named
 
-MadeBy = Annotated[str, typer.Option(help="Who made the results, in your words; it stands on a board.")]
+MadeBy = Annotated[
+    str, typer.Option(help="Who made the results, in your words; it stands on a board.")
+]
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files of results.")]
 To = Annotated[
-    Path | None, typer.Option(help="File to write. Default: the run's folder with .zip after its name.")
+    Path | None,
+    typer.Option(help="File to write. Default: the run's folder with .zip after its name."),
 ]
 
 
@@ -54,7 +59,9 @@ def run(
     made_by: MadeBy = "",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to write the runs to. Default: reports/<model>-<prompts>-<edition>."),
+        typer.Option(
+            help="Folder to write the runs to. Default: reports/<model>-<prompts>-<edition>."
+        ),
     ] = None,
     no_cache: options.NoCache = False,
     workers: options.RuleWorkers = None,
@@ -76,20 +83,30 @@ def run(
         Here().check(of)
     sources = {name: of.source(name, limit) for name in of.datasets}
     asked = {
-        "model": model, "engine": engine, "prompt": prompt, "answer": answer, "thinking": thinking,
-        "batch_size": batch_size, "server": tuple(server or ()), "device": device, "dtype": dtype,
-    }  # fmt: skip
+        "model": model,
+        "engine": engine,
+        "prompt": prompt,
+        "answer": answer,
+        "thinking": thinking,
+        "batch_size": batch_size,
+        "server": tuple(server or ()),
+        "device": device,
+        "dtype": dtype,
+    }
     specs = [resolve.spec(of.settings(name, **asked), source) for name, source in sources.items()]
     for spec in specs:
         if spec.ego.prompt.version not in of.prompts:
             listed = ", ".join(of.prompts)
             raise UserError(
-                f"--prompt {spec.ego.prompt.version}: {of.name} has prompts {listed}; give one of them"
+                f"--prompt {spec.ego.prompt.version}: {of.name} has prompts {listed}; give one of "
+                "them"
             )
     datasets = Suite(of.name, of.description, tuple(sources))
     suite.check(datasets, specs)
     cache = None if no_cache else default_file()
-    evaluated = partial(evaluate, cache=cache, quiet=quiet, workers=options.workers_of(workers or "2"))
+    evaluated = partial(
+        evaluate, cache=cache, quiet=quiet, workers=options.workers_of(workers or "2")
+    )
     frozen = [source.dataset for source in sources.values()]
     if dry_run:
         for spec, dataset in zip(specs, frozen, strict=True):
@@ -99,7 +116,9 @@ def run(
     if limit is None:
         pack([folder], edition, made_by, None, quiet)
     elif not quiet:
-        typer.echo(f"a try of {amount(limit, 'layout')} of each dataset is no entry: nothing was packed")
+        typer.echo(
+            f"a try of {amount(limit, 'layout')} of each dataset is no entry: nothing was packed"
+        )
 
 
 def pack(
@@ -123,7 +142,11 @@ def pack(
     entry = of.entry(given)
     try:
         contents = results.Contents(
-            format=results.FORMAT, edition=of.name, digest=of.digest, made_by=made_by, runs=tuple(entry)
+            format=results.FORMAT,
+            edition=of.name,
+            digest=of.digest,
+            made_by=made_by,
+            runs=tuple(entry),
         )
     except ValueError as error:
         raise UserError(f"--made-by: {error}; give a shorter text") from None
@@ -140,7 +163,8 @@ def verify(
 ) -> None:
     """Compute results again from their answers; compare each figure.
 
-    No model is asked, and nothing in the file is run or believed. Exit code 1 means that a figure differs.
+    No model is asked, and nothing in the file is run or believed.
+    Exit code 1 means that a figure differs.
     """
     from harness.extensions.benchmark.rescore import Here
 
@@ -168,10 +192,15 @@ def _rescored(file: Path, here: "Here", silent: bool) -> "Iterator[Rescored]":
 
 def _mapping(file: Path, done: "Rescored") -> dict[str, Any]:
     return {
-        "file": str(file), "edition": done.edition.name, "digest": done.edition.digest,
-        "made_by": done.contents.made_by, "agents": str(done.suite.variant), "figures": done.compared,
-        "differing": done.differences, "equal": not any(done.differences.values()),
-    }  # fmt: skip
+        "file": str(file),
+        "edition": done.edition.name,
+        "digest": done.edition.digest,
+        "made_by": done.contents.made_by,
+        "agents": str(done.suite.variant),
+        "figures": done.compared,
+        "differing": done.differences,
+        "equal": not any(done.differences.values()),
+    }
 
 
 def _show(file: Path, done: "Rescored") -> None:
@@ -197,8 +226,8 @@ def seeds(
 ) -> None:
     """Print how to build sealed layouts.
 
-    Their seeds follow from a commit. Nobody knew its id before it was made, so nobody, the makers included,
-    had looked at these layouts.
+    Their seeds follow from a commit. Nobody knew its id before it was made, so nobody,
+    the makers included, had looked at these layouts.
     """
     from harness.dataset import load
     from harness.extensions.benchmark import edition as editions
@@ -210,7 +239,10 @@ def seeds(
     else:
         of = [load.load(load.find(name), 1).scenario for name in editions.named(edition).datasets]
     lines: list[dict[str, Any]] = [
-        {"scenario": scenarios.argument(each), "first_seed": sealed(commit, each.name.partition(":")[0])}
+        {
+            "scenario": scenarios.argument(each),
+            "first_seed": sealed(commit, each.name.partition(":")[0]),
+        }
         for each in of
     ]
     if as_json:
@@ -230,8 +262,8 @@ def board(
 ) -> None:
     """Rank files of results on a page, each computed again.
 
-    Entries share a rank where the layouts do not tell them apart. The page works offline. Exit code 1 means
-    that a file was left out.
+    Entries share a rank where the layouts do not tell them apart. The page works offline.
+    Exit code 1 means that a file was left out.
     """
     from harness.extensions.benchmark import board as boards
     from harness.extensions.benchmark.rescore import Here
@@ -254,12 +286,19 @@ def board(
         lines = boards.lines(entries)
         page = boards.write(lines, left_out, out)
         if as_json:
-            echo_json([
-                {"rank": line.rank, "agents": line.name, "gain": line.gain,
-                 "made_by": line.entry.contents.made_by, "success": line.success,
-                 "equal": not any(line.entry.differences.values())}
-                for line in lines
-            ])  # fmt: skip
+            echo_json(
+                [
+                    {
+                        "rank": line.rank,
+                        "agents": line.name,
+                        "gain": line.gain,
+                        "made_by": line.entry.contents.made_by,
+                        "success": line.success,
+                        "equal": not any(line.entry.differences.values()),
+                    }
+                    for line in lines
+                ]
+            )
         elif not quiet:
             _show_board(lines)
             typer.echo(f"wrote {printable(page)}")

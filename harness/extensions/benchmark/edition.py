@@ -39,7 +39,9 @@ Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of d
 
 
 class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A small file of results, `editions/NAME.golden.zip`, whose figures pin how all figures are computed."""
+    """A small file of results, `editions/NAME.golden.zip`,
+    whose figures pin how all figures are computed.
+    """
 
     sha256: str  # of the file
     layouts: int  # how many of each dataset it has, from the first
@@ -59,7 +61,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     latency: str  # of every answer, as `--latency` reads it
     ties: str  # how equally likely actions are taken, as `--ties` reads it
     metrics: Names  # the figures that a file of results states
-    # the kind of the intervals of gains: of all layouts taken together, or combined from those of each half
+    # the kind of the intervals of gains: of all layouts taken together, or combined from those of
+    # each half
     gains: Literal["paired episodes", "episodes"] = "episodes"
     golden: Golden | None = None  # None in a project's own edition that pins nothing
     sealed: str | None = None  # what earlier editions of a project may state; nothing reads it
@@ -77,21 +80,33 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         scores = [score for score in run.scores if score.metric in self.metrics]
         if self.gains == PAIRED:
             return scores
-        return [pinned.gain(run, score) if is_gain(score, run.conditions) else score for score in scores]
+        return [
+            pinned.gain(run, score) if is_gain(score, run.conditions) else score for score in scores
+        ]
 
     def difference(self, pairs: Pairs) -> Estimate:
-        """Return the mean over families of success a - b, with the interval of the edition's gains."""
+        """Return the mean over families of success a - b,
+        with the interval of the edition's gains.
+        """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
     def settings(self, dataset: str, **asked: Any) -> Settings:
-        """Return the settings of an evaluation on one of the datasets; `asked` says who answers, and how."""
+        """Return the settings of an evaluation on one of the datasets;
+        `asked` says who answers, and how.
+        """
         return Settings(
-            world=FrozenSettings(dataset=dataset), seeds=self.seeds, condition=self.condition,
-            latency=self.latency, ties=self.ties, **asked,
-        )  # fmt: skip
+            world=FrozenSettings(dataset=dataset),
+            seeds=self.seeds,
+            condition=self.condition,
+            latency=self.latency,
+            ties=self.ties,
+            **asked,
+        )
 
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
-        """Return one of the datasets, or its first layouts. Raises UserError if the one here is another."""
+        """Return one of the datasets, or its first layouts.
+        Raises UserError if the one here is another.
+        """
         source = FrozenSource(load.load(load.find(dataset), limit), Selection(limit))
         if source.dataset.sha256 != self.datasets[dataset]:
             raise self._differs(
@@ -102,20 +117,23 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
         """Return the runs of one entry by dataset, in the edition's order.
 
-        Raises UserError unless each is of this edition, each dataset has one, and all are of one agent.
-        `limit` is how many layouts they are of; None for all, as an entry is.
+        Raises UserError unless each is of this edition, each dataset has one, and all are of one
+        agent. `limit` is how many layouts they are of; None for all, as an entry is.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
             mistakes = self._mistakes(run.manifest, limit, by_dataset, _agent(runs[0].manifest))
             if wrong := next(mistakes, None):
                 raise UserError(
-                    f"{printable(run.path)} is no run of {printable(self.name)}: {wrong}; make one with "
+                    f"{printable(run.path)} is no run of {printable(self.name)}: {wrong}; make one "
+                    "with "
                     f"`harness benchmark run {printable(self.name)}`"
                 )
             by_dataset[str(getattr(run.manifest.world, "name", ""))] = run
         if missing := [name for name in self.datasets if name not in by_dataset]:
-            raise UserError(f"{printable(self.name)} has dataset {printable(missing[0])}; add a run of it")
+            raise UserError(
+                f"{printable(self.name)} has dataset {printable(missing[0])}; add a run of it"
+            )
         return {name: by_dataset[name] for name in self.datasets}
 
     def _mistakes(
@@ -123,7 +141,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ) -> Iterator[str]:
         world = m.world
         if not isinstance(world, FrozenScenes) or self.datasets.get(world.name) != world.sha256:
-            yield f"its scenes are {printable(getattr(world, 'name', 'driven'), 40)}, none of its datasets"
+            yield (
+                f"its scenes are {printable(getattr(world, 'name', 'driven'), 40)}, none of its "
+                "datasets"
+            )
         elif world.limit != limit or world.selection:
             yield f"it has {amount(world.episodes, 'layout')} that were selected, and all count"
         elif world.name in others:
@@ -131,27 +152,38 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if m.helpers:
             yield "its helpers are of other models, and one model answers for all"
         if changed := [key for key, value in _agent(m).items() if value != agent[key]]:
-            yield f"its {changed[0]} is another than that of {printable(next(iter(others), ''), 40)}"
+            yield (
+                f"its {changed[0]} is another than that of {printable(next(iter(others), ''), 40)}"
+            )
         version, sha256 = str(m.prompt["version"]), m.prompt["sha256"]
         if self.prompts.get(version) != sha256:
             yield f"its prompt is {printable(version, 40)}, none of its prompts"
         conditions = tuple(str(condition["name"]) for condition in m.conditions)
         for what, own, wanted in (
-            ("conditions", conditions, self.condition), ("seeds", m.seeds, parse_seeds(self.seeds)),
-            ("latency", m.settings.latency, self.latency), ("ties", m.settings.ties, self.ties),
+            ("conditions", conditions, self.condition),
+            ("seeds", m.seeds, parse_seeds(self.seeds)),
+            ("latency", m.settings.latency, self.latency),
+            ("ties", m.settings.ties, self.ties),
             ("device profile", m.device_profile and m.device_profile.name, None),
-            ("sums", m.sums, "refuse"), ("image", m.image, "own"), ("flip", m.flip, False),
-            ("temperature", m.settings.temperature, 0.0), ("sampling seed", m.settings.sampling_seed, 0),
-        ):  # fmt: skip
+            ("sums", m.sums, "refuse"),
+            ("image", m.image, "own"),
+            ("flip", m.flip, False),
+            ("temperature", m.settings.temperature, 0.0),
+            ("sampling seed", m.settings.sampling_seed, 0),
+        ):
             if own != wanted:
                 yield f"its {what}: {printable(own)}, not {printable(wanted)}"
 
     def spec(self, run: Run, source: FrozenSource) -> Spec:
-        """Return the evaluation that a run of this edition is; of the run it takes who answered, and how."""
+        """Return the evaluation that a run of this edition is;
+        of the run it takes who answered, and how.
+        """
         m = run.manifest
         prompt = versions.load(str(m.prompt["version"]))
         if prompt.sha256 != self.prompts[prompt.version]:
-            raise self._differs(f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version])
+            raise self._differs(
+                f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version]
+            )
         card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
@@ -173,7 +205,9 @@ def _agent(m: Manifest) -> dict[str, Any]:
 
 
 def named(name: str) -> Edition:
-    """Return an edition, shipped or the project's. Raises UserError if there is none, or it is wrong."""
+    """Return an edition, shipped or the project's.
+    Raises UserError if there is none, or it is wrong.
+    """
     if name not in names(KIND):
         raise unknown("edition", name, names(KIND))
     return of_file(find(KIND, f"{name}.toml"))
@@ -189,8 +223,9 @@ def of_file(file: Path) -> Edition:
         raise UserError(f"{where}: {printable(error)}; give texts and whole numbers") from None
     edition = convert(tables, Edition, where, name=file.stem, digest=sha256)
     for what, stated, known in (
-        ("metric", edition.metrics, METRICS), ("ranked_by", (edition.ranked_by,), edition.condition),
-    ):  # fmt: skip
+        ("metric", edition.metrics, METRICS),
+        ("ranked_by", (edition.ranked_by,), edition.condition),
+    ):
         if strange := [each for each in stated if each not in known]:
             raise unknown(f"{what} of {where}", strange[0], known)
     parse_seeds(edition.seeds)

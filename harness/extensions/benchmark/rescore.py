@@ -1,4 +1,6 @@
-"""Compute the runs in a file of results again from their answers alone, and say which figures differ."""
+"""Compute the runs in a file of results again from their answers alone,
+and say which figures differ.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,7 +34,8 @@ class Rescored:
     # what differs from the figures in the file, by dataset, in words; none where all are equal
     differences: Mapping[str, Sequence[str]]
     compared: int  # how many figures were
-    golden: bool = False  # whether the file is the one that pins the edition, of a few layouts, and no entry
+    # whether the file is the one that pins the edition, of a few layouts, and no entry
+    golden: bool = False
 
 
 class Here:
@@ -55,12 +58,17 @@ class Here:
             return
         file = edition.golden_file
         if not file.is_file() or edition.layouts(sha256_file(file, "record")) is None:
-            raise UserError(f"{printable(file)} is not the file that {edition.name} pins; restore it")
+            raise UserError(
+                f"{printable(file)} is not the file that {edition.name} pins; restore it"
+            )
         with TemporaryDirectory(prefix="harness-") as folder:
             done = rescored(file, Path(folder), lambda count: None, self)
-        if wrong := [f"{name}: {figure}" for name, found in done.differences.items() for figure in found]:
+        if wrong := [
+            f"{name}: {figure}" for name, found in done.differences.items() for figure in found
+        ]:
             raise UserError(
-                f"this installation computes {len(wrong)} figures of {edition.name} otherwise than it pins, "
+                f"this installation computes {len(wrong)} figures of {edition.name} otherwise than "
+                "it pins, "
                 f"such as {printable(wrong[0])}; install a release that has that edition as it was"
             )
         self._checked.add(edition.digest)
@@ -69,8 +77,8 @@ class Here:
 def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: Here) -> Rescored:
     """Compute a file's runs again under the edition that it names, in an empty folder.
 
-    Of the file, only what the models wrote is used. Rules are here and are asked again; no other model is
-    asked, and nothing of the file is run.
+    Of the file, only what the models wrote is used. Rules are here and are asked again; no other
+    model is asked, and nothing of the file is run.
 
     Args:
         file: the file of results.
@@ -78,8 +86,9 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         progress: called with the number of answers that were read again.
         here: this installation, which several files share.
 
-    Raises UserError if the file is broken, too large or of another edition than the one here, or has not the
-    answer to every question, or one to another question; or if figures are computed otherwise here.
+    Raises UserError if the file is broken, too large or of another edition than the one here, or
+    has not the answer to every question, or one to another question; or if figures are computed
+    otherwise here.
     """
     contents, stated = contents_of(file), folder / "stated"
     with _about(file, stated):
@@ -97,7 +106,9 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         if limit is None:
             here.check(edition)
         runs, differences, compared = dict[str, Run](), dict[str, list[str]](), 0
-        for name, run in edition.entry([read(stated / name) for name in contents.runs], limit).items():
+        for name, run in edition.entry(
+            [read(stated / name) for name in contents.runs], limit
+        ).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
             ours, otherwise = computed(run, edition.spec(run, source), place, progress)
@@ -120,12 +131,15 @@ def _about(file: Path, stated: Path) -> Iterator[None]:
 
 
 def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
-    """Yield what differs between the figures of two runs that an edition names, and between their episodes.
+    """Yield what differs between the figures of two runs that an edition names,
+    and between their episodes.
 
-    Numbers are compared as they are written, to the last digit; but not a column of episodes that the stated
-    run, which may be older, lacks.
+    Numbers are compared as they are written, to the last digit;
+    but not a column of episodes that the stated run, which may be older, lacks.
     """
-    theirs, ours = ({score.key: score for score in edition.figures(run)} for run in (stated, computed))
+    theirs, ours = (
+        {score.key: score for score in edition.figures(run)} for run in (stated, computed)
+    )
     for key in {**theirs, **ours}:
         if theirs.get(key) != ours.get(key):
             yield " ".join(key)

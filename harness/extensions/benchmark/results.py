@@ -1,7 +1,7 @@
 """Pack a benchmark's results into one zip file, and unpack a stranger's.
 
-In it are `results.json`, and of each dataset's run a folder with its manifest, its answers, how its episodes
-ended, and the figures that its edition names. Its bytes follow from these.
+In it are `results.json`, and of each dataset's run a folder with its manifest, its answers, how its
+episodes ended, and the figures that its edition names. Its bytes follow from these.
 """
 
 import zipfile
@@ -36,8 +36,11 @@ from harness.runs.writer import csv_text
 FORMAT = "swarmdrive-results/1"
 CONTENTS = "results.json"
 FILES = {  # of each run, with the most bytes that each may have
-    "run.json": 16 << 20, "answers.jsonl": 1 << 30, "episodes.csv": 256 << 20, "summary.csv": 16 << 20,
-}  # fmt: skip
+    "run.json": 16 << 20,
+    "answers.jsonl": 1 << 30,
+    "episodes.csv": 256 << 20,
+    "summary.csv": 16 << 20,
+}
 MOST_UNPACKED = 1 << 30  # bytes of all files together
 MOST_RUNS = 100
 MOST_LETTERS = 200  # of who made it
@@ -59,20 +62,31 @@ class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if self.format != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
-        if not 0 < len(self.runs) == len(set(self.runs)) <= MOST_RUNS or not all(map(_plain, self.runs)):
-            raise ValueError("runs: none, too many, one twice, or one with a name that is no folder's")
+        if not 0 < len(self.runs) == len(set(self.runs)) <= MOST_RUNS or not all(
+            map(_plain, self.runs)
+        ):
+            raise ValueError(
+                "runs: none, too many, one twice, or one with a name that is no folder's"
+            )
         if len(self.made_by) > MOST_LETTERS:
             raise ValueError(f"made_by has more than {MOST_LETTERS} letters")
 
 
 def pack(
-    contents: Contents, runs: Mapping[str, Run], figures: Callable[[Run], Sequence[Score]], out: Path
+    contents: Contents,
+    runs: Mapping[str, Run],
+    figures: Callable[[Run], Sequence[Score]],
+    out: Path,
 ) -> None:
-    """Write the runs, by dataset, to one file. What a run says of the machine's folders is left out.
+    """Write the runs, by dataset, to one file.
+    What a run says of the machine's folders is left out.
 
     `figures` returns those that count of a run.
     """
-    with replacing(out) as part, ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+    with (
+        replacing(out) as part,
+        ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+    ):
         for name, data in _files(contents, runs, figures):
             member = ZipInfo(name)  # of 1980, so that the bytes follow from the content
             member.compress_type, member.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
@@ -89,16 +103,26 @@ def _files(
         scenes = FrozenSettings(dataset=name, limit=world.limit)
         settings = replace(deciding(run.manifest.settings), world=scenes)
         manifest = replace(
-            run.manifest, name=name, command="", tags=(), world=replace(world, path=name), settings=settings
+            run.manifest,
+            name=name,
+            command="",
+            tags=(),
+            world=replace(world, path=name),
+            settings=settings,
         )
-        yield f"{name}/run.json", msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
+        yield (
+            f"{name}/run.json",
+            msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n",
+        )
         for file in ("answers.jsonl", "episodes.csv"):
             yield f"{name}/{file}", bytes_of(run.path / file, "rows")
         yield f"{name}/summary.csv", csv_text(Score, figures(run), manifest.variant).encode()
 
 
 def contents_of(file: Path) -> Contents:
-    """Return what a file says of itself. Raises UserError if it is no such file; nothing else is unpacked."""
+    """Return what a file says of itself. Raises UserError if it is no such file;
+    nothing else is unpacked.
+    """
     with _archive(file) as archive:
         return msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
 
@@ -106,8 +130,9 @@ def contents_of(file: Path) -> Contents:
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
     """Write a file's runs to a folder, by dataset.
 
-    Only the files that `contents` call for are written, each under a name that is made here and no larger
-    than `FILES` allows. Raises UserError, before anything is unpacked, if it states others or larger ones.
+    Only the files that `contents` call for are written, each under a name that is made here and no
+    larger than `FILES` allows. Raises UserError, before anything is unpacked, if it states others
+    or larger ones.
     """
     with _archive(file) as archive:
         wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
@@ -132,7 +157,8 @@ def _archive(file: Path) -> Iterator[ZipFile]:
             raise  # it is of where this is unpacked
         reason = getattr(error, "strerror", None) or error
         raise UserError(
-            f"{printable(file)} is no file of results ({printable(reason)}); give one that `harness "
+            f"{printable(file)} is no file of results ({printable(reason)}); give one that "
+            "`harness "
             "benchmark run` or `pack` wrote"
         ) from None
 
@@ -142,13 +168,17 @@ def _plain(name: str) -> bool:
 
 
 def _refuse_long_list(file: Path) -> None:
-    """Raise ValueError for a list of files that would fill memory before one of them is looked at."""
+    """Raise ValueError for a list of files that would fill memory before one of them is looked
+    at.
+    """
     with opened(file, "record") as whole:
         end = whole.seek(0, 2)
         whole.seek(max(0, end - 42))
         tail = whole.read()
     if len(tail) < 22 or tail[-22:-18] != END or tail[:4] == END_64:
-        raise ValueError(f"it does not end as a zip file of at most {LARGEST['record'] >> 20} MB does")
+        raise ValueError(
+            f"it does not end as a zip file of at most {LARGEST['record'] >> 20} MB does"
+        )
     if int.from_bytes(tail[-10:-6], "little") > LARGEST_LIST:
         raise ValueError("its list of files is too long")
 

@@ -9,14 +9,17 @@ SEALED = 1_000_000_000  # the first of as many layout seeds from which sealed la
 
 
 def sealed(commit: str, scenario: str) -> int:
-    """Return the first layout seed of a scenario's sealed layouts: it follows from the id of a commit.
+    """Return the first layout seed of a scenario's sealed layouts:
+    it follows from the id of a commit.
 
-    It is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9. Nobody knows the id of a
-    commit before it is made, so nobody has looked at the layouts before. Raises UserError for another id.
+    It is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9. Nobody knows
+    the id of a commit before it is made, so nobody has looked at the layouts before. Raises
+    UserError for another id.
     """
     if not re.fullmatch("[0-9a-f]{40}|[0-9a-f]{64}", commit):
         raise UserError(
-            f"commit {printable(commit, 70)}: give a whole id, 40 hex digits, as `git rev-parse` prints it"
+            f"commit {printable(commit, 70)}: give a whole id, 40 hex digits, as `git rev-parse` "
+            "prints it"
         )
     number = int(hashlib.sha256(f"{commit} {scenario}".encode()).hexdigest(), 16)
     return SEALED + number % SEALED

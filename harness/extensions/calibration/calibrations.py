@@ -1,10 +1,11 @@
-"""Correct the probabilities of answers by what was fitted on tune layouts: files `calibrations/*.toml`.
+"""Correct the probabilities of answers by what was fitted on tune layouts:
+files `calibrations/*.toml`.
 
-`harness model calibrate` writes one. What it holds is frozen, for one model and one question: the weights,
-the prompt, the answer mode, the scenario and the role. It may hold two things. A prior, the mean answer over
-tune questions, is divided out (Zhou and others 2023, "batch calibration"): it needs no tree. A temperature
-sharpens or flattens what is left (Guo and others 2017): its likelihood of the optimal actions is the best.
-Both leave an answer that could not be read as it is.
+`harness model calibrate` writes one. What it holds is frozen, for one model and one question: the
+weights, the prompt, the answer mode, the scenario and the role. It may hold two things. A prior,
+the mean answer over tune questions, is divided out (Zhou and others 2023, "batch calibration"): it
+needs no tree. A temperature sharpens or flattens what is left (Guo and others 2017): its likelihood
+of the optimal actions is the best. Both leave an answer that could not be read as it is.
 """
 
 from collections.abc import Mapping
@@ -64,10 +65,13 @@ class Calibration:
     helper: Correction | None = None  # None where no helper answered
 
     def obstacle(self, agent: Mapping[str, Any], scenario: str) -> str | None:
-        """Return why it does not fit an agent's settings (`question_of`) in a scenario; None if it does."""
+        """Return why it does not fit an agent's settings (`question_of`) in a scenario;
+        None if it does.
+        """
         now = {**question_of(agent), "scenario": scenario}
         then = {**self.question, "scenario": self.scenario}
-        for name in then | now:  # the model may have an adapter, or a pinned file, that it had not then
+        # the model may have an adapter, or a pinned file, that it had not then
+        for name in then | now:
             value, other = then.get(name), now.get(name)
             if value != other:
                 return f"was fitted with {name} {printable(value, 40)}, not {printable(other, 40)}"
@@ -113,11 +117,15 @@ def _read(path: Any) -> Calibration:
     check_seeds(where, found.first_seed, found.last_seed)
     for correction in filter(None, (found.ego, found.helper)):
         if len(correction.prior) not in (0, len(found.actions)):
-            raise UserError(f"{where}: prior has {len(correction.prior)} values; give one an action, or none")
+            raise UserError(
+                f"{where}: prior has {len(correction.prior)} values; give one an action, or none"
+            )
     return found
 
 
 def check_seeds(what: str, first: int, last: int) -> None:
     """Raise UserError unless layout seeds are all for tuning."""
     if not 0 <= first <= last or purposes(first, last - first + 1) != ["tune"]:
-        raise UserError(f"{what}: {ONLY_TUNE}, and these are {stated(first, max(last - first, 0) + 1)}")
+        raise UserError(
+            f"{what}: {ONLY_TUNE}, and these are {stated(first, max(last - first, 0) + 1)}"
+        )

@@ -13,8 +13,12 @@ from harness.core.errors import UserError, printable, unknown
 
 def command(
     run: Path = typer.Argument(help="Folder of a finished run on tune layouts (seeds 0 to 99999)."),
-    level: str = typer.Option("L1", help="L0 divides the mean answer out, L1 has a temperature, L0+L1 both."),
-    dataset: Path | None = typer.Option(None, help="Folder of the run's dataset. Default: where it says."),
+    level: str = typer.Option(
+        "L1", help="L0 divides the mean answer out, L1 has a temperature, L0+L1 both."
+    ),
+    dataset: Path | None = typer.Option(
+        None, help="Folder of the run's dataset. Default: where it says."
+    ),
     out: Path = typer.Option(
         ..., help="File to write; calibrations/NAME.toml makes it usable as calibration=NAME."
     ),
@@ -35,16 +39,24 @@ def command(
     if out.suffix != ".toml":
         raise UserError(f"--out {printable(out)}: end it in .toml")
     if out.exists():
-        raise UserError(f"--out {printable(out)} is there already; give a new name, since runs name it")
-    found, fitted = calibrate(run, cast(Level, level), dataset, shlex.join(["harness", *sys.argv[1:]]))
+        raise UserError(
+            f"--out {printable(out)} is there already; give a new name, since runs name it"
+        )
+    found, fitted = calibrate(
+        run, cast(Level, level), dataset, shlex.join(["harness", *sys.argv[1:]])
+    )
     write(found, out)
     if as_json:
         echo_json({**asdict(found), "fitted": [asdict(each) for each in fitted]})
         return
     for each in fitted:
-        prior = " ".join(f"{a} {p:.2f}" for a, p in zip(found.actions, each.correction.prior, strict=False))
+        prior = " ".join(
+            f"{a} {p:.2f}" for a, p in zip(found.actions, each.correction.prior, strict=False)
+        )
         typer.echo(
-            f"{each.role}: temperature {each.correction.temperature:g}{prior and f', prior {prior}'}, "
-            f"NLL {each.before_nats:.3f} to {each.after_nats:.3f} nats (n = {each.correction.answers})"
+            f"{each.role}: temperature "
+            f"{each.correction.temperature:g}{prior and f', prior {prior}'}, "
+            f"NLL {each.before_nats:.3f} to {each.after_nats:.3f} nats (n = "
+            f"{each.correction.answers})"
         )
     typer.echo(f"wrote {printable(out)}: {found.level}, fitted on {printable(found.fitted_on)}")

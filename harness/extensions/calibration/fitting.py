@@ -1,4 +1,6 @@
-"""`harness model calibrate`: fit what corrects a model's probabilities, on a run on tune layouts."""
+"""`harness model calibrate`: fit what corrects a model's probabilities,
+on a run on tune layouts.
+"""
 
 import json
 from dataclasses import asdict, dataclass
@@ -38,14 +40,16 @@ class Fitted:
 
     role: str
     correction: Correction
-    before_nats: float  # mean negative log-likelihood of the optimal actions, where any action is optimal
+    # mean negative log-likelihood of the optimal actions, where any action is optimal
+    before_nats: float
     after_nats: float
 
 
 def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
     """Fit a correction on answers and the actions that are optimal there, both (n, A).
 
-    The prior is the mean of all answers. Of the temperatures that do best, it has the one nearest to 1.
+    The prior is the mean of all answers.
+    Of the temperatures that do best, it has the one nearest to 1.
     """
     prior: tuple[float, ...] = ()
     if "L0" in level:
@@ -54,14 +58,20 @@ def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
         return Correction(len(p), prior=prior)
     known = optimal.any(axis=1)
     if not known.any():
-        raise UserError("no action is optimal in any of its decision points; give a run with more layouts")
+        raise UserError(
+            "no action is optimal in any of its decision points; give a run with more layouts"
+        )
     tried = TEMPERATURES[np.argsort(np.abs(np.log(TEMPERATURES)), kind="stable")].round(4)
-    nats = [nats_of(Correction(len(p), t, prior).of(p[known]), optimal[known]) for t in tried.tolist()]
+    nats = [
+        nats_of(Correction(len(p), t, prior).of(p[known]), optimal[known]) for t in tried.tolist()
+    ]
     return Correction(len(p), float(tried[int(np.argmin(np.round(nats, 9)))]), prior)
 
 
 def nats_of(p: Floats, optimal: Bools) -> float:
-    """Return the mean negative log-likelihood of the optimal actions, over answers (n, A) where any is."""
+    """Return the mean negative log-likelihood of the optimal actions,
+    over answers (n, A) where any is.
+    """
     return float(np.nanmean(likelihood_nats(p, optimal))) if optimal.any() else float("nan")
 
 
@@ -70,14 +80,21 @@ def calibrate(
 ) -> tuple[Calibration, list[Fitted]]:
     """Fit a calibration on the answers of a finished run on tune layouts.
 
-    Raises UserError for layouts of another purpose, several models, sampled answers, or none at all.
+    Raises UserError for layouts of another purpose, several models, sampled answers,
+    or none at all.
     """
     run, name = read(folder), printable(folder)
     manifest = run.manifest
     if not isinstance(manifest.world, FrozenScenes):
-        raise UserError(f"{name} was driven, and no tree says what follows; give a run of `harness eval`")
+        raise UserError(
+            f"{name} was driven, and no tree says what follows; give a run of `harness eval`"
+        )
     if manifest.helpers or manifest.settings.temperature:
-        reason = "its helpers have a model of their own" if manifest.helpers else "its answers are sampled"
+        reason = (
+            "its helpers have a model of their own"
+            if manifest.helpers
+            else "its answers are sampled"
+        )
         raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
     data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
     forest = data.forest
@@ -92,11 +109,18 @@ def calibrate(
     corrections = {each.role: each.correction for each in fitted}
     seeds = stated(first, last - first + 1)
     found = Calibration(
-        level, command,
-        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, {amount(len(forest.seeds), 'layout')}",
-        first, last, data.scenario.name, tuple(run.actions), question_of(manifest.agent(0)),
-        corrections["ego"], corrections.get("helper"),
-    )  # fmt: skip
+        level,
+        command,
+        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, "
+        f"{amount(len(forest.seeds), 'layout')}",
+        first,
+        last,
+        data.scenario.name,
+        tuple(run.actions),
+        question_of(manifest.agent(0)),
+        corrections["ego"],
+        corrections.get("helper"),
+    )
     return found, fitted
 
 
@@ -117,5 +141,9 @@ def write(found: Calibration, out: Path) -> None:
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
     for name, table in tables.items():
         if table is not None:
-            lines += ["", f"[{name}]", *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in table.items())]
+            lines += [
+                "",
+                f"[{name}]",
+                *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in table.items()),
+            ]
     write_whole(out, "\n".join([*lines, ""]))

@@ -1,4 +1,6 @@
-"""The setting `calibration` of a condition: all answers are corrected before anything is made of them."""
+"""The setting `calibration` of a condition:
+all answers are corrected before anything is made of them.
+"""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -29,7 +31,10 @@ class Calibrated(Part, frozen=True, kw_only=True):
 
     def check_with(self, point: "OperatingPoint") -> None:
         if point.has_fusion_call:
-            allowed = f"left out where {point.asks_twice}, which asks twice: the second question has no fit"
+            allowed = (
+                f"left out where {point.asks_twice}, which asks twice: the second question has no "
+                "fit"
+            )
             raise wrong("calibration", self.calibration, allowed)
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:

@@ -1,4 +1,6 @@
-"""Check a language model before a run: the prompt it reads, token by token, its answers and their time."""
+"""Check a language model before a run: the prompt it reads, token by token,
+its answers and their time.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,12 +11,14 @@ from harness.backends.card import Thinking
 from harness.backends.chat import Chat
 from harness.core.errors import UserError
 
-Pictured = tuple[Request, Request, Request]  # one question with a camera picture, a blank one, and none
+# one question with a camera picture, a blank one, and none
+Pictured = tuple[Request, Request, Request]
 
 
 @dataclass(frozen=True)
 class Looks:
-    """A model's answers by answer mode to an image prompt, with what the cameras see and a blank picture.
+    """A model's answers by answer mode to an image prompt,
+    with what the cameras see and a blank picture.
 
     `text` is an answer to the text alone, in the last answer mode that worked; None if none did.
     """
@@ -27,10 +31,13 @@ class Looks:
     def fault(self) -> str | None:
         """Why the model takes no pictures; None if it does.
 
-        A model that answers all pictures alike still reads them if its prompt has more tokens with one.
+        A model that answers all pictures alike still reads them if its prompt has more tokens with
+        one.
         """
         if self.text is None:
-            [error, *_] = (a.error for a in (*self.answers.values(), *self.blank.values()) if a.error)
+            [error, *_] = (
+                a.error for a in (*self.answers.values(), *self.blank.values()) if a.error
+            )
             return f"answers no prompt with a picture: {error}"
         pairs = [(answer, self.blank[mode]) for mode, answer in self.answers.items()]
         if any(a.text != b.text for a, b in pairs if not (a.error or b.error)):
@@ -42,7 +49,8 @@ class Looks:
         if max(counts) > text:
             return None
         return (
-            "ignores pictures: the same answers to a frame and to a blank one, and as many prompt tokens as "
+            "ignores pictures: the same answers to a frame and to a blank one, and as many prompt "
+            "tokens as "
             "without any"
         )
 
@@ -52,14 +60,17 @@ class Checkup:
     """Result of checking a model."""
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
-    tokens: list[tuple[int, str]] | None  # its ids, each with its text; None if only a server knows them
+    # its ids, each with its text; None if only a server knows them
+    tokens: list[tuple[int, str]] | None
     bos_tokens: int | None  # BOS tokens that it begins with; more than one harms most models
-    turn_end: str | None  # text of the token that ends an answer by its chat template, if there is one
+    # text of the token that ends an answer by its chat template, if there is one
+    turn_end: str | None
     thinking: Thinking | None  # what the model's own template can do; None for a server's
     # one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1
     answers: dict[AnswerMode, Completion]
     identity: dict[str, Any]
-    looks: Looks | None = None  # answers to pictures; None if the card says that the model takes none
+    # answers to pictures; None if the card says that the model takes none
+    looks: Looks | None = None
 
 
 def check(
@@ -70,7 +81,8 @@ def check(
 ) -> Checkup:
     """Check a model with some questions, one in each answer mode.
 
-    For a model with vision, `shown` has questions of an image prompt. `progress` is called with 1 after each.
+    For a model with vision, `shown` has questions of an image prompt.
+    `progress` is called with 1 after each.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:
@@ -100,7 +112,11 @@ def _leading(ids: Sequence[int], token: int | None) -> int:
 def _looks(answer: Callable[..., Completion], shown: Sequence[Pictured]) -> Looks:
     answers = {own.answer: answer(own) for own, _, _ in shown}
     blanks = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
-    answered = [text for _, _, text in shown if not (answers[text.answer].error or blanks[text.answer].error)]
+    answered = [
+        text
+        for _, _, text in shown
+        if not (answers[text.answer].error or blanks[text.answer].error)
+    ]
     return Looks(answers, blanks, answer(answered[-1], warm=True) if answered else None)
 
 
@@ -109,8 +125,8 @@ def _answer(backend: Rendering, request: Request, warm: bool = False) -> Complet
     try:
         if warm:
             return backend.complete([request])[0]
-        # The first answer's time includes loading kernels and caches. As in a run, the first question has the
-        # same system prompt and another scene.
+        # The first answer's time includes loading kernels and caches. As in a run, the first
+        # question has the same system prompt and another scene.
         *head, last = request.messages
         message = {**last, "content": f"Another scene. {last['content']}"}
         backend.complete([replace(request, messages=(*head, message))])

@@ -18,17 +18,29 @@ if TYPE_CHECKING:
 
 MARGIN = 10
 PACKAGES = (
-    "numpy", "scipy", "pandas", "jinja2", "highway-env", "matplotlib", "tokenizers", "torch", "transformers",
+    "numpy",
+    "scipy",
+    "pandas",
+    "jinja2",
+    "highway-env",
+    "matplotlib",
+    "tokenizers",
+    "torch",
+    "transformers",
     "llama-cpp-python",
-)  # fmt: skip
+)
 SMI_S = 1.0  # most seconds that nvidia-smi is waited for
 GIB = 2**30
 
 
 def command(
-    gpu: bool = typer.Option(False, "--gpu", help="Also ask torch for GPUs, which takes a few seconds."),
+    gpu: bool = typer.Option(
+        False, "--gpu", help="Also ask torch for GPUs, which takes a few seconds."
+    ),
     engines: bool = typer.Option(
-        False, "--engines", help="Also time the engines of each small model that has several; takes a minute."
+        False,
+        "--engines",
+        help="Also time the engines of each small model that has several; takes a minute.",
     ),
     as_json: options.Json = False,
 ) -> None:
@@ -49,13 +61,16 @@ def command(
         return
     versions = dict(facts["versions"])
     _line(
-        "harness", f"{versions.pop('harness')}, Python {versions.pop('python')}, {versions.pop('platform')}"
+        "harness",
+        f"{versions.pop('harness')}, Python {versions.pop('python')}, {versions.pop('platform')}",
     )
     _line("packages", ", ".join(f"{name} {version}" for name, version in versions.items()))
     memory = "unknown" if facts["memory_gib"] is None else f"{facts['memory_gib']:g} GiB"
     _line("machine", f"{facts['cores']} cores, {memory} of memory")
     _line(
-        "GPU", "; ".join(map(printable, facts["gpu"])) or f"none that {'torch' if gpu else 'nvidia-smi'} sees"
+        "GPU",
+        "; ".join(map(printable, facts["gpu"]))
+        or f"none that {'torch' if gpu else 'nvidia-smi'} sees",
     )
     size = f"{facts['cache']['bytes'] / 1e6:.1f} MB" if facts["cache"]["bytes"] else "empty"
     _line("meters", ", ".join(facts["meters"]) or "none of energy that can be read")
@@ -98,7 +113,9 @@ def look(gpu: bool) -> dict[str, Any]:
         try:
             models += map(_model, cards.each_engine(name))
         except UserError as error:  # a card with a mistake is what one asks a doctor about
-            models.append({"name": name, "engine": None, "missing": "a sound card", "remedy": str(error)})
+            models.append(
+                {"name": name, "engine": None, "missing": "a sound card", "remedy": str(error)}
+            )
     cache = default_file()
     return {
         "versions": versions(PACKAGES),
@@ -116,7 +133,12 @@ def _model(card: "Card") -> dict[str, Any]:
     from harness.backends.registry import missing
 
     lack = missing(card)
-    return {"name": card.name, "engine": card.engine, "missing": lack, "remedy": _remedy(card, lack)}
+    return {
+        "name": card.name,
+        "engine": card.engine,
+        "missing": lack,
+        "remedy": _remedy(card, lack),
+    }
 
 
 def _remedy(card: "Card", lack: str | None) -> str | None:

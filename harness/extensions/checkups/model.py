@@ -1,4 +1,6 @@
-"""Check a model before a run: ask it in every answer mode, with and without pictures, and examine it."""
+"""Check a model before a run: ask it in every answer mode, with and without pictures,
+and examine it.
+"""
 
 from dataclasses import dataclass, replace
 from typing import cast
@@ -34,7 +36,10 @@ class Check:
     @property
     def completions(self) -> list[Completion]:
         """Every answer that has to come, those to pictures too."""
-        return [*self.seen.answers.values(), *(self.seen.looks.answers.values() if self.seen.looks else ())]
+        return [
+            *self.seen.answers.values(),
+            *(self.seen.looks.answers.values() if self.seen.looks else ()),
+        ]
 
     @property
     def usable(self) -> bool:
@@ -44,32 +49,41 @@ class Check:
         return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in answers)
 
 
-def check(card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Progress) -> Check:
+def check(
+    card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Progress
+) -> Check:
     """Check a model, examine it if it answers by letters, and keep what was found.
 
-    The card is a language model's. Without a device or number format, `dtype`, the engine's choice and the
-    card's hold. `progress` counts answers.
+    The card is a language model's. Without a device or number format, `dtype`, the engine's choice
+    and the card's hold. `progress` counts answers.
     """
     data = load.load(load.find(DATASET), 1)
     can = capabilities(card.engine).answer_modes
     if "readout" in can:  # which asks for letters, as a decision does
         can = tuple(mode for mode in can if mode != "decision")
     ego = Agent(card, versions.load(PROMPT), can[0], thinking=thinking)
-    sees = Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking) if card.vision else None
+    sees = (
+        Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking) if card.vision else None
+    )
     settings = Settings(batch_size=1, device=device, dtype=dtype)
     spec = Spec(ego, FrozenSource(data), (), (0,), settings=settings)
     modes = ("json",) if ego.thinking else can
     scenes = data.scenes(data.forest.ids[:1])
 
     def question(agent: Agent) -> Request:
-        return next(requests(replace(spec, ego=agent), scenes))  # the first of a scene's is the ego's
+        # the first of a scene's is the ego's
+        return next(requests(replace(spec, ego=agent), scenes))
 
     asked = [question(replace(ego, answer=mode)) for mode in modes]
     shown = [
-        (question(replace(sees, answer=mode)), question(replace(sees, answer=mode, image="blank")),
-         question(replace(sees, answer=mode, image="none")))
-        for mode in modes if sees
-    ]  # fmt: skip
+        (
+            question(replace(sees, answer=mode)),
+            question(replace(sees, answer=mode, image="blank")),
+            question(replace(sees, answer=mode, image="none")),
+        )
+        for mode in modes
+        if sees
+    ]
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
     progress.more(len(asked) + 2 * len(shown))
     seen = ask(cast("Rendering", backend), asked, shown, progress)

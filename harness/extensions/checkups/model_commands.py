@@ -29,7 +29,9 @@ _WIDTH = 100  # of lines of tokens
 
 
 def check(
-    name: str = typer.Argument(help="Model: a card name, a checkpoint directory, a .gguf file or a hub id."),
+    name: str = typer.Argument(
+        help="Model: a card name, a checkpoint directory, a .gguf file or a hub id."
+    ),
     engine: options.Engine = None,
     thinking: options.Thinking = False,
     device: options.Device = None,
@@ -38,11 +40,12 @@ def check(
 ) -> None:
     """Load a model, show its prompt and time one answer.
 
-    It does so in each answer mode. Twelve fixed questions, and pairs of questions that differ in one fact,
-    show whether its read-outs follow the letter and whether it reads the scene; later pages of runs asked so
-    say it. A model that takes pictures is also asked with a picture and with a blank one. If its card names
-    several engines and its weights are small, each is timed shortly, and a line says which is faster here.
-    Exit code 1 if no answer can be read, or if it ignores the picture; 3 if it answers in no mode.
+    It does so in each answer mode. Twelve fixed questions, and pairs of questions that differ in
+    one fact, show whether its read-outs follow the letter and whether it reads the scene; later
+    pages of runs asked so say it. A model that takes pictures is also asked with a picture and with
+    a blank one. If its card names several engines and its weights are small, each is timed shortly,
+    and a line says which is faster here. Exit code 1 if no answer can be read, or if it ignores the
+    picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
@@ -56,22 +59,31 @@ def check(
             echo_json({**head, "model_free": True})
         else:
             typer.echo(
-                f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing to load"
+                f"{card.name}: engine {card.engine} is model-free: no weights, no tokens, nothing "
+                "to load"
             )
         return
     with bar(f"asking {printable(card.name, 30)}", grows=True) as progress:
         done = checkup.check(card, thinking, device, dtype, progress)
     spec, seen, who = done.spec, done.seen, printable(card.name)
     if done.unanswered:
-        typer.echo(f"harness: the fixed questions got no answer: {printable(done.unanswered, 300)}", err=True)
+        typer.echo(
+            f"harness: the fixed questions got no answer: {printable(done.unanswered, 300)}",
+            err=True,
+        )
     paces = _paces(card)
     if as_json:
         result = done.findings
-        echo_json({
-            **head, "model_free": False, "thinking_asked": spec.ego.thinking, **asdict(seen),
-            "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
-            "paces": paces,
-        })  # fmt: skip
+        echo_json(
+            {
+                **head,
+                "model_free": False,
+                "thinking_asked": spec.ego.thinking,
+                **asdict(seen),
+                "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
+                "paces": paces,
+            }
+        )
     else:
         _show(spec, seen)
         _show_findings(done.findings)
@@ -90,17 +102,24 @@ def check(
 
 def parity(
     model: str = typer.Argument(
-        help="A .gguf file, a card that names both engines, or a folder with a checkpoint and a GGUF file."
+        help="A .gguf file, a card that names both engines, or a folder with a checkpoint and a "
+        "GGUF file."
     ),
     prompt: options.Prompt = "v2",
     dataset: options.Dataset = resources.DATASET,
-    prompts: int = typer.Option(64, help="Number of prompts to compare, spread over scenes and viewers."),
+    prompts: int = typer.Option(
+        64, help="Number of prompts to compare, spread over scenes and viewers."
+    ),
     read_outs: bool = typer.Option(
-        False, "--read-outs", help="Compare tokens and read-outs alone, which takes a fraction of the time."
+        False,
+        "--read-outs",
+        help="Compare tokens and read-outs alone, which takes a fraction of the time.",
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Compare a model's answers on transformers and on llama.cpp. Exit code 1 if they differ too much."""
+    """Compare a model's answers on transformers and on llama.cpp.
+    Exit code 1 if they differ too much.
+    """
     from harness.backends import cards
     from harness.backends.registry import missing
     from harness.dataset import load
@@ -117,7 +136,8 @@ def parity(
     for card in (reference, gguf):
         if lack := missing(card):
             raise UserError(
-                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model check`"
+                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model "
+                "check`"
             )
     data = load.load(load.find(dataset))
     scenes = data.scenes(data.courses())
@@ -133,7 +153,9 @@ def parity(
     findings, left_out = compared.findings, compared.left_out
     holds = all(finding.holds for finding in findings)
     if as_json:
-        rows = [asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in findings]
+        rows = [
+            asdict(f) | {"measured": f.measured if isfinite(f.measured) else None} for f in findings
+        ]
         echo_json({"holds": holds, "findings": rows, "left_out": left_out})
         raise typer.Exit(0 if holds else 1)
     for f in findings:
@@ -185,16 +207,25 @@ def _show(spec: "Spec", seen: "Checkup") -> None:
         typer.echo(f"tokens       not known here: {why}")
     else:
         typer.echo(
-            f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS at its beginning"
+            f"tokens       {len(seen.tokens)} in the prompt, {seen.bos_tokens} of them BOS at its "
+            "beginning"
         )
         if seen.turn_end:
-            typer.echo(f"answer ends  at {printable(seen.turn_end)}, as its chat template ends a turn")
+            typer.echo(
+                f"answer ends  at {printable(seen.turn_end)}, as its chat template ends a turn"
+            )
         else:
-            typer.echo("answer ends  at no token of its chat template: it may write on after its answer")
+            typer.echo(
+                "answer ends  at no token of its chat template: it may write on after its answer"
+            )
     if card.system:
-        typer.echo("system       at the beginning of the first user turn: its template has no place for it")
-    typer.echo(f"thinking     {seen.thinking or 'as the server is set'}; "
-               f"{'asked' if spec.ego.thinking else 'not asked'} here; card: {card.thinking}")  # fmt: skip
+        typer.echo(
+            "system       at the beginning of the first user turn: its template has no place for it"
+        )
+    typer.echo(
+        f"thinking     {seen.thinking or 'as the server is set'}; "
+        f"{'asked' if spec.ego.thinking else 'not asked'} here; card: {card.thinking}"
+    )
     typer.echo(f"prompt       {PROMPT}, the ego of {DATASET}'s first scene")
     for line in seen.prompt.split("\n"):
         typer.echo(f"  | {printable(line, 1000)}")
@@ -213,11 +244,14 @@ def _show_findings(result: "Findings | None") -> None:
     if result is None:
         return
     typer.echo(
-        f"letters      {100 * result.letter_share:.0f} % of a read-out follows the letter; the likeliest "
+        f"letters      {100 * result.letter_share:.0f} % of a read-out follows the letter; the "
+        "likeliest "
         f"action does in {result.follows_letter} of {result.n} questions; mass on the letters "
         f"{result.label_mass:.2f}"
     )
-    shown = ", ".join(f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in result.pairs)
+    shown = ", ".join(
+        f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in result.pairs
+    )
     typer.echo(
         f"pairs        of questions that differ in one fact, letters {result.letters}; the answer "
         f"followed the fact in (mean change of its probability): {shown}"
@@ -236,7 +270,9 @@ def _show_answers(answers: "Mapping[AnswerMode, Completion]") -> None:
             took += f"first token after {answer.first_token_s * 1000:.1f} ms, "
         count = answer.completion_tokens
         tokens = "" if count is None else f"{count} token{'' if count == 1 else 's'}, "
-        typer.echo(f"{mode:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}")
+        typer.echo(
+            f"{mode:<13}{took}{tokens}{answer.finish_reason}: {printable(repr(answer.text))}"
+        )
 
 
 def _token_lines(tokens: list[tuple[int, str]]) -> list[str]:

@@ -1,4 +1,6 @@
-"""How fast each engine of a card answers on this machine, shortly timed. It advises, and decides nothing."""
+"""How fast each engine of a card answers on this machine, shortly timed.
+It advises, and decides nothing.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -28,7 +30,8 @@ class Pace:
 
 
 def paces(stem: str) -> list[Pace]:
-    """Time the engines of a card file: those that run here, if there are several and weights are small.
+    """Time the engines of a card file:
+    those that run here, if there are several and weights are small.
 
     Raises UserError if weights do not load or the model cannot answer so, and Unanswered.
     """
@@ -39,10 +42,13 @@ def paces(stem: str) -> list[Pace]:
 
 
 def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
-    """Time the engines of card files, as far as `paces` can. `progress` is called with 1 after each."""
+    """Time the engines of card files, as far as `paces` can.
+    `progress` is called with 1 after each.
+    """
     measured = {}
     for stem in stems:
-        with suppress(UserError, Unanswered):  # what is wrong with a card is said where cards are listed
+        # what is wrong with a card is said where cards are listed
+        with suppress(UserError, Unanswered):
             measured[stem] = paces(stem)
         progress(1)
     return {stem: each for stem, each in measured.items() if each}
@@ -56,10 +62,13 @@ def advice(measured: Sequence[Pace]) -> str:
     if by_letters == by_text:
         verdict = f"{by_text or 'neither'} is faster here"
     else:
-        verdict = f"faster here: {by_letters or 'neither'} for read-outs, {by_text or 'neither'} for text"
+        verdict = (
+            f"faster here: {by_letters or 'neither'} for read-outs, {by_text or 'neither'} for text"
+        )
     letters_s, text_s = (" and ".join(f"{s:.2g} s" for s in of) for of in (of_letters, of_text))
     return (
-        f"{verdict}; --engine chooses. On {engines}: a read-out {letters_s}, {TOKENS} tokens of text {text_s}"
+        f"{verdict}; --engine chooses. On {engines}: a read-out {letters_s}, {TOKENS} tokens of "
+        f"text {text_s}"
     )
 
 

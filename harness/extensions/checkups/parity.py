@@ -1,7 +1,8 @@
 """Parity: one model through two engines. The same prompts, compared token by token.
 
-transformers in float32 is the reference. llama.cpp is held to it twice: with the very same float32 weights,
-exported on the spot where the architecture can be, and with the GGUF file that the model's card names.
+transformers in float32 is the reference. llama.cpp is held to it twice: with the very same float32
+weights, exported on the spot where the architecture can be, and with the GGUF file that the model's
+card names.
 """
 
 import tempfile
@@ -26,8 +27,8 @@ from harness.core.errors import Unanswered, UserError, printable
 from harness.parsing.parse import parse
 
 LEAST_TEXTS, MOST_READOUT = 0.98, 0.02
-# Other formats are measured, and have no limit. Of a picture llama.cpp rounds pixels, the weights of their
-# patches and GELU to half precision in files of any format.
+# Other formats are measured, and have no limit. Of a picture llama.cpp rounds pixels, the weights
+# of their patches and GELU to half precision in files of any format.
 MOST_LOGIT = {"F32": 1e-3, "F16": 0.1}
 SEEN = {"F32": 0.1, "F16": 0.1}
 SHOWN = 5  # differences of a kind that are named
@@ -74,10 +75,10 @@ def compare(
 ) -> Comparison:
     """Hold a GGUF card's model against the same model on transformers.
 
-    `reference` is a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked. Of `asked`,
-    requests for JSON, there may be none; `letters` ask for a read-out. `progress` is called with 1 after each
-    of `PASSES` passes over the prompts, or with those left out. Raises UserError for weights that are not
-    there or do not load.
+    `reference` is a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked. Of
+    `asked`, requests for JSON, there may be none; `letters` ask for a read-out. `progress` is
+    called with 1 after each of `PASSES` passes over the prompts, or with those left out. Raises
+    UserError for weights that are not there or do not load.
     """
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")
@@ -97,22 +98,34 @@ def compare(
             left_out = str(error)
         else:
             beside = projector_of(file).name if gguf.projector else None
-            same = replace(gguf, weights=str(file), file=None, revision=None, sha256=None, projector=beside)
+            same = replace(
+                gguf, weights=str(file), file=None, revision=None, sha256=None, projector=beside
+            )
             exact = partial(llama_backend.open, same, device="cpu")
             engines.insert(0, ("F32", exact))
-        alone: list[tuple[str, Callable[..., Backend], list[str]]] = [("transformers", plain, expected.texts)]
+        alone: list[tuple[str, Callable[..., Backend], list[str]]] = [
+            ("transformers", plain, expected.texts)
+        ]
         for label, engine in engines:
             trial = _outputs(engine(batch_size=1), asked, letters, rows)
             if engine is exact:
                 alone.append(("llama.cpp F32", engine, trial.texts))
             ids = json_ids + letter_ids
-            findings.append(_equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, trial.tokens))
+            findings.append(
+                _equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, trial.tokens)
+            )
             if asked:
                 logit = np.abs(expected.logits - trial.logits).max(axis=1)
                 most = most_logit.get(label)
                 findings += [
                     _near(f"{label}: largest difference of a logit", most, json_ids, logit),
-                    _equal(f"{label}: greedy text equal", LEAST_TEXTS, json_ids, expected.texts, trial.texts),
+                    _equal(
+                        f"{label}: greedy text equal",
+                        LEAST_TEXTS,
+                        json_ids,
+                        expected.texts,
+                        trial.texts,
+                    ),
                 ]
             readout = np.abs(expected.readouts - trial.readouts).max(axis=1)
             what = f"{label}: largest difference of a read-out"
@@ -129,10 +142,14 @@ def compare(
 
 
 def _outputs(
-    backend: LanguageModel | LlamaBackend, asked: Sequence[Request], letters: Sequence[Request], rows: int
+    backend: LanguageModel | LlamaBackend,
+    asked: Sequence[Request],
+    letters: Sequence[Request],
+    rows: int,
 ) -> Outputs:
     tokens = [
-        backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking)) for r in (*asked, *letters)
+        backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking))
+        for r in (*asked, *letters)
     ]
     logits = [backend.next_log_probs([r], rows) for r in asked]
     readouts = [
@@ -144,14 +161,18 @@ def _outputs(
 
 
 def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
-    """Answer each question. Raises Unanswered if one gets no answer: two errors are not equal texts."""
+    """Answer each question. Raises Unanswered if one gets no answer:
+    two errors are not equal texts.
+    """
     completions = backend.complete(asked)
     if errors := [printable(c.error, 300) for c in completions if c.error is not None]:
         raise Unanswered(f"{errors[0]}: no answer to {len(errors)} of {len(asked)} questions")
     return [completion.text for completion in completions]
 
 
-def _equal(what: str, least: float, ids: Sequence[str], a: Sequence[Any], b: Sequence[Any]) -> Finding:
+def _equal(
+    what: str, least: float, ids: Sequence[str], a: Sequence[Any], b: Sequence[Any]
+) -> Finding:
     unlike = [f"{i}: {x!r} / {y!r}" for i, x, y in zip(ids, a, b, strict=True) if x != y]
     share = 1 - len(unlike) / len(ids)
     return Finding(what, share, least, share >= least, len(ids), tuple(unlike[:SHOWN]))

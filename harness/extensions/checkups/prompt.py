@@ -41,7 +41,8 @@ class Answers(Struct, frozen=True):
     placeholder_copies: int  # answers that copy a placeholder of the prompt
     bad_sums: int  # answers whose numbers do not sum to one
     at_limit: int  # answers that ran to the limit of tokens
-    # how many answers have each fault for which they cannot be read, by status; an answer may have several
+    # how many answers have each fault for which they cannot be read, by status; an answer may have
+    # several
     faults: dict[str, int]
     sample: str  # the first text of the commonest kind
 
@@ -72,7 +73,8 @@ class Trial(Struct, frozen=True):
     model: str  # name of the model
     prompt: str  # the prompt version
     roles: tuple[Answers, ...]  # each role's answers
-    pairs: tuple[Moved, ...]  # how the ego's answers moved in pairs of scenes that differ in one fact
+    # how the ego's answers moved in pairs of scenes that differ in one fact
+    pairs: tuple[Moved, ...]
 
 
 def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
@@ -83,12 +85,14 @@ def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
     card = resolve(model, engine)
     if not capabilities(card.engine).language_model:
         raise UserError(
-            f"--model {printable(card.name)}: it reads no prompt; give a language model (`harness model "
+            f"--model {printable(card.name)}: it reads no prompt; give a language model (`harness "
+            "model "
             "list`)"
         )
     if reason := unfit(prompt, questions.scenario()):
         raise UserError(
-            f"--model: prompt {prompt.version} {reason}; the fixed questions are of that scenario; leave "
+            f"--model: prompt {prompt.version} {reason}; the fixed questions are of that scenario; "
+            "leave "
             "--model out"
         )
     return card
@@ -109,8 +113,11 @@ def try_on(
     return trial, examine(backend, agent, progress) if reads_out else None
 
 
-def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None) -> Trial:
-    """Ask a model the fixed questions in both roles, and the ego the pairs of scenes; `COUNT` requests.
+def try_out(
+    backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
+) -> Trial:
+    """Ask a model the fixed questions in both roles, and the ego the pairs of scenes;
+    `COUNT` requests.
 
     Raises Unanswered if a question got no answer.
     """
@@ -124,33 +131,49 @@ def try_out(backend: Backend, agent: Agent, progress: Callable[[int], None] = la
         completions += backend.complete(chunk)
         for completion in completions[start:]:
             if completion.error is not None:
-                raise Unanswered(f"{printable(completion.error, 300)}: a fixed question got no answer")
+                raise Unanswered(
+                    f"{printable(completion.error, 300)}: a fixed question got no answer"
+                )
         progress(len(chunk))
     rest = iter(completions)
     roles = tuple(
-        described(agent.prompt, role, asked[0].actions, [answer_of(request, next(rest)) for request in asked])
+        described(
+            agent.prompt,
+            role,
+            asked[0].actions,
+            [answer_of(request, next(rest)) for request in asked],
+        )
         for role, asked in by_role.items()
     )
     return Trial(agent.card.name, agent.prompt.version, roles, moved(pairs, rest))
 
 
-def described(prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]) -> Answers:
+def described(
+    prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]
+) -> Answers:
     """Return what a role's answers are like, for a prompt whose examples they may copy."""
-    examples = [_value(example.answer) for example in prompt.examples.of(role)] if prompt.examples else []
+    examples = (
+        [_value(example.answer) for example in prompt.examples.of(role)] if prompt.examples else []
+    )
     intents = [answer.intent for answer in answers if answer.intent]
     likeliest = Counter(actions[intent.index(max(intent))] for intent in intents)
     faults = Counter(fault for answer in answers for fault in _faults(answer))
     texts = Counter(answer.raw.strip() for answer in answers)
     return Answers(
-        role=role, n=len(answers), readable=len(intents),
-        strict=sum(answer.status == Status.STRICT for answer in answers), distinct=len(texts),
+        role=role,
+        n=len(answers),
+        readable=len(intents),
+        strict=sum(answer.status == Status.STRICT for answer in answers),
+        distinct=len(texts),
         action=max(likeliest, key=likeliest.__getitem__, default=None),
         action_count=max(likeliest.values(), default=0),
         example_copies=sum(_value(answer.raw.strip()) in examples for answer in answers),
         placeholder_copies=sum(_echoes(answer) for answer in answers),
-        bad_sums=faults[Status.BAD_SUM], at_limit=sum(a.finish_reason == "length" for a in answers),
-        faults=dict(faults.most_common()), sample=texts.most_common(1)[0][0],
-    )  # fmt: skip
+        bad_sums=faults[Status.BAD_SUM],
+        at_limit=sum(a.finish_reason == "length" for a in answers),
+        faults=dict(faults.most_common()),
+        sample=texts.most_common(1)[0][0],
+    )
 
 
 def _faults(answer: Answer) -> tuple[str, ...]:

@@ -1,4 +1,6 @@
-"""`harness prompt check`: every prompt of every scene, its tokens, and what a model does with it."""
+"""`harness prompt check`: every prompt of every scene, its tokens,
+and what a model does with it.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -28,17 +30,18 @@ def check(
     dtype: options.Dtype = None,
     as_json: options.Json = False,
 ) -> None:
-    """Render every prompt of every scene and count its tokens. Exit code 1 if one is outside the budget.
+    """Render every prompt of every scene and count its tokens.
+    Exit code 1 if one is outside the budget.
 
-    The ego's fusion call is rendered with the messages of one helper, of two helpers, and so on to all. A
-    repair turn is counted with the longest answer that a role may give. A picture counts as many tokens as
-    the model's card says; the exit code is also 1 if the model's own image processor is installed and makes
-    another number.
+    The ego's fusion call is rendered with the messages of one helper, of two helpers, and so on to
+    all. A repair turn is counted with the longest answer that a role may give. A picture counts as
+    many tokens as the model's card says; the exit code is also 1 if the model's own image processor
+    is installed and makes another number.
 
-    With --model, the model is asked twelve fixed questions in each role, and pairs of scenes that differ in
-    one fact. What it does with the prompt is said in words: whether it copies placeholders or examples, sums
-    wrongly, runs to the limit, follows the letter of a read-out, ignores the scene. The questions are of tune
-    layouts. An image prompt is not asked.
+    With --model, the model is asked twelve fixed questions in each role, and pairs of scenes that
+    differ in one fact. What it does with the prompt is said in words: whether it copies
+    placeholders or examples, sums wrongly, runs to the limit, follows the letter of a read-out,
+    ignores the scene. The questions are of tune layouts. An image prompt is not asked.
     """
     from harness.backends.tokens import counter, summarize_counts
     from harness.dataset import load
@@ -69,29 +72,41 @@ def check(
     stats = {call: summarize_counts(tokens) for call, tokens in sizes.tokens.items() if tokens}
     if as_json:
         outside = [each._asdict() for each in sizes.outside]
-        figures = {"version": version, "budget": prompt.token_budget, "tokens": stats, "outside": outside}
+        figures = {
+            "version": version,
+            "budget": prompt.token_budget,
+            "tokens": stats,
+            "outside": outside,
+        }
         seen = {"picture": {**reader.as_mapping(), "checked": reader.checked}} if reader else {}
         of_model = to_builtins(dict(zip(("trial", "readout"), tried, strict=True))) if tried else {}
         echo_json({**figures, **seen, **of_model}, indent=None)
     else:
         least, most = prompt.token_budget
         typer.echo(
-            f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to {most} tokens"
+            f"{version}: renders for every viewer of {len(scenes)} scenes; budget {least} to "
+            f"{most} tokens"
         )
         if reader:
             here = "as its processor says" if reader.checked else "its processor is not here to ask"
             typer.echo(f"picture {reader.picture}, {here}")
         for call, s in stats.items():
-            typer.echo(f"{call:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}")
+            typer.echo(
+                f"{call:<7} {s['least']} to {s['most']} tokens, mean {s['mean']}, n = {s['n']}"
+            )
         if not count:
             typer.echo(NOT_COUNTED)
         if sizes.outside:
             total = sum(map(len, sizes.tokens.values()))
-            typer.echo(f"outside the budget: {len(sizes.outside)} of {total} prompts; the first are")
+            typer.echo(
+                f"outside the budget: {len(sizes.outside)} of {total} prompts; the first are"
+            )
         for each in sizes.outside[:10]:
             messages = f" with messages of {each.messages}" if each.messages else ""
             repair = " with a repair turn" if each.call == REPAIR else ""
-            typer.echo(f"scene {each.scene} viewer {each.viewer}{messages}{repair}: {each.tokens} tokens")
+            typer.echo(
+                f"scene {each.scene} viewer {each.viewer}{messages}{repair}: {each.tokens} tokens"
+            )
         if tried:
             _show_trial(*tried)
     if sizes.outside:

@@ -1,8 +1,9 @@
-"""Fixed questions that try a model out: twelve scenes of tune layouts, and pairs that differ in one fact.
+"""Fixed questions that try a model out: twelve scenes of tune layouts,
+and pairs that differ in one fact.
 
-`questions.json` has the scenes: of each of twelve layouts the first decision point of the reference drivers
-at which the ego sees one conflict and a helper is near, as `harness dataset build occluded-intersection
---seed 1000` freezes it. No layout is one of a report.
+`questions.json` has the scenes: of each of twelve layouts the first decision point of the reference
+drivers at which the ego sees one conflict and a helper is near, as `harness dataset build
+occluded-intersection --seed 1000` freezes it. No layout is one of a report.
 """
 
 from collections.abc import Mapping
@@ -75,14 +76,16 @@ def requests(agent: Agent, role: Role = "ego") -> list[Request]:
 def scene_pairs(agent: Agent) -> list[Pair]:
     """Return the pairs of scenes as an agent is asked them as the ego: four of each kind of fact.
 
-    A conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the ego: SLOWER
-    should be likelier with the conflict, and with the small gap.
+    A conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the ego:
+    SLOWER should be likelier with the conflict, and with the small gap.
     """
 
     def pair(fact: Fact, number: int, present: SceneGraph, absent: SceneGraph) -> Pair:
         halves = (("a", present), ("b", absent))
         return Pair(
-            fact, "SLOWER", *(_request(agent, half, f"{fact}-{number}{end}/ego") for end, half in halves)
+            fact,
+            "SLOWER",
+            *(_request(agent, half, f"{fact}-{number}{end}/ego") for end, half in halves),
         )
 
     every = []
@@ -96,8 +99,8 @@ def scene_pairs(agent: Agent) -> list[Pair]:
 def plain_pairs(agent: Agent) -> list[Pair]:
     """Return the pairs of plain questions to an agent that reads out: four of each kind of fact.
 
-    They are answered YES or NO: whether to brake in danger or without, and whether the first of two numbers
-    is greater.
+    They are answered YES or NO: whether to brake in danger or without,
+    and whether the first of two numbers is greater.
     """
     every = []
     for n, (present_text, absent_text) in enumerate(_DANGER):

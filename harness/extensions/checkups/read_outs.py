@@ -1,8 +1,9 @@
-"""Ask a model the fixed questions, and find out what its read-outs follow: the letter, or the scene.
+"""Ask a model the fixed questions, and find out what its read-outs follow:
+the letter, or the scene.
 
-What `harness model check` found is kept in the user's cache by what was asked: the model's identity, the
-prompt's digest and the answer mode. Runs that asked the same, and their pages, say it; no setting follows
-from it. It is never read from a run: a stranger's file could say anything.
+What `harness model check` found is kept in the user's cache by what was asked: the model's
+identity, the prompt's digest and the answer mode. Runs that asked the same, and their pages, say
+it; no setting follows from it. It is never read from a run: a stranger's file could say anything.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -59,7 +60,8 @@ class Findings(Struct, frozen=True):
     follows_letter: int  # in how many questions one letter was the likeliest in every order
     label_mass: float  # mean probability of the letters
     pairs: tuple[Moved, ...]
-    others: tuple[Moved, ...] = ()  # the pairs with letters read the other way, where these showed nothing
+    # the pairs with letters read the other way, where these showed nothing
+    others: tuple[Moved, ...] = ()
 
     @property
     def reads_scene(self) -> bool:
@@ -75,18 +77,23 @@ class Findings(Struct, frozen=True):
         """Yield what a reader of runs that asked the model so has to know."""
         if not self.reads_scene:
             others = _of_scene(self.others)
-            otherwise = f"; with --letters {self.other_letters} in {_moved_of(others)}" if others else ""
+            otherwise = (
+                f"; with --letters {self.other_letters} in {_moved_of(others)}" if others else ""
+            )
             reads = any(pair.read for pair in others)
             found = f"with letters read {self.letters} it does not" if reads else "it does not"
             yield (
-                f"{found} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, moved its "
-                f"answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model check, answer "
+                f"{found} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, "
+                "moved its "
+                f"answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model check, "
+                "answer "
                 f"{self.answer}, prompt {self.prompt})."
             )
         # A model that learnt one order of the letters is read in that order.
         if self.letters == "cyclic" and self.letter_share > MOST_SHARE:
             yield (
-                f"its likeliest action follows the letter in {self.follows_letter} of {self.n} questions "
+                f"its likeliest action follows the letter in {self.follows_letter} of {self.n} "
+                "questions "
                 "(model check); --letters cyclic averages that out."
             )
 
@@ -102,12 +109,16 @@ def _moved_of(pairs: Sequence[Moved]) -> str:
 def examine(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Findings | str:
-    """Ask a model the fixed questions by read-outs; return what was found, or why a question got no answer.
+    """Ask a model the fixed questions by read-outs;
+    return what was found, or why a question got no answer.
 
-    Letters are read over cyclic orders to see what follows them, and in the pairs as the agent reads them. If
-    no scene moved these, the pairs are asked the other way as well: weights may have learnt one order alone.
+    Letters are read over cyclic orders to see what follows them, and in the pairs as the agent
+    reads them. If no scene moved these, the pairs are asked the other way as well: weights may have
+    learnt one order alone.
     """
-    reader = replace(agent, answer="readout", letters=agent.letters if agent.answer in BARE else None)
+    reader = replace(
+        agent, answer="readout", letters=agent.letters if agent.answer in BARE else None
+    )
     pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]
     asked = [
         *questions.requests(replace(reader, letters="cyclic")),
@@ -134,7 +145,11 @@ def examine(
     scenes = [*questions.scene_pairs(turned)]
     halves = [half for pair in scenes for half in (pair.present, pair.absent)]
     again = _answers(backend, halves, lambda count: None)
-    return again if isinstance(again, str) else replace_struct(found, others=moved(scenes, iter(again)))
+    return (
+        again
+        if isinstance(again, str)
+        else replace_struct(found, others=moved(scenes, iter(again)))
+    )
 
 
 def _answers(
@@ -154,36 +169,52 @@ def _answers(
 
 
 def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
-    """Return by fact how the answers to some pairs moved, of the pairs of which both halves can be read.
+    """Return by fact how the answers to some pairs moved,
+    of the pairs of which both halves can be read.
 
     A pair has two completions: with the fact, and without.
     """
     changes: dict[Fact, list[float]] = {}
     for pair in pairs:
-        likely = [_likelihood(pair, half, next(completions)) for half in (pair.present, pair.absent)]
+        likely = [
+            _likelihood(pair, half, next(completions)) for half in (pair.present, pair.absent)
+        ]
         readable = [p for p in likely if p is not None]
         of_fact = changes.setdefault(pair.fact, [])
         if len(readable) == len(likely):
             of_fact.append(readable[0] - readable[1])
     return tuple(
-        Moved(fact, len(all_), sum(c >= LEAST_MOVED for c in all_), round(fmean(all_), 4) if all_ else 0.0)
+        Moved(
+            fact,
+            len(all_),
+            sum(c >= LEAST_MOVED for c in all_),
+            round(fmean(all_), 4) if all_ else 0.0,
+        )
         for fact, all_ in changes.items()
     )
 
 
 def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | None:
-    """Return how likely the expected action is in one half of a pair; None if that cannot be read."""
+    """Return how likely the expected action is in one half of a pair;
+    None if that cannot be read.
+    """
     intent = answer_of(half, completion).intent
     return intent[half.actions.index(pair.expected)] if intent else None
 
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
     """Keep what was found of the model with an identity."""
-    kept.keep(_name(identity, findings.prompt_sha256, findings.answer), msgspec.json.encode(findings))
+    kept.keep(
+        _name(identity, findings.prompt_sha256, findings.answer), msgspec.json.encode(findings)
+    )
 
 
-def recall_findings(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> Findings | None:
-    """Return what was found of the model with an identity, asked so; None if nobody asked it so here."""
+def recall_findings(
+    identity: Mapping[str, Any], prompt_sha256: str, answer: str
+) -> Findings | None:
+    """Return what was found of the model with an identity, asked so;
+    None if nobody asked it so here.
+    """
     data = kept.recall(_name(identity, prompt_sha256, answer))
     try:
         findings = None if data is None else msgspec.json.decode(data, type=Findings)
@@ -199,7 +230,9 @@ def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
 
 
 def caveats(manifest: Manifest) -> Iterator[str]:
-    """Yield what `harness model check` found here of a run's models, if they were asked as in the run."""
+    """Yield what `harness model check` found here of a run's models,
+    if they were asked as in the run.
+    """
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]

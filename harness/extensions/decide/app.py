@@ -1,8 +1,9 @@
 """The application of `harness serve`: a model's decisions by two wire shapes, and nothing else.
 
-A request names no file, address or code: its texts are data of a question, and its pictures come with it. Who
-may ask is decided before its body is read; browsers' pages of other sites may not, since they cannot send
-JSON without leave, and names other than this machine's are refused (DNS rebinding) where only it is served.
+A request names no file, address or code: its texts are data of a question, and its pictures come
+with it. Who may ask is decided before its body is read; browsers' pages of other sites may not,
+since they cannot send JSON without leave, and names other than this machine's are refused (DNS
+rebinding) where only it is served.
 """
 
 import asyncio
@@ -34,7 +35,8 @@ MOST_SEEN_BYTES = 5 * 2**20  # of one with a picture
 BODY_S = 30.0  # within which a request must have come
 ANSWER_S = 120.0  # within which it is answered; a client's usual patience
 CONNECTIONS = 128  # open at the same time
-UNREAD = (401, 403, 404, 405, 408, 413)  # statuses of requests whose body was not read, or not to its end
+# statuses of requests whose body was not read, or not to its end
+UNREAD = (401, 403, 404, 405, 408, 413)
 _OVERFLOW = "context overflow"
 
 
@@ -58,9 +60,14 @@ class Service:
     """Answers the requests for one model."""
 
     def __init__(
-        self, model: ServedModel, batch_size: int = 1, token: str | None = None, local: bool = True,
-        places: int = PLACES, answer_s: float = ANSWER_S,
-    ) -> None:  # fmt: skip
+        self,
+        model: ServedModel,
+        batch_size: int = 1,
+        token: str | None = None,
+        local: bool = True,
+        places: int = PLACES,
+        answer_s: float = ANSWER_S,
+    ) -> None:
         """Prepare to answer.
 
         Args:
@@ -107,18 +114,27 @@ class Service:
             except ValueError:
                 host = None
             if host not in web.NAMES:
-                raise Refusal("this machine is called 127.0.0.1 or localhost here", 403, "forbidden")
+                raise Refusal(
+                    "this machine is called 127.0.0.1 or localhost here", 403, "forbidden"
+                )
         if "origin" in headers:
             raise Refusal("pages of other sites are not served", 403, "forbidden")
         if self._token is not None:
             kind, _, given = headers.get("authorization", "").partition(" ")
-            if kind.lower() != "bearer" or not compare_digest(given.strip().encode(), self._token.encode()):
+            if kind.lower() != "bearer" or not compare_digest(
+                given.strip().encode(), self._token.encode()
+            ):
                 raise Refusal("give the server's token as the API key", 401, "invalid_api_key")
 
     async def _body(self, request: Request) -> bytes:
         kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        if kind != "application/json" or request.headers.get("content-encoding", "identity") != "identity":
-            raise Refusal("a request is JSON, as application/json and not compressed", code="content_type")
+        if (
+            kind != "application/json"
+            or request.headers.get("content-encoding", "identity") != "identity"
+        ):
+            raise Refusal(
+                "a request is JSON, as application/json and not compressed", code="content_type"
+            )
         most = MOST_SEEN_BYTES if self._model.sees else MOST_BYTES
         data = bytearray()
         try:
@@ -160,7 +176,9 @@ class Service:
         assert isinstance(error, HTTPException)
         paths = ", ".join(["GET /v1/models", *(f"POST {shape.path}" for shape in SHAPES)])
         where = printable(f"{request.method} {request.url.path}")
-        return _refused(Refusal(f"nothing answers {where}; there is {paths}", error.status_code, "not_found"))
+        return _refused(
+            Refusal(f"nothing answers {where}; there is {paths}", error.status_code, "not_found")
+        )
 
     def _bug(self, request: Request, error: Exception) -> Response:
         traceback.print_exception(error)

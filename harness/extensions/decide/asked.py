@@ -11,7 +11,8 @@ from harness.prompts.decision import Question
 
 MOST_QUESTIONS = 64  # of one request
 MOST_OPTIONS = 255  # of one question, as other servers of the class
-MOST_DEPTH = 32  # of data: each level indents all below it, so that a small request could fill the memory
+# of data: each level indents all below it, so that a small request could fill the memory
+MOST_DEPTH = 32
 
 
 class Refusal(Exception):
@@ -66,7 +67,9 @@ class Answered:
 
     @property
     def confidence(self) -> float:
-        """0 where all options are equally likely, 1 where one is certain: (K max p - 1) / (K - 1)."""
+        """0 where all options are equally likely, 1 where one is certain:
+        (K max p - 1) / (K - 1).
+        """
         assert self.shares is not None
         k = len(self.shares)
         return min(1.0, max(0.0, (k * max(self.shares) - 1) / (k - 1)))
@@ -83,13 +86,17 @@ def text_of(content: Any) -> str:
     Raises Refusal if it is nested too deep.
     """
     _check_depth(content, MOST_DEPTH)
-    return content if isinstance(content, str) else json.dumps(content, indent=2, ensure_ascii=False)
+    return (
+        content if isinstance(content, str) else json.dumps(content, indent=2, ensure_ascii=False)
+    )
 
 
 def _check_depth(content: Any, left: int) -> None:
     if isinstance(content, dict | list):
         if not left:
-            raise Refusal(f"data is nested more than {MOST_DEPTH} deep; give it flatter", code="depth")
+            raise Refusal(
+                f"data is nested more than {MOST_DEPTH} deep; give it flatter", code="depth"
+            )
         for inner in content.values() if isinstance(content, dict) else content:
             _check_depth(inner, left - 1)
 

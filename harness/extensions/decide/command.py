@@ -17,7 +17,8 @@ def command(
     engine: options.Engine = None,
     letters: str | None = typer.Option(None, help=HELP["letters"]),
     batch_size: int = typer.Option(
-        1, help="Most questions that the model is asked together. With 1 none moves another's answer."
+        1,
+        help="Most questions that the model is asked together. With 1 none moves another's answer.",
     ),
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -26,13 +27,14 @@ def command(
     ),
     port: int = typer.Option(8080, help="Port; 0 picks a free one."),
     token: str | None = typer.Option(
-        None, help=f"What clients must give as their API key. Default: the value of {TOKEN}, if any."
+        None,
+        help=f"What clients must give as their API key. Default: the value of {TOKEN}, if any.",
     ),
 ) -> None:
     """Serve a model's decisions to other programs.
 
-    It answers POST /v1/systemone, POST /v1/decisions and GET /v1/models until Ctrl-C. A language model
-    answers by a read-out of letters, a decision model as it does.
+    It answers POST /v1/systemone, POST /v1/decisions and GET /v1/models until Ctrl-C. A language
+    model answers by a read-out of letters, a decision model as it does.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
@@ -44,7 +46,8 @@ def command(
     local, token = web.is_loopback(host), token or os.environ.get(TOKEN) or None
     if token is None and not local:
         raise UserError(
-            f"--host {printable(host)}: other machines reach it; give a --token, or set {TOKEN}, or leave "
+            f"--host {printable(host)}: other machines reach it; give a --token, or set {TOKEN}, "
+            "or leave "
             "--host out"
         )
     if token is not None and not (token.isascii() and token.isprintable() and " " not in token):
@@ -57,7 +60,9 @@ def command(
 
     def listening(url: str) -> None:
         # Some clients add /v1 to the address that they are given.
-        typer.echo(f"{url}/v1, or {url} for some clients, serves {printable(agent.card.name)} until Ctrl-C")
+        typer.echo(
+            f"{url}/v1, or {url} for some clients, serves {printable(agent.card.name)} until Ctrl-C"
+        )
 
     try:
         web.serve(service.app(), host, port, listening, limit_concurrency=CONNECTIONS)

@@ -1,11 +1,21 @@
-"""`POST /v1/decisions`, as OpenAI has it (openai-python, types/decision_create_params.py and decision.py)."""
+"""`POST /v1/decisions`, as OpenAI has it (openai-python, types/decision_create_params.py and
+decision.py).
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from harness.extensions.decide.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, Refusal, asked, text_of
+from harness.extensions.decide.asked import (
+    MOST_QUESTIONS,
+    Answered,
+    Asked,
+    Enquiry,
+    Refusal,
+    asked,
+    text_of,
+)
 from harness.prompts.decision import Question
 
 
@@ -78,13 +88,17 @@ class Body(Struct):
     """A request; fields that are not listed are ignored."""
 
     input: str | list[Message]
-    questions: Annotated[list[Choice | Score | Predicate], Meta(min_length=1, max_length=MOST_QUESTIONS)]
+    questions: Annotated[
+        list[Choice | Score | Predicate], Meta(min_length=1, max_length=MOST_QUESTIONS)
+    ]
     model: str | None = None
 
 
 def read(body: Body) -> Enquiry:
     """Return what is asked. Raises Refusal where it cannot be."""
-    contents = [body.input] if isinstance(body.input, str) else [_user(message) for message in body.input]
+    contents = (
+        [body.input] if isinstance(body.input, str) else [_user(message) for message in body.input]
+    )
     texts, images = zip(*map(_read, contents), strict=True) if contents else ((), ())
     state = "\n".join(texts)
     questions = tuple(_asked(question, state) for question in body.questions)
@@ -93,7 +107,9 @@ def read(body: Body) -> Enquiry:
 
 def _user(message: Message) -> str | list[Part]:
     if message.role != "user":
-        raise Refusal("input has a message of another role than user; put what it says into the user's")
+        raise Refusal(
+            "input has a message of another role than user; put what it says into the user's"
+        )
     return message.content
 
 
@@ -101,8 +117,11 @@ def _read(content: str | list[Part]) -> tuple[str, list[str]]:
     """Return the text of some content, its parts on lines of their own, and its pictures' URLs."""
     if isinstance(content, str):
         return content, []
-    texts = [part.text if isinstance(part, Text) else text_of(part.data) for part in content
-             if not isinstance(part, Picture)]  # fmt: skip
+    texts = [
+        part.text if isinstance(part, Text) else text_of(part.data)
+        for part in content
+        if not isinstance(part, Picture)
+    ]
     return "\n".join(texts), [part.image_url for part in content if isinstance(part, Picture)]
 
 
@@ -115,8 +134,10 @@ def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
             options = [(option.value, option.description) for option in choices]
             return asked(question.name, Question(state, instructions, {}), options)
         case Score(levels=levels):
-            meant = [f"{each.label}: {each.description}" if each.description else each.label
-                     for each in levels]  # fmt: skip
+            meant = [
+                f"{each.label}: {each.description}" if each.description else each.label
+                for each in levels
+            ]
             options = [(str(level), meaning) for level, meaning in enumerate(meant)]
             whole = asked(question.name, Question(state, instructions, {}, "score"), options)
             return Asked(whole.name, whole.question, tuple(each.label for each in levels))
@@ -129,9 +150,12 @@ def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
     """Return the answer's JSON. Tokens are 0 where nobody counts them."""
     read = sum(each.tokens or 0 for each in answers)
     usage = {
-        "input_tokens": read, "input_tokens_details": {"cache_write_tokens": 0, "cached_tokens": 0},
-        "output_tokens": 0, "output_tokens_details": {"reasoning_tokens": 0}, "total_tokens": read,
-    }  # fmt: skip
+        "input_tokens": read,
+        "input_tokens_details": {"cache_write_tokens": 0, "cached_tokens": 0},
+        "output_tokens": 0,
+        "output_tokens_details": {"reasoning_tokens": 0},
+        "total_tokens": read,
+    }
     return {"model": model, "answers": [_answer(each) for each in answers], "usage": usage}
 
 
@@ -141,11 +165,21 @@ def _answer(answer: Answered) -> dict[str, Any]:
         return {"type": "refusal", **name}
     kind, values, shares = answer.asked.question.kind, answer.asked.values, answer.shares
     if kind == "noul":
-        return {"type": "predicate", **name, "probability": shares[answer.asked.options.index("true")]}
+        return {
+            "type": "predicate",
+            **name,
+            "probability": shares[answer.asked.options.index("true")],
+        }
     pairs = list(zip(values, shares, strict=True))
     if kind == "score":
-        levels = [{"value": n, "label": label, "probability": p} for n, (label, p) in enumerate(pairs)]
-        told = {"score": answer.mean_level, "confidence": answer.confidence, "probabilities": levels}
+        levels = [
+            {"value": n, "label": label, "probability": p} for n, (label, p) in enumerate(pairs)
+        ]
+        told = {
+            "score": answer.mean_level,
+            "confidence": answer.confidence,
+            "probabilities": levels,
+        }
         return {"type": "score", **name, **told}
     listed = [{"value": value, "probability": p} for value, p in pairs]
     chosen = {"choice": values[answer.likeliest], "confidence": answer.confidence}

@@ -1,4 +1,6 @@
-"""The queue before a model: one thread answers, in the order of arrival, in batches of what waits."""
+"""The queue before a model: one thread answers, in the order of arrival,
+in batches of what waits.
+"""
 
 import asyncio
 import queue
@@ -24,7 +26,8 @@ class Desk:
         Thread(target=self._work, daemon=True).start()  # no pool: Ctrl-C would wait for its threads
 
     async def ask(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return the completions of some requests; where this is cancelled, what still waits is dropped.
+        """Return the completions of some requests;
+        where this is cancelled, what still waits is dropped.
 
         Raises Refusal if there is no place for all, and what the backend raises.
         """

@@ -1,4 +1,6 @@
-"""A model as it is served: what it is sent of a question, what it may be asked, and what it is called."""
+"""A model as it is served: what it is sent of a question, what it may be asked,
+and what it is called.
+"""
 
 import time
 from itertools import count
@@ -17,16 +19,20 @@ from harness.prompts import decision, versions
 from harness.prompts.readout import LETTERS
 
 ANY = "default"  # the name that asks for whatever there is
-MOST_CHARACTERS = 2**18  # of a state and its question: each order of the letters is split into tokens
+# of a state and its question: each order of the letters is split into tokens
+MOST_CHARACTERS = 2**18
 _PROMPT = "v9"  # no text of it is asked
 
 
 def served(card: Card, letters: Any = None) -> Agent:
-    """Return the agent that answers for a card. Raises UserError if its model cannot be asked questions."""
+    """Return the agent that answers for a card.
+    Raises UserError if its model cannot be asked questions.
+    """
     can = capabilities(card.engine)
     if not ("decision" in can.answer_modes and can.closed_loop):
         raise UserError(
-            f"{card.shown}: its engine {card.engine} reads scenes or recorded answers, and no question of "
+            f"{card.shown}: its engine {card.engine} reads scenes or recorded answers, and no "
+            "question of "
             "others, so it cannot be served; give a language model or a decision model"
         )
     return Agent(card, versions.load(_PROMPT), "decision", letters=letters)
@@ -45,25 +51,32 @@ class ServedModel:
         self._digest = digest({**backend.identity(), "letters": agent.letters})
 
     def listed(self) -> dict[str, Any]:
-        """Return its entry in `GET /v1/models`; a served model gives decisions and writes nothing."""
+        """Return its entry in `GET /v1/models`;
+        a served model gives decisions and writes nothing.
+        """
         reads = ["text", *(["image"] if self.sees else [])]
         return {
-            "id": self.name, "object": "model", "created": self._started_s,
+            "id": self.name,
+            "object": "model",
+            "created": self._started_s,
             "owned_by": "swarmdrive-harness",
             "architecture": {"input_modalities": reads, "output_modalities": ["decisions"]},
             "meta": {"digest": self._digest},
-        }  # fmt: skip
+        }
 
     def requests(self, enquiry: Enquiry) -> list[Request]:
         """Return a request for each question. Raises Refusal if the model cannot be asked one."""
         if enquiry.model not in (None, ANY, self.name):
             raise Refusal(
-                f"there is no model {printable(enquiry.model)!r}; ask for {printable(self.name)!r}, or for "
+                f"there is no model {printable(enquiry.model)!r}; ask for "
+                f"{printable(self.name)!r}, or for "
                 f"{ANY!r}",
                 code="model_not_found",
             )
         if enquiry.images and not self.sees:
-            raise Refusal(f"{printable(self.name)} reads texts alone; leave pictures out", code="picture")
+            raise Refusal(
+                f"{printable(self.name)} reads texts alone; leave pictures out", code="picture"
+            )
         if len(enquiry.images) > 1:
             raise Refusal(f"{len(enquiry.images)} pictures; give one", code="picture")
         image = picture(enquiry.images[0]) if enquiry.images else None
@@ -73,12 +86,14 @@ class ServedModel:
         if self._reads_letters and len(asked.options) > len(LETTERS):
             raise Refusal(
                 f"question {printable(asked.name, 40)!r} has {len(asked.options)} options; "
-                f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at most",
+                f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at "
+                "most",
                 code="options",
             )
         if asked.length > MOST_CHARACTERS:  # before each order of the letters has a copy
             raise Refusal(
-                f"a question and its state have {asked.length} characters; give {MOST_CHARACTERS} at most",
+                f"a question and its state have {asked.length} characters; give {MOST_CHARACTERS} "
+                "at most",
                 code="context_length_exceeded",
             )
         turn = {"role": "user", **({"image": "camera"} if image else {})}
@@ -86,4 +101,6 @@ class ServedModel:
             asked.options, lambda order: decision.asked(asked.question, (turn,), order)
         )
         blank = self._agent.blank("ego", asked.options)
-        return blank.alike(id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats)
+        return blank.alike(
+            id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats
+        )

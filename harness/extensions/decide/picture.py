@@ -19,7 +19,9 @@ _URL = re.compile(r"data:image/(png|jpeg);base64,", re.IGNORECASE)
 def picture(url: str) -> Image:
     """Return the picture of a data URL. Raises Refusal if it is none, or too large."""
     if not (head := _URL.match(url)):
-        raise Refusal("a picture is no data URL of a PNG or JPEG; nothing is fetched", code="picture")
+        raise Refusal(
+            "a picture is no data URL of a PNG or JPEG; nothing is fetched", code="picture"
+        )
     try:
         extras.need("reading a picture", "PIL")
     except UserError as error:
@@ -27,10 +29,13 @@ def picture(url: str) -> Image:
     import PIL.Image
 
     try:
-        file = PIL.Image.open(BytesIO(b64decode(url[head.end() :], validate=True)), formats=("PNG", "JPEG"))
+        file = PIL.Image.open(
+            BytesIO(b64decode(url[head.end() :], validate=True)), formats=("PNG", "JPEG")
+        )
         if file.width * file.height > MOST_PX:  # known from its head
             raise Refusal(
-                f"a picture has {file.width} x {file.height} pixels; give at most {MOST_PX}", code="picture"
+                f"a picture has {file.width} x {file.height} pixels; give at most {MOST_PX}",
+                code="picture",
             )
         return Image(np.asarray(file.convert("RGB")))
     except (Error, OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:

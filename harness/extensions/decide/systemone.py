@@ -1,4 +1,6 @@
-"""`POST /v1/systemone`, as TypeSafe's API and llama.cpp have it (llama.cpp, tools/server/README.md)."""
+"""`POST /v1/systemone`, as TypeSafe's API and llama.cpp have it (llama.cpp,
+tools/server/README.md).
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -36,7 +38,9 @@ class Body(Struct):
     """A request; fields that are not listed are ignored."""
 
     state: Content
-    questions: Annotated[dict[str, Choice | Score | Noul], Meta(min_length=1, max_length=MOST_QUESTIONS)]
+    questions: Annotated[
+        dict[str, Choice | Score | Noul], Meta(min_length=1, max_length=MOST_QUESTIONS)
+    ]
     model: str | None = None
     images: list[str] = []
     files: list[str] = []
@@ -59,7 +63,9 @@ def _asked(name: str, question: Choice | Score | Noul, state: str) -> Asked:
             options = [(str(level), text_of(content)) for level, content in enumerate(levels)]
             return asked(name, Question(state, instructions, {}, "score"), options)
         case Noul(criteria=outcomes):
-            options = [(option, _meaning((outcomes or {}).get(option))) for option in ("true", "false")]
+            options = [
+                (option, _meaning((outcomes or {}).get(option))) for option in ("true", "false")
+            ]
             return asked(name, Question(state, instructions, {}, "noul"), options)
 
 
@@ -81,8 +87,9 @@ def _answer(answer: Answered) -> dict[str, Any]:
     if kind == "noul":
         return {"type": kind, "noul": answer.shares[options.index("true")]}
     spread = {
-        "probabilities": dict(zip(options, answer.shares, strict=True)), "confidence": answer.confidence,
-    }  # fmt: skip
+        "probabilities": dict(zip(options, answer.shares, strict=True)),
+        "confidence": answer.confidence,
+    }
     if kind == "score":
         legend = dict(answer.asked.question.meanings)
         return {"type": kind, "score": answer.mean_level, "legend": legend, **spread}

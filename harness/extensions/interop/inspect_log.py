@@ -1,6 +1,7 @@
 """A run as a log of Inspect AI, for its viewer and its data frames: a sample an answer.
 
-The package writes the file; nothing here knows the format. https://inspect.aisi.org.uk/eval-logs.html
+The package writes the file;
+nothing here knows the format. https://inspect.aisi.org.uk/eval-logs.html
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,15 +27,19 @@ from harness.runs.records import Answer, FrozenScenes
 from harness.runs.run_dataset import check_scenes, dataset_of
 from harness.runs.sources import lacking
 
-VALUES = {"strict": "C", "recovered": "P", "failed": "I"}  # as Inspect calls correct, partial and incorrect
+# as Inspect calls correct, partial and incorrect
+VALUES = {"strict": "C", "recovered": "P", "failed": "I"}
 STOPS = {"stop": "stop", "length": "max_tokens", "refusal": "content_filter"}
 SPOKEN = {
-    "system": model.ChatMessageSystem, "user": model.ChatMessageUser, "assistant": model.ChatMessageAssistant,
-}  # fmt: skip
+    "system": model.ChatMessageSystem,
+    "user": model.ChatMessageUser,
+    "assistant": model.ChatMessageAssistant,
+}
 
 
 def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
-    """Write a run to an `.eval` file, or to JSON if its name ends so; its dataset may be in another folder.
+    """Write a run to an `.eval` file, or to JSON if its name ends so;
+    its dataset may be in another folder.
 
     Raises:
         UserError: the file is there already, and would lose the prompts.
@@ -45,13 +50,17 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
         refuse_less(path, {"prompts": why} if why else {}, "--inspect")
     with replacing(path) as part:
         log.write_eval_log(
-            log_of(run, frozen, scenes), str(part), format="json" if path.suffix == ".json" else "eval"
+            log_of(run, frozen, scenes),
+            str(part),
+            format="json" if path.suffix == ".json" else "eval",
         )
     return path
 
 
 def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> log.EvalLog:
-    """Return the log: its task is dataset and prompt version, its results the run's summary over episodes."""
+    """Return the log: its task is dataset and prompt version,
+    its results the run's summary over episodes.
+    """
     manifest, variant = run.manifest, run.manifest.variant
     whole = msgspec.to_builtins(manifest)
     stated = nameless(whole)
@@ -61,10 +70,16 @@ def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> lo
     return log.EvalLog(
         status="success",
         eval=log.EvalSpec(
-            eval_id=name, run_id=name, task_id=name, created=manifest.created,
-            task=f"{run.source} {variant.prompt}", task_version=variant.prompt, tags=list(manifest.tags),
+            eval_id=name,
+            run_id=name,
+            task_id=name,
+            created=manifest.created,
+            task=f"{run.source} {variant.prompt}",
+            task_version=variant.prompt,
+            tags=list(manifest.tags),
             dataset=log.EvalDataset(name=run.source, samples=len(samples)),
-            model=f"{manifest.model['engine']}/{variant.model}", config=log.EvalConfig(),
+            model=f"{manifest.model['engine']}/{variant.model}",
+            config=log.EvalConfig(),
             task_args={key: stated[key] for key in asked},
             packages={"swarmdrive-harness": manifest.versions.get("harness", "unknown")},
             metadata={key: stated[key] for key in ("command", "world", "latency", "identity")},
@@ -74,7 +89,7 @@ def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> lo
             total_samples=len(samples), completed_samples=len(samples), scores=list(_results(run))
         ),
         samples=samples,
-    )  # fmt: skip
+    )
 
 
 def _results(run: Run) -> Iterator[log.EvalScore]:
@@ -89,7 +104,9 @@ def _results(run: Run) -> Iterator[log.EvalScore]:
         yield log.EvalScore(name=condition, scorer="swarmdrive-harness", metrics=metrics)
 
 
-def _samples(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> Iterator[log.EvalSample]:
+def _samples(
+    run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]
+) -> Iterator[log.EvalSample]:
     sent = prompts_of(run)
     d = run.decisions
     regret, safe = d["regret"], d.of_actions("safe")
@@ -98,7 +115,9 @@ def _samples(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> 
     for name, rows in d.scenes.items():
         answers = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
         kept = _kept(run, condition[rows.start : rows.stop], regret[rows.start : rows.stop])
-        target = [a for a, is_safe in zip(run.actions, safe[rows.start] == 1.0, strict=True) if is_safe]
+        target = [
+            a for a, is_safe in zip(run.actions, safe[rows.start] == 1.0, strict=True) if is_safe
+        ]
         facts = {"scene": name, "episode": int(episode[rows.start]), "step": int(step[rows.start])}
         for answer in answers.values():
             asked: Sequence[Mapping[str, str]] = ()
@@ -108,15 +127,23 @@ def _samples(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> 
                 heard = messages_of(said, answer.heard, run.actions)
                 shown = as_asked(dataset.scenario, scenes[name], answer, scenes.get(source))
                 asked = sent(shown, answer.viewer, heard)
-            yield _sample(run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts)
+            yield _sample(
+                run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts
+            )
 
 
 def _sample(
-    run: Run, answer: Answer, asked: Sequence[Mapping[str, str]], target: list[str],
-    kept: Mapping[str, Score], facts: Mapping[str, Any],
-) -> log.EvalSample:  # fmt: skip
+    run: Run,
+    answer: Answer,
+    asked: Sequence[Mapping[str, str]],
+    target: list[str],
+    kept: Mapping[str, Score],
+    facts: Mapping[str, Any],
+) -> log.EvalSample:
     here = bool(asked) and digest(asked) == answer.prompt_sha256
-    chat = [SPOKEN[message["role"]](content=message["content"]) for message in asked] if here else []
+    chat = (
+        [SPOKEN[message["role"]](content=message["content"]) for message in asked] if here else []
+    )
     reply = model.ChatMessageAssistant(content=answer.raw, source="generate")
     usage = None
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
@@ -125,38 +152,55 @@ def _sample(
     stop = STOPS.get(answer.finish_reason, "unknown")
     plain = msgspec.to_builtins(answer) | {"detail": text(answer.detail)}
     left_out = ("raw", "prompt_tokens", "completion_tokens", "finish_reason", "error", "seconds")
-    intent = "failed" if answer.intent is None else " ".join(
-        f"{action} {p:.2f}" for action, p in zip(run.actions, answer.intent, strict=True)
-    )  # fmt: skip
+    intent = (
+        "failed"
+        if answer.intent is None
+        else " ".join(
+            f"{action} {p:.2f}" for action, p in zip(run.actions, answer.intent, strict=True)
+        )
+    )
     verdict = Score(
-        value=VALUES[answer.verdict], answer=intent, explanation=f"{answer.status}: {plain['detail']}"
+        value=VALUES[answer.verdict],
+        answer=intent,
+        explanation=f"{answer.status}: {plain['detail']}",
     )
     return log.EvalSample(
-        id=answer.id, epoch=1, input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",
-        target=target, messages=[*chat, reply],
+        id=answer.id,
+        epoch=1,
+        input=chat or f"a prompt that is not here, sha256 {answer.prompt_sha256}",
+        target=target,
+        messages=[*chat, reply],
         output=model.ModelOutput(
-            model=run.agent(answer)["model"]["name"], usage=usage, time=answer.seconds,
+            model=run.agent(answer)["model"]["name"],
+            usage=usage,
+            time=answer.seconds,
             error=answer.error and text(answer.error),
             choices=[model.ChatCompletionChoice(message=reply, stop_reason=stop)],
         ),
         scores={"parsed": verdict, **kept},
         metadata={**facts, **{key: value for key, value in plain.items() if key not in left_out}},
-    )  # fmt: skip
+    )
 
 
 def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
-    """Of each condition in which it is known, the share of seeds whose decision gave success away."""
+    """Of each condition in which it is known,
+    the share of seeds whose decision gave success away.
+    """
     scores = {}
     for n, name in enumerate(run.conditions):
         known = regret[(condition == n) & ~np.isnan(regret)]
         if len(known):
-            explanation = f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
+            explanation = (
+                f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
+            )
             scores[f"regret {name}"] = Score(value=float(known.mean()), explanation=explanation)
     return scores
 
 
 def _scenes(run: Run, folder: Path | None) -> tuple[Dataset | None, dict[str, Scene]]:
-    """Return the run's dataset and decision points; none if it is not here as it was, or it was driven."""
+    """Return the run's dataset and decision points;
+    none if it is not here as it was, or it was driven.
+    """
     if not isinstance(run.manifest.world, FrozenScenes):
         return None, {}
     try:

@@ -1,4 +1,6 @@
-"""Teach models and tune prompts: what trees show to be right, distilling, rewards, a search of wordings."""
+"""Teach models and tune prompts: what trees show to be right, distilling, rewards,
+a search of wordings.
+"""
 
 from harness.core.extensions import Extension
 

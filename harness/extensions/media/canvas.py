@@ -1,6 +1,8 @@
-"""One still of a driven episode: from above, and as the cameras of the ego and of one helper see it.
+"""One still of a driven episode: from above,
+and as the cameras of the ego and of one helper see it.
 
-Words are drawn when they change, what lies on the ground each time: the view from above follows the action.
+Words are drawn when they change, what lies on the ground each time:
+the view from above follows the action.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -34,7 +36,9 @@ SIDE_IN, HEIGHT_IN, DPI = 5.0, 6.2, 90
 WIDTH, HEIGHT = SIZE_PX
 CAMERA_IN, CAPTION_PX = WIDTH / DPI, 23
 NAME_PT = 7.0
-SIDES = np.array([[0, 1], [0, -1], [1, 0], [-1, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
+SIDES = np.array(
+    [[0, 1], [0, -1], [1, 0], [-1, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float
+)
 GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 
 
@@ -43,7 +47,7 @@ class Canvas:
 
     def __init__(
         self, played: ReplayedEpisode, buildings: Sequence[Building], agents: Sequence[str]
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.played, self.actions, self.buildings = played, played.scenario.actions, buildings
         height, width = HEIGHT_IN, SIDE_IN + CAMERA_IN
         self.figure = Figure(figsize=(width, height), dpi=DPI)
@@ -56,12 +60,15 @@ class Canvas:
             self.axes.add_artist(artist)
         several = len(agents) > 1
         rows, long = (agents, 1.2) if several else (self.actions, 1.75)
-        self.bars = self.figure.add_axes((3.1 / width, 0.28 / height, long / width, (below - 0.4) / height))
+        self.bars = self.figure.add_axes(
+            (3.1 / width, 0.28 / height, long / width, (below - 0.4) / height)
+        )
         self.bars.set(xlim=(0, 1), ylim=(len(rows) - 0.5, -0.5), xticks=[0, 0.5, 1])
         self.bars.set_yticks(range(len(rows)), labels=list(map(printable, rows)), size=7)
         self.bars.tick_params(labelsize=6, length=2)
         self.lines = [
-            self.figure.text(0.1 / width, (below - 0.4 - 0.22 * n) / height, "", size=8) for n in range(4)
+            self.figure.text(0.1 / width, (below - 0.4 - 0.22 * n) / height, "", size=8)
+            for n in range(4)
         ]
         self.lines[0].set_text(f"episode {played.episode}, seed {played.seed}")
         self.lines[1].set_text(printable(played.condition, 34))
@@ -85,21 +92,31 @@ class Canvas:
         pixels = np.ascontiguousarray(np.asarray(self.canvas.buffer_rgba())[..., :3])  # type: ignore[no-untyped-call]
         for n, viewer in enumerate(viewers):
             top = CAPTION_PX + n * (CAPTION_PX + HEIGHT)
-            pixels[top : top + HEIGHT, -WIDTH:] = frame(self.played.scenario, still.state, viewer).pixels
+            pixels[top : top + HEIGHT, -WIDTH:] = frame(
+                self.played.scenario, still.state, viewer
+            ).pixels
         return pixels
 
     def _words(self, still: Still, viewers: Sequence[str]) -> None:
-        """The policy and what is said of it, drawn again if it is not as in the last still; and the time."""
+        """The policy and what is said of it, drawn again if it is not as in the last still;
+        and the time.
+        """
         turns, ego = list(still.turns.values()), still.state.ego
         decision = turns[0].decision
         ending = still.outcome or f"decision {decision.action} at {decision.acts_at_s:.2f} s"
         if len(turns) > 1:
             ending = still.outcome or f"{len(turns)} agents decide"
-        words = (ending, *((turn.decision.step, turn.open, turn.outcome) for turn in turns), *viewers)
+        words = (
+            ending,
+            *((turn.decision.step, turn.open, turn.outcome) for turn in turns),
+            *viewers,
+        )
         if words != self.words:
             self.words = words
             self.canvas.restore_region(self.fixed)  # type: ignore[no-untyped-call]
-            for bar in _shares(turns, self.actions) if len(turns) > 1 else _bars(turns[0], self.actions):
+            for bar in (
+                _shares(turns, self.actions) if len(turns) > 1 else _bars(turns[0], self.actions)
+            ):
                 self.bars.add_artist(bar)
                 self.bars.draw_artist(bar)
                 bar.remove()
@@ -107,7 +124,9 @@ class Canvas:
             for viewer, caption in zip(viewers, self.captions, strict=False):
                 whose = "agent" if viewer in still.turns and len(turns) > 1 else "helper"
                 whose = "ego" if viewer == ego.id and len(turns) == 1 else whose
-                caption.set_text(f"cameras of {printable(viewer)}, {whose}: front above, rear below")
+                caption.set_text(
+                    f"cameras of {printable(viewer)}, {whose}: front above, rear below"
+                )
             for line in (self.lines[3], *self.captions[: len(viewers)]):
                 self.figure.draw_artist(line)
             self.worded = self._copy()
@@ -142,7 +161,11 @@ class Canvas:
         for vehicle in still.state.vehicles:
             look = "ego" if vehicle.id in still.turns else vehicle.part
             self._over(
-                body(vehicle, "danger" if vehicle.id == still.danger else look, vehicle.id not in known)
+                body(
+                    vehicle,
+                    "danger" if vehicle.id == still.danger else look,
+                    vehicle.id not in known,
+                )
             )
         self._over(*_messages(self.played, still), *self._names(still, view, pt_per_m))
         for spine in self.axes.spines.values():
@@ -159,22 +182,32 @@ class Canvas:
             self.figure.draw_artist(artist)
 
     def _names(self, still: Still, view: View, pt_per_m: float) -> Iterator[Artist]:
-        """Every vehicle's id and speed beside it, over nobody: where it was in the last still if it can."""
+        """Every vehicle's id and speed beside it, over nobody:
+        where it was in the last still if it can.
+        """
         shown = [v for v in still.state.vehicles if view.holds(north_up(np.array([v.x_m, v.y_m])))]
         decisions = {agent: turn.decision for agent, turn in still.turns.items()}
-        attackers = {m.sender for decision in decisions.values() for m in decision.messages if m.attacker}
+        attackers = {
+            m.sender for decision in decisions.values() for m in decision.messages if m.attacker
+        }
         taken = [_around(v) for v in still.state.vehicles]
         outlines, leaders = list[Outline](), list[Floats]()
         for v in shown:
-            action = f" {decisions[v.id].action}" if v.id in decisions and len(decisions) > 1 else ""
+            action = (
+                f" {decisions[v.id].action}" if v.id in decisions and len(decisions) > 1 else ""
+            )
             text = f"{v.id} {v.speed_mps:.0f} m/s{action}{' attacks' if v.id in attackers else ''}"
             outline, size = _outline(text), _size(text) / pt_per_m
             box = _around(v)
             at, reach = box.mean(axis=0), (box[1] - box[0]) / 2
             gaps = np.repeat(GAPS_PT, len(SIDES))[:, None] / pt_per_m
             places = at + np.tile(SIDES, (len(GAPS_PT), 1)) * (reach + size / 2 + gaps)
-            ahead = np.abs(SIDES @ north_up(np.array([np.cos(v.heading_rad), np.sin(v.heading_rad)])))
-            cost = np.tile(0.3 * ahead, len(GAPS_PT)) + np.repeat(np.arange(len(GAPS_PT)), len(SIDES))
+            ahead = np.abs(
+                SIDES @ north_up(np.array([np.cos(v.heading_rad), np.sin(v.heading_rad)]))
+            )
+            cost = np.tile(0.3 * ahead, len(GAPS_PT)) + np.repeat(
+                np.arange(len(GAPS_PT)), len(SIDES)
+            )
             half = size / 2 + 1.0 / pt_per_m
             cost += 100 * covered(places, half, taken) + 100 * (cut(places, half, view) > 0)
             if v.id in self.sides:
@@ -188,7 +221,9 @@ class Canvas:
         yield LineCollection(leaders, colors=INK, linewidths=0.5)
         if outlines:
             every = Outline.make_compound_path(*outlines)
-            yield PathPatch(every, facecolor="white", edgecolor="white", linewidth=2.0, joinstyle="round")
+            yield PathPatch(
+                every, facecolor="white", edgecolor="white", linewidth=2.0, joinstyle="round"
+            )
             yield PathPatch(every, facecolor=INK, edgecolor="none")
 
     def _copy(self) -> object:
@@ -261,7 +296,9 @@ def _messages(played: ReplayedEpisode, still: Still) -> Iterator[Artist]:
         yield Line2D(*path.T, color=GREY, linewidth=0.8, linestyle=":")
         if turn.since_s >= sent_s:
             colour = BAD if lost else GOOD if message.on_time else LATE
-            yield Line2D(place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6)
+            yield Line2D(
+                place[:1], place[1:], marker="X" if lost else "o", color=colour, markersize=6
+            )
 
 
 def _bars(turn: Turn, actions: Sequence[str]) -> Iterator[Artist]:
@@ -271,12 +308,20 @@ def _bars(turn: Turn, actions: Sequence[str]) -> Iterator[Artist]:
         width = 1.4 if action == decision.action else 0.3
         pale = 0.35 if turn.open else 1.0
         yield Rectangle(
-            (0.0, n - 0.4), p, 0.8, facecolor=colours[action], alpha=pale, edgecolor=INK, linewidth=width
+            (0.0, n - 0.4),
+            p,
+            0.8,
+            facecolor=colours[action],
+            alpha=pale,
+            edgecolor=INK,
+            linewidth=width,
         )
 
 
 def _shares(turns: Sequence[Turn], actions: Sequence[str]) -> Iterator[Artist]:
-    """Yield the policy of each agent's last decision as a row from slow to fast, and what it came to."""
+    """Yield the policy of each agent's last decision as a row from slow to fast,
+    and what it came to.
+    """
     colours = list(colours_of(actions).values())
     for n, turn in enumerate(turns):
         starts = np.cumsum([0.0, *turn.decision.fused[:-1]])

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.core.errors import UserError, printable, unknown
-from harness.evaluate.replay import ReplayedEpisode, act, acting_frame, actions_by_frame, due_frame, played
+from harness.evaluate.replay import (
+    ReplayedEpisode,
+    act,
+    acting_frame,
+    actions_by_frame,
+    due_frame,
+    played,
+)
 from harness.runs.folder import read
 from harness.runs.records import ClosedLoop, Decision
 from harness.world.outcome import Outcome
@@ -46,7 +53,8 @@ class Still:
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
     """Return an episode of a run folder; by default of the last condition and the first seed.
 
-    Raises UserError if the folder holds no closed-loop run, or has no such episode, condition or seed.
+    Raises UserError if the folder holds no closed-loop run, or has no such episode,
+    condition or seed.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):
@@ -65,7 +73,9 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> R
     return played(run, episode, condition, seed)
 
 
-def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None) -> Iterator[Still]:
+def stills(
+    played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None
+) -> Iterator[Still]:
     """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
@@ -78,7 +88,9 @@ def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda don
     while True:
         if due and due[0] <= world.frame:
             now, seen = due.pop(0), world.state()
-            latest |= {decision.agent or ids[0]: decision for frame, decision in begun if frame == now}
+            latest |= {
+                decision.agent or ids[0]: decision for frame, decision in begun if frame == now
+            }
         turns = {ids[place]: _turn(world, place, latest[ids[place]], p) for place in world.journeys}
         progress(1)
         yield Still(world.state(), seen, turns, _ending(world), world.layout.danger_id)
@@ -86,7 +98,9 @@ def stills(played: ReplayedEpisode, progress: Callable[[int], None] = lambda don
             return
         deciding = any(turn.open for turn in turns.values())
         next_frame = world.frame + (1 if deciding else max(1, round(p.simulation_hz / STILLS_HZ)))
-        world.advance(min([next_frame, *(f for f in {*acting, *due} if world.frame < f < next_frame)]))
+        world.advance(
+            min([next_frame, *(f for f in {*acting, *due} if world.frame < f < next_frame)])
+        )
         if world.frame in acting and not world.ended:
             act(world, acting[world.frame])
 

@@ -1,7 +1,7 @@
 """A driven episode from above and through cameras, as a moving picture.
 
-Thinking is shown slowly: a still a frame of 20 ms while a decision is open, else ten a second, all for the
-same time. So messages can be seen to travel.
+Thinking is shown slowly: a still a frame of 20 ms while a decision is open, else ten a second, all
+for the same time. So messages can be seen to travel.
 """
 
 import io
@@ -64,7 +64,9 @@ def _gif(pictures: Iterable[Pixels], out: Path) -> None:
     )
     durations = [STILL_MS] * len(others) + [LAST_MS]
     data = io.BytesIO()
-    first.save(data, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False)
+    first.save(
+        data, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=False
+    )
     write_whole(out, data.getvalue())
 
 
@@ -74,10 +76,15 @@ def _mp4(pictures: Iterator[Pixels], out: Path) -> None:
     first = next(pictures)
     with replacing(out) as part:
         file = write_frames(
-            str(part.resolve()), first.shape[1::-1], fps=1000 / STILL_MS, codec="libx264", quality=None,
-            macro_block_size=2, ffmpeg_log_level="error",
+            str(part.resolve()),
+            first.shape[1::-1],
+            fps=1000 / STILL_MS,
+            codec="libx264",
+            quality=None,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
             output_params=["-crf", "20", "-movflags", "+faststart", "-f", "mp4"],
-        )  # fmt: skip
+        )
         file.send(None)
         last = first
         for last in chain([first], pictures):
@@ -91,7 +98,9 @@ def _pictures(played: ReplayedEpisode, progress: Callable[[int], None]) -> Itera
     listed = list(stills(played))
     graphs = list(_graphs(played.scenario, listed))
     canvas = Canvas(played, listed[0].state.buildings, list(listed[0].turns))
-    for still, seen, view in zip(listed, graphs, _views(played.scenario, listed, graphs), strict=True):
+    for still, seen, view in zip(
+        listed, graphs, _views(played.scenario, listed, graphs), strict=True
+    ):
         yield canvas.picture(still, {v: [*graph.seen] for v, graph in seen.items()}, view)
         progress(1)
 
@@ -102,14 +111,18 @@ def _graphs(scenario: Scenario, listed: Iterable[Still]) -> Iterator[dict[str, S
     for still in listed:
         if still.seen != moment:
             moment = still.seen
-            graphs = {v.id: scene_graph(scenario, moment, v.id) for v in (moment.ego, *moment.helpers)}
+            graphs = {
+                v.id: scene_graph(scenario, moment, v.id) for v in (moment.ego, *moment.helpers)
+            }
         yield graphs
 
 
 def _views(
     scenario: Scenario, listed: Sequence[Still], graphs: Iterable[Mapping[str, SceneGraph]]
 ) -> Iterable[View]:
-    """Return a view for each still: one from each decision to the next, then one for each period of these."""
+    """Return a view for each still: one from each decision to the next,
+    then one for each period of these.
+    """
     period_s, zone_m = scenario.parameters.decision_period_s, scenario.road().zone_m
     held = []
     for still, seen in zip(listed, graphs, strict=True):
@@ -118,4 +131,6 @@ def _views(
         asked = [message.sender for decision in decisions for message in decision.messages]
         graph = seen[still.state.ego.id] if now else None
         held.append(spots(still.state, zone_m, graph, (still.danger, *still.turns, *asked)))
-    return views(held, [int(still.state.time_s / period_s + 1e-6) for still in listed], shape_of(scenario))
+    return views(
+        held, [int(still.state.time_s / period_s + 1e-6) for still in listed], shape_of(scenario)
+    )

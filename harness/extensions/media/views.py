@@ -12,7 +12,8 @@ EASE = 8  # stills before a decision in which a video turns to its view
 
 
 def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> list[View]:
-    """A view for each still of a video: held through each part, it turns to the next in its last stills.
+    """A view for each still of a video:
+    held through each part, it turns to the next in its last stills.
 
     Args:
         held: spots of each still.
@@ -20,10 +21,15 @@ def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> l
         shape: height by width.
     """
     starts = [0, *(n for n, (a, b) in enumerate(pairwise(parts), 1) if a != b), len(parts)]
-    turns = [begin if begin == 0 else max(begin - EASE, last) for last, begin in pairwise([0, *starts[:-1]])]
-    # What is on its way from one part into the next is in the views of both, and so in all between them.
+    turns = [
+        begin if begin == 0 else max(begin - EASE, last)
+        for last, begin in pairwise([0, *starts[:-1]])
+    ]
+    # What is on its way from one part into the next is in the views of both, and so in all between
+    # them.
     targets = [
-        view_of(np.concatenate(held[turn:end]), shape) for turn, end in zip(turns, starts[1:], strict=True)
+        view_of(np.concatenate(held[turn:end]), shape)
+        for turn, end in zip(turns, starts[1:], strict=True)
     ]
     stills = []
     for n, target in enumerate(targets):

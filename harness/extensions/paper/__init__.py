@@ -1,4 +1,6 @@
-"""Play the paper's studies: a calibrated proxy beside each of its numbers, and any model in closed loop."""
+"""Play the paper's studies: a calibrated proxy beside each of its numbers,
+and any model in closed loop.
+"""
 
 from harness.core.extensions import Extension
 

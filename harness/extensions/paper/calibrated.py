@@ -1,16 +1,19 @@
-"""The calibrated proxy: intents in the paper's occluded intersection, by mechanism and not by panel.
+"""The calibrated proxy: intents in the paper's occluded intersection,
+by mechanism and not by panel.
 
-The story of an episode. A danger comes from one of three approaches, and the ego cannot see it. The ego
-guesses, and in some episodes guesses wrong; whoever sees the approach, the witness, knows, except in the
-episodes that nobody reads rightly. Helper h watches approach h; the nearest helper watches the likeliest one,
-and helpers past the third watch nothing new. The other helpers share the ego's guess. Once the ego has fused
-the witness's message it keeps what it learnt, though not its certainty: it goes on asking. Decisions before
-the last leave time to mend them; the last one decides.
+The story of an episode. A danger comes from one of three approaches, and the ego cannot see it. The
+ego guesses, and in some episodes guesses wrong; whoever sees the approach, the witness, knows,
+except in the episodes that nobody reads rightly. Helper h watches approach h; the nearest helper
+watches the likeliest one, and helpers past the third watch nothing new. The other helpers share the
+ego's guess. Once the ego has fused the witness's message it keeps what it learnt, though not its
+certainty: it goes on asking. Decisions before the last leave time to mend them; the last one
+decides.
 
 The intents go through trigger, channel, consensus and scoring like any model's.
 
-What decides success is drawn stratified. Every seed has each kind of episode, by where the danger comes from
-and who reads it rightly, in its share to within one, and each link's luck is spread evenly over each kind.
+What decides success is drawn stratified. Every seed has each kind of episode, by where the danger
+comes from and who reads it rightly, in its share to within one, and each link's luck is spread
+evenly over each kind.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,7 +39,8 @@ CUT = 2.45  # standard deviations either side; .70 to .946 nats for the ego
 STEPS = 6  # decisions an episode: 18 messages are three replies each
 CHUNK = 2000  # episodes that are played together
 
-# Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it best.
+# Declared geometry, metres. The witness stands beside the conflict, so that Equation 2 hears it
+# best.
 EGO_M, WITNESS_M, OTHERS_M = 25.0, 6.0, 20.0
 FIRST_RANGE_M, RANGE_STEP_M = 15.0, 10.0
 PAYLOAD_BITS = 800.0  # declared: an intent, a position and a few words
@@ -62,7 +66,8 @@ class Parameters:
     inference_s: float = 0.145  # seconds of one inference
 
 
-# Every number that was chosen with rows of the paper (`paper_numbers.csv`) in sight, and those rows.
+# Every number that was chosen with rows of the paper (`paper_numbers.csv`) in sight, and those
+# rows.
 FITTED_ON: Mapping[str, tuple[str, ...]] = {
     "left_share": ("B2", "B6"),
     "right_share": ("B3",),
@@ -76,7 +81,8 @@ FITTED_ON: Mapping[str, tuple[str, ...]] = {
     "inference_s": ("A2",),
     "CUT (harness/extensions/paper/calibrated.py)": ("B20",),  # no decision is above .95 nats
     "STEPS (harness/extensions/paper/calibrated.py)": ("A8", "A9"),
-    "WITNESS_M, EGO_M, OTHERS_M (harness/extensions/paper/calibrated.py)": ("B9",),  # the witness decides
+    # the witness decides
+    "WITNESS_M, EGO_M, OTHERS_M (harness/extensions/paper/calibrated.py)": ("B9",),
     "6g jitter (harness/radio/profiles.py)": ("A6",),
     "density-coupled loss (harness/radio/constant.py)": ("B6", "B7", "B8"),
 }
@@ -96,14 +102,21 @@ class _Drawn:
         """Return the rows of one step."""
         at = np.arange(number, len(self.right), STEPS)
         return _Drawn(
-            self.right[at], self.intents.take(at), self.knowing[at], self.witness[at], self.draws.take(at)
+            self.right[at],
+            self.intents.take(at),
+            self.knowing[at],
+            self.witness[at],
+            self.draws.take(at),
         )
 
     def nearest(self, helpers: int) -> "_Drawn":
         """Return the same with only the first helpers, whose draws no other moves."""
         draws = Draws(self.draws.link[:, :helpers], self.draws.jitter[:, :helpers])
         return replace(
-            self, intents=self.intents.of_first(helpers), witness=self.witness[:, :helpers], draws=draws
+            self,
+            intents=self.intents.of_first(helpers),
+            witness=self.witness[:, :helpers],
+            draws=draws,
         )
 
 
@@ -114,19 +127,24 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
         return np.concatenate([attrgetter(name)(part) for part in parts])
 
     return _Drawn(
-        joint("right"), Intents.joined([part.intents for part in parts]), joint("knowing"), joint("witness"),
+        joint("right"),
+        Intents.joined([part.intents for part in parts]),
+        joint("knowing"),
+        joint("witness"),
         Draws(joint("draws.link"), joint("draws.jitter")),
-    )  # fmt: skip
+    )
 
 
 class CalibratedWorld:
     """Episodes whose decision points are drawn: each step's, for all episodes at once.
 
-    An ego that has fused the witness's message knows from its next decision on. The last decision decides.
+    An ego that has fused the witness's message knows from its next decision on.
+    The last decision decides.
     """
 
     def __init__(self, steps: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
-        self._steps = steps  # of all seeds, one below the other, with as many episodes each as `numbers`
+        # of all seeds, one below the other, with as many episodes each as `numbers`
+        self._steps = steps
         self._seed, self._episode = np.repeat(seeds, len(numbers)), np.tile(numbers, len(seeds))
         self._step = -1
         self._knows = np.zeros(len(self._seed), dtype=bool)
@@ -156,7 +174,9 @@ class CalibratedWorld:
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
-        """Return None: the study's vehicles are nowhere in particular, see nothing and claim nothing."""
+        """Return None: the study's vehicles are nowhere in particular,
+        see nothing and claim nothing.
+        """
 
     site = claims = plans = listed = outlook
 
@@ -181,20 +201,24 @@ class Calibrated:
     def __init__(self, episodes: int, parameters: Parameters | None = None) -> None:
         self.parameters = parameters or Parameters()
         self.episodes = episodes
-        self._of_seeds = lru_cache(maxsize=2)(self._drawn)  # all points of a panel have the same draws
+        # all points of a panel have the same draws
+        self._of_seeds = lru_cache(maxsize=2)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
         """Return what a reader needs to know of where the intents come from."""
         rows = sorted({row for rows in FITTED_ON.values() for row in rows})
         return {
             "proxy_model_version": VERSION,
-            "calibration_label": f"fitted on rows {', '.join(rows)} of the paper; all others are predictions",
+            "calibration_label": f"fitted on rows {', '.join(rows)} of the "
+            "paper; all others are predictions",
             "parameters": asdict(self.parameters),
             "fitted_on": {name: list(rows) for name, rows in FITTED_ON.items()},
             "episodes_per_seed": self.episodes,
         }
 
-    def walked(self, settings: Sequence[Setting], seeds: Sequence[int]) -> Iterator[Iterable[WalkResult]]:
+    def walked(
+        self, settings: Sequence[Setting], seeds: Sequence[int]
+    ) -> Iterator[Iterable[WalkResult]]:
         """Return episodes of every seed, `CHUNK` at a time, which bounds memory."""
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
@@ -222,7 +246,9 @@ class Calibrated:
         return [drawn.step(number) for number in range(STEPS)]
 
     def _draw(self, seed: int, helpers: int, first: int) -> _Drawn:
-        """A helper's draws do not depend on how many there are, nor an episode's on the operating point."""
+        """A helper's draws do not depend on how many there are,
+        nor an episode's on the operating point.
+        """
         p, e = self.parameters, min(CHUNK, self.episodes - first)
         n = e * STEPS
         base = noise.generator("calibrated", seed, first)
@@ -238,7 +264,11 @@ class Calibrated:
         guess = np.where(reader == 0, right, wrong)
         know = np.where(reader <= 1, right, wrong)
 
-        link, jitter, unsure = np.empty((n, helpers, 2)), np.empty((n, helpers)), np.empty((n, helpers))
+        link, jitter, unsure = (
+            np.empty((n, helpers, 2)),
+            np.empty((n, helpers)),
+            np.empty((n, helpers)),
+        )
         for h in range(helpers):
             own = noise.generator("calibrated", seed, first, h)
             crossings = np.stack([stratified(own, kind), stratified(own, kind)], axis=1)
@@ -249,21 +279,29 @@ class Calibrated:
         guessed, knew = (np.repeat(top, STEPS) for top in (guess, know))
         top = np.where(witness, knew[:, None], guessed[:, None])
         intents = Intents(
-            own=peaked(ego_nats, guessed), helpers=peaked(nats, top), valid=np.ones((n, helpers), dtype=bool),
+            own=peaked(ego_nats, guessed),
+            helpers=peaked(nats, top),
+            valid=np.ones((n, helpers), dtype=bool),
             distance_m=np.insert(np.where(witness, WITNESS_M, OTHERS_M), 0, EGO_M, axis=1),
-            range_m=np.broadcast_to(FIRST_RANGE_M + RANGE_STEP_M * np.arange(helpers), (n, helpers)),
+            range_m=np.broadcast_to(
+                FIRST_RANGE_M + RANGE_STEP_M * np.arange(helpers), (n, helpers)
+            ),
             payload_bits=np.full((n, helpers), PAYLOAD_BITS),
             inference_s=np.full((n, 1 + helpers), p.inference_s),
-        )  # fmt: skip
-        return _Drawn(np.repeat(right, STEPS), intents, peaked(ego_nats, knew), witness, Draws(link, jitter))
+        )
+        return _Drawn(
+            np.repeat(right, STEPS), intents, peaked(ego_nats, knew), witness, Draws(link, jitter)
+        )
 
 
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
-    """Return uniform draws for rows of kinds, both (n,): of the k rows of a kind one in each k-th of [0, 1).
+    """Return uniform draws for rows of kinds, both (n,):
+    of the k rows of a kind one in each k-th of [0, 1).
 
     One such column a dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
     """
-    order = np.lexsort((generator.random(len(kinds)), kinds))  # a kind's rows together, in random order
+    # a kind's rows together, in random order
+    order = np.lexsort((generator.random(len(kinds)), kinds))
     _, first, count = np.unique(kinds[order], return_index=True, return_counts=True)
     place = np.arange(len(kinds)) - np.repeat(first, count)
     drawn = np.empty(len(kinds))
@@ -275,7 +313,9 @@ def peaked(nats: Floats, top: Ints) -> Floats:
     """Return intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
     entropies, shares = _by_entropy()
     most = np.interp(nats, entropies, shares)[..., None]
-    return np.where(np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1))
+    return np.where(
+        np.asarray(top)[..., None] == np.arange(ACTIONS), most, (1 - most) / (ACTIONS - 1)
+    )
 
 
 @lru_cache(maxsize=1)
@@ -293,4 +333,5 @@ def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
     return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))
 
 
-SWEPT = Calibrated(300)  # beside runs in a sweep; a seed has as many episodes as in the paper's sweeps
+# beside runs in a sweep; a seed has as many episodes as in the paper's sweeps
+SWEPT = Calibrated(300)

@@ -1,7 +1,7 @@
 """`harness study closed-loop`: the paper's panels where a car can crash, driven by any model.
 
-All grid points are conditions of one live run. Their episodes share worlds for as long as they go the same
-way (docs/decisions/0014), so a grid costs far less than its points one by one.
+All grid points are conditions of one live run. Their episodes share worlds for as long as they go
+the same way (docs/decisions/0014), so a grid costs far less than its points one by one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +34,9 @@ RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
-    """Return the paper's panels as conditions named by what they change; size has density-coupled loss."""
+    """Return the paper's panels as conditions named by what they change;
+    size has density-coupled loss.
+    """
     losses = density_coupled_loss(np.arange(1, VEHICLES + 1))
     changes = (
         *(("size", n, n, f"max_helpers={n - 1},loss={loss:g}") for n, loss in enumerate(losses, 1)),
@@ -51,10 +53,11 @@ def panels() -> dict[str, list[Setting]]:
 def run_closed_loop(
     spec: Spec, out: Path, workers: Workers, progress: Callable[[int], None], cache: Path | None
 ) -> Study:
-    """Drive all grid points. A study that was stopped in `out` continues; `run/` there has the live run.
+    """Drive all grid points. A study that was stopped in `out` continues;
+    `run/` there has the live run.
 
-    The evaluation's conditions are those of `panels`. `progress` is called with the number of layouts just
-    driven under all of them.
+    The evaluation's conditions are those of `panels`.
+    `progress` is called with the number of layouts just driven under all of them.
     """
     if (out / RUN / "run.json").is_file():
         done = finished(spec, out / RUN)
@@ -67,17 +70,22 @@ def run_closed_loop(
     shown = tables(summary)
     m, world = done.manifest, cast(ClosedLoop, done.manifest.world)
     return Study(
-        "closed-loop", f"The paper's panels, driven: {m.variant} · {world.title}",
+        "closed-loop",
+        f"The paper's panels, driven: {m.variant} · {world.title}",
         [f"{table.title}: {in_a_sentence(table)}." for table in shown],
         [
             f"Every grid point was driven in closed loop on the layouts of {world.title}; n = "
-            f"{crossed(world.episodes, len(m.seeds))} (channel seeds {', '.join(map(str, m.seeds))}), and "
+            f"{crossed(world.episodes, len(m.seeds))} (channel seeds "
+            f"{', '.join(map(str, m.seeds))}), and "
             "95 % intervals are over episodes. "
             "conditions.csv has all figures with their n, and run/ the driven episodes."
         ],
-        shown, {"conditions": summary}, {"run": RUN, "panels": described(grids), "versions": m.versions},
-        summary, lambda: _figures(core, sweeps),
-    )  # fmt: skip
+        shown,
+        {"conditions": summary},
+        {"run": RUN, "panels": described(grids), "versions": m.versions},
+        summary,
+        lambda: _figures(core, sweeps),
+    )
 
 
 def _figures(core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]") -> "dict[str, Figure]":
@@ -96,11 +104,23 @@ def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.Dat
     for score in done.scores:
         if score.metric in SHOWN or score.metric.startswith(("latency_p", "collision")):
             by_point.setdefault(score.condition, []).append(score)
-    return pd.DataFrame([
-        {
-            "source": source, "panel": panel, "condition": s.condition, "variable": s.variable,
-            "value": s.value, "metric": r.metric, "mean": r.value, "ci_low": r.low, "ci_high": r.high,
-            "n": r.n, "interval": r.interval,
-        }
-        for panel, settings in grids.items() for s in settings for r in by_point[s.point.name]
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {
+                "source": source,
+                "panel": panel,
+                "condition": s.condition,
+                "variable": s.variable,
+                "value": s.value,
+                "metric": r.metric,
+                "mean": r.value,
+                "ci_low": r.low,
+                "ci_high": r.high,
+                "n": r.n,
+                "interval": r.interval,
+            }
+            for panel, settings in grids.items()
+            for s in settings
+            for r in by_point[s.point.name]
+        ]
+    )

@@ -18,7 +18,9 @@ MOST_EPISODES = 1_000_000
 def paper(
     out: Path = typer.Option(Path("reports/paper"), help="Folder to write."),
     episodes: int = typer.Option(1500, help="Episodes per seed to compare the operating points."),
-    sweep_episodes: int = typer.Option(300, help="Episodes per seed at each grid point of a sweep."),
+    sweep_episodes: int = typer.Option(
+        300, help="Episodes per seed at each grid point of a sweep."
+    ),
     seeds: str = typer.Option(
         "0:5", help="Seeds of the episodes and the channel: 0:5 means 0 to 4; 3,7,9 is a list."
     ),
@@ -40,7 +42,9 @@ def paper(
     settings = panels(episodes, sweep_episodes)
     sizes = {panel.name: panel.episodes for panel in settings}
     refuse_other(out, "study", {"seeds": list(draws), "episodes_per_seed": sizes})
-    with bar("grid points", sum(len(panel.settings) for panel in settings), as_json or quiet) as progress:
+    with bar(
+        "grid points", sum(len(panel.settings) for panel in settings), as_json or quiet
+    ) as progress:
         study = run_paper(settings, draws, progress)
     finish(study, out, as_json, quiet)
 

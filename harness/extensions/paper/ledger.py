@@ -1,4 +1,6 @@
-"""Every number of the paper beside ours: how far off, whether fitted, and what had to be assumed."""
+"""Every number of the paper beside ours:
+how far off, whether fitted, and what had to be assumed.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -28,7 +30,8 @@ ASSUMED = {
     "core": "5 seeds x 1 500 episodes; the paper may mean 1 500 in all",
     "size": "N counts the ego; N = 5 to 7 are not in the paper; loss follows 0.6 + 3 (N - 2) %",
     "loss": "one crossing's; request and reply both cross",
-    "tau": "entropies in nats over three actions; grid 0.3 to 1.05 in steps of 0.05, the paper states none",
+    "tau": "entropies in nats over three actions; grid 0.3 to 1.05 in steps of 0.05, the paper "
+    "states none",
     "A4": "the paper's window is 200 ms and its mean 218.9 ms: counted to the end of the exchange",
     "A6": "no roadside edge: the paper calls it optional",
 }
@@ -37,11 +40,12 @@ ASSUMED = {
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     """Return a row for each number of the paper.
 
-    Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`,
-    `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's range), `allowed`, `verdict`,
-    `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points,
-    ours is one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it is
-    not but the interval reaches what is, `misses` where it does not, or `cited`.
+    Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`,
+    `paper_high`, `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's
+    range), `allowed`, `verdict`, `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the
+    paper gives a range over grid points, ours is one row a grid point. A verdict is `within` where
+    the difference is allowed, `unclear` where it is not but the interval reaches what is, `misses`
+    where it does not, or `cited`.
     """
     import pandas as pd
 
@@ -62,13 +66,20 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
         for ours in _ours(summary, row, metric):
             mean, ci_low, ci_high = (float(ours[k]) * scale for k in ("mean", "ci_low", "ci_high"))
             difference = mean - min(max(mean, low), high)
-            rows.append({
-                **place, "value": "" if ours["value"] is None else ours["value"],
-                "ours": mean, "ci_low": ci_low, "ci_high": ci_high, "difference": difference,
-                "allowed": allowed,
-                "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
-                "kind": "fitted" if row["id"] in fitted else "predicted", "assumed": assumed,
-            })  # fmt: skip
+            rows.append(
+                {
+                    **place,
+                    "value": "" if ours["value"] is None else ours["value"],
+                    "ours": mean,
+                    "ci_low": ci_low,
+                    "ci_high": ci_high,
+                    "difference": difference,
+                    "allowed": allowed,
+                    "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
+                    "kind": "fitted" if row["id"] in fitted else "predicted",
+                    "assumed": assumed,
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -76,7 +87,8 @@ def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: floa
     """Return the verdict on a mean with its interval, where `least` to `most` is allowed."""
     if least <= mean <= most:
         return "within"
-    return "misses" if ci_low > most or ci_high < least else "unclear"  # also where no interval is known
+    # also where no interval is known
+    return "misses" if ci_low > most or ci_high < least else "unclear"
 
 
 def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
@@ -98,7 +110,8 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the paper's values for figures, a row a grid point, with our names of condition and metric.
+    """Return the paper's values for figures, a row a grid point,
+    with our names of condition and metric.
 
     `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
     """
@@ -129,14 +142,18 @@ def headline(ledger: "pd.DataFrame") -> list[str]:
     """Say how many numbers of the paper are met, and which are not."""
     counts = tally(ledger)
     sentences = [
-        f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss it, "
+        f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss "
+        "it, "
         f"{counts['unclear']} unclear (the interval reaches the aim); {counts['predicted']} of the "
-        f"{counts['total']} are predictions: no parameter of the proxy was chosen on them, as on the "
+        f"{counts['total']} are predictions: no parameter of the proxy was chosen on them, as on "
+        "the "
         "others (*)."
     ]
     for verdict, title in (("misses", "Missed"), ("unclear", "Unclear")):
         rows = ledger[ledger.verdict == verdict].to_dict("records")
-        if named := "; ".join(f"{row['id']}, {_what(row)}: {row['difference']:+z.1f}" for row in rows):
+        if named := "; ".join(
+            f"{row['id']}, {_what(row)}: {row['difference']:+z.1f}" for row in rows
+        ):
             sentences.append(f"{title}: {named}.")
     return sentences
 
@@ -152,12 +169,17 @@ def tables(ledger: "pd.DataFrame") -> list[Table]:
             continue
         off = f"{row['difference']:+z.1f}"
         missed = row["verdict"] in ("misses", "unclear")
-        played.append((
-            f"{row['id']}{'*' * (row['kind'] == 'fitted')} {_what(row)}", paper,
-            PLAIN.interval(row["ours"], row["ci_low"], row["ci_high"]),
-            strong(f"{off} {row['verdict']}") if missed else off, f"{row['allowed']:.1f}", row["kind"],
-            row["assumed"],
-        ))  # fmt: skip
+        played.append(
+            (
+                f"{row['id']}{'*' * (row['kind'] == 'fitted')} {_what(row)}",
+                paper,
+                PLAIN.interval(row["ours"], row["ci_low"], row["ci_high"]),
+                strong(f"{off} {row['verdict']}") if missed else off,
+                f"{row['allowed']:.1f}",
+                row["kind"],
+                row["assumed"],
+            )
+        )
     heads = ("row", "paper", "ours [95 % CI]", "off by", "aim", "kind", "assumed")
     return [
         Table("Ledger", heads, played, terminal=range(4)),
@@ -168,4 +190,6 @@ def tables(ledger: "pd.DataFrame") -> list[Table]:
 def _what(row: Mapping[Any, Any]) -> str:
     value = f" {row['value']:g}" if isinstance(row["value"], float) else ""
     unit = UNITS.get(row["unit"], f", {row['unit']}")
-    return " ".join(filter(None, (row["condition"], f"{row['variable']}{value}", f"{row['metric']}{unit}")))
+    return " ".join(
+        filter(None, (row["condition"], f"{row['variable']}{value}", f"{row['metric']}{unit}"))
+    )

@@ -1,4 +1,6 @@
-"""`harness study paper`: operating points, swarm size, packet loss and entropy threshold, by the proxy."""
+"""`harness study paper`: operating points, swarm size, packet loss and entropy threshold,
+by the proxy.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,13 +51,20 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     weights = tuple(Setting("6g", nearest.at(six, v), VEHICLES, WEIGHTS, v) for v in (1.0, EQUAL_M))
     return [
         Panel(CORE, tuple(Setting(name, point, VEHICLES) for name, point in points.items()), core),
-        *(Panel(name, tuple(settings), sweep) for name, settings in {"size": sizes, **along}.items()),
+        *(
+            Panel(name, tuple(settings), sweep)
+            for name, settings in {"size": sizes, **along}.items()
+        ),
         Panel(WEIGHTS, weights, core),
     ]
 
 
-def run_paper(panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]) -> Study:
-    """Play the paper's panels with the calibrated proxy, and hold them against the paper's numbers."""
+def run_paper(
+    panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]
+) -> Study:
+    """Play the paper's panels with the calibrated proxy,
+    and hold them against the paper's numbers.
+    """
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
     whole, (core, *sweeps, weights) = joined(results), (result.summary for result in results)
@@ -63,36 +72,56 @@ def run_paper(panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[
     theirs, proxy = marks(numbers), next(iter(sources.values())).manifest()
     episodes = {p.name: p.episodes for p in panels}
     return Study(
-        "study", "The paper's study, from one causal simulator", headline(numbers),
+        "study",
+        "The paper's study, from one causal simulator",
+        headline(numbers),
         [
-            f"Intents of a calibrated proxy (version {proxy['proxy_model_version']}) go through the same "
+            f"Intents of a calibrated proxy (version {proxy['proxy_model_version']}) go through "
+            "the same "
             "trigger, channel, consensus and scoring as a language model's. It was "
-            f"{proxy['calibration_label']}. No condition has a success probability of its own to draw "
-            "from, and no parameter depends on a panel or a grid point. So the study shows that one "
-            "mechanism explains the numbers. It is no evidence that a language model would give them.",
+            f"{proxy['calibration_label']}. No condition has a success probability of its own to "
+            "draw "
+            "from, and no parameter depends on a panel or a grid point. So the study shows that "
+            "one "
+            "mechanism explains the numbers. It is no evidence that a language model would give "
+            "them.",
             f"95 % intervals are over {len(seeds)} seed means of {episodes[CORE]} episodes each, "
-            f"{episodes['size']} at a grid point of figure B, whose points share their random draws. Draws "
-            "are stratified, so an interval shows how far other seeds of this proxy would move a mean; "
+            f"{episodes['size']} at a grid point of figure B, whose points share their random "
+            "draws. Draws "
+            "are stratified, so an interval shows how far other seeds of this proxy would move a "
+            "mean; "
             "plain draws, like the paper's, scatter more.",
             equation_2(weights),
-            "Crosses and bars in the figures are the paper's values and ranges, and shaded is the band "
-            "that it calls best. The cloud's latency is the paper's figure: nothing here simulates a "
+            "Crosses and bars in the figures are the paper's values and ranges, and shaded is the "
+            "band "
+            "that it calls best. The cloud's latency is the paper's figure: nothing here simulates "
+            "a "
             "cloud.",
         ],
-        [*tables(numbers), Table(
-            "What was fitted", ("parameter", "value", "rows of the paper"),
-            [
-                (name, str(proxy["parameters"].get(name, "")), ", ".join(rows))
-                for name, rows in proxy["fitted_on"].items()
-            ], "Every parameter that was chosen on rows of the paper.",
-        )],
+        [
+            *tables(numbers),
+            Table(
+                "What was fitted",
+                ("parameter", "value", "rows of the paper"),
+                [
+                    (name, str(proxy["parameters"].get(name, "")), ", ".join(rows))
+                    for name, rows in proxy["fitted_on"].items()
+                ],
+                "Every parameter that was chosen on rows of the paper.",
+            ),
+        ],
         {"conditions": whole.summary, "episodes": whole.episodes, "ledger": numbers},
         {
-            "study": "paper", "seeds": list(seeds), "episodes_per_seed": episodes, "source": proxy,
-            "panels": described({p.name: p.settings for p in panels}), "versions": versions(),
+            "study": "paper",
+            "seeds": list(seeds),
+            "episodes_per_seed": episodes,
+            "source": proxy,
+            "panels": described({p.name: p.settings for p in panels}),
+            "versions": versions(),
         },
-        numbers, lambda: _figures(core, sweeps, theirs),
-    )  # fmt: skip
+        numbers,
+        lambda: _figures(core, sweeps, theirs),
+    )
 
 
 def _figures(
@@ -105,13 +134,18 @@ def _figures(
 
 
 def equation_2(weights: "pd.DataFrame") -> str:
-    """Say what the weights by distance do in the calibrated proxy, from the summary of their panel."""
+    """Say what the weights by distance do in the calibrated proxy,
+    from the summary of their panel.
+    """
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it, without = (
         percent(success.loc[metres], "mean", "ci_low", "ci_high") for metres in (1.0, EQUAL_M)
     )
     return (
-        f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, and in "
-        f"{without} % with equal ones. The distances are declared so that the witness decides: this is no "
-        f"evidence for the equation. For a run: harness study sweep RUN --over {WEIGHTS} --grid 1,{EQUAL_M:g}"
+        f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, "
+        "and in "
+        f"{without} % with equal ones. The distances are declared so that the witness decides: "
+        "this is no "
+        f"evidence for the equation. For a run: harness study sweep RUN --over {WEIGHTS} --grid "
+        f"1,{EQUAL_M:g}"
     )

@@ -1,4 +1,6 @@
-"""Ask beyond one run: every pair of agents, twins of questions, what moved answers, frozen against driven."""
+"""Ask beyond one run: every pair of agents, twins of questions, what moved answers,
+frozen against driven.
+"""
 
 from harness.core.extensions import Extension
 

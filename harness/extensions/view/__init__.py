@@ -1,4 +1,6 @@
-"""Runs of a folder: in a browser on this machine, with notes on decision points, as a site, and by date."""
+"""Runs of a folder: in a browser on this machine, with notes on decision points, as a site,
+and by date.
+"""
 
 from harness.core.extensions import Extension
 

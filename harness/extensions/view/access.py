@@ -1,9 +1,10 @@
 """Who may read the pages: only who has the token that `harness view` printed, and no other site.
 
-A machine may have several users, and each can reach its loopback interface; so can every page in a browser.
-The address that is printed holds the token; its answer is a cookie, and the address without it. Requests that
-another site causes are refused, except that a link may open a page in a tab, where that site cannot read it.
-(A run's own page is such a site, since it lies in a sandbox, and has links to others.)
+A machine may have several users, and each can reach its loopback interface; so can every page in a
+browser. The address that is printed holds the token; its answer is a cookie, and the address
+without it. Requests that another site causes are refused, except that a link may open a page in a
+tab, where that site cannot read it. (A run's own page is such a site, since it lies in a sandbox,
+and has links to others.)
 """
 
 from secrets import compare_digest
@@ -40,7 +41,8 @@ class Access:
         if (given := request.query_params.get(TOKEN)) is not None and self._is(given):
             # With its host, since a path that begins with // would lead to another.
             answer = RedirectResponse(str(request.url.remove_query_params(TOKEN)), 303)
-            # Not `strict`: a page in a sandbox is another site, and the link back to the list is in it.
+            # Not `strict`: a page in a sandbox is another site, and the link back to the list is in
+            # it.
             answer.set_cookie(name, self._token, httponly=True, samesite="lax")
             return answer
         if given is None and self._is(request.cookies.get(name, "")):
@@ -53,7 +55,10 @@ class Access:
 
 def _of_another_site(request: Request) -> bool:
     headers = request.headers
-    opens_tab = (headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest")) == ("navigate", "document")
+    opens_tab = (headers.get("sec-fetch-mode"), headers.get("sec-fetch-dest")) == (
+        "navigate",
+        "document",
+    )
     caused_by = headers.get("sec-fetch-site", "none")  # browsers say so; other programs do not
     origin = headers.get("origin")
     return (caused_by not in ("none", "same-origin") and not opens_tab) or (

@@ -1,17 +1,19 @@
 """The pages of `harness view`: what each address answers, and what it may not.
 
-Nobody who sends a request can name a file. A run is looked up in the listing of the folder, a picture among
-the files of its study; both are compared as text, so `..`, absolute and encoded paths name nothing. What is
-then opened must lie in the folder itself (`folder.py`). What a run says it was made of, its
-prompt and its dataset, is read as by `harness report`: shown only if it has the digest that the run noted.
+Nobody who sends a request can name a file. A run is looked up in the listing of the folder, a
+picture among the files of its study; both are compared as text, so `..`, absolute and encoded paths
+name nothing. What is then opened must lie in the folder itself (`folder.py`). What a run says it
+was made of, its prompt and its dataset, is read as by `harness report`: shown only if it has the
+digest that the run noted.
 
-Nobody without the token gets anything (`access.py`), and other sites get nothing: names other than this
-machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or, but for a note,
-posted to. The list runs no script but, while a run goes on, one of its own that asks how far that is. A run's
-page is as untrusted as the run's author, so pages are kept apart from the list and from each other: `sandbox`
-gives them an origin of their own, from which they can read nothing here, and they may load nothing. Their
-inline scripts may run as far as their own policy lets them, and save files if they are clicked. Browsers show
-no page that is both in a sandbox and `same-origin` with its opener, so these are not.
+Nobody without the token gets anything (`access.py`), and other sites get nothing: names other than
+this machine's are refused, which ends DNS rebinding, and no page may be framed, embedded or, but
+for a note, posted to. The list runs no script but, while a run goes on, one of its own that asks
+how far that is. A run's page is as untrusted as the run's author, so pages are kept apart from the
+list and from each other: `sandbox` gives them an origin of their own, from which they can read
+nothing here, and they may load nothing. Their inline scripts may run as far as their own policy
+lets them, and save files if they are clicked. Browsers show no page that is both in a sandbox and
+`same-origin` with its opener, so these are not.
 """
 
 import asyncio
@@ -61,7 +63,8 @@ OF_LIST = {
     f"script-src 'sha256-{digest(pages.script())}'; connect-src 'self'",
 }
 OF_RUNS = {  # in the place of those above, for what a run's folder holds
-    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "Content-Security-Policy": "default-src 'none'; script-src "
+    "'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
     "sandbox allow-scripts allow-downloads",
     "Cross-Origin-Opener-Policy": "unsafe-none",
@@ -72,10 +75,15 @@ def app(folder: Path, token: str) -> ASGIApp:
     """Return the application for one folder of runs, for who has the token."""
     view = View(folder)
     routes = {
-        "/": view.index, "/progress": view.progress, "/style.css": view.style, "/run": view.run,
-        "/picture": view.picture, "/compare": view.compare, "/report": view.report,
+        "/": view.index,
+        "/progress": view.progress,
+        "/style.css": view.style,
+        "/run": view.run,
+        "/picture": view.picture,
+        "/compare": view.compare,
+        "/report": view.report,
         "/notes": view.notes,
-    }  # fmt: skip
+    }
     return _Guarded(
         Starlette(
             routes=[
@@ -86,7 +94,11 @@ def app(folder: Path, token: str) -> ASGIApp:
                 Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
                 Middleware(Access, token=token),
             ],
-            exception_handlers={UserError: view.wrong, HTTPException: view.wrong, Exception: view.bug},
+            exception_handlers={
+                UserError: view.wrong,
+                HTTPException: view.wrong,
+                Exception: view.bug,
+            },
         )
     )
 
@@ -109,7 +121,9 @@ class _Guarded:
 
 
 class View:
-    """One folder of runs. What reads files runs in threads; pages that take seconds are made one by one."""
+    """One folder of runs. What reads files runs in threads;
+    pages that take seconds are made one by one.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -149,7 +163,9 @@ class View:
         links = [pages.to_notes(run.name, scene)]
         if written and scene is None:
             return await run_in_threadpool(_shown, written, links)
-        return await self._drawn(request, partial(pages.report, self._whole([run]), written, scene), links)
+        return await self._drawn(
+            request, partial(pages.report, self._whole([run]), written, scene), links
+        )
 
     async def notes(self, request: Request) -> Response:
         """Return the notes on a run, with a form for more."""
@@ -161,21 +177,29 @@ class View:
         return HTMLResponse(page, headers={"Referrer-Policy": "same-origin"})
 
     async def note(self, request: Request) -> Response:
-        """Write a note on a decision point of a run. `Access` refuses another origin; browsers state one."""
+        """Write a note on a decision point of a run. `Access` refuses another origin;
+        browsers state one.
+        """
         if "origin" not in request.headers:
-            raise HTTPException(403, "it is not said which site sends this; send it from a page of this list")
+            raise HTTPException(
+                403, "it is not said which site sends this; send it from a page of this list"
+            )
         sent = b""
         try:
             async with asyncio.timeout(SENT_S):
                 async for chunk in request.stream():
                     sent += chunk
                     if len(sent) > MOST_SENT:
-                        raise HTTPException(413, "this is longer than a note may be; shorten it", CLOSED)
+                        raise HTTPException(
+                            413, "this is longer than a note may be; shorten it", CLOSED
+                        )
         except TimeoutError:
             late = f"a note did not come within {SENT_S:g} s; send it again"
             raise HTTPException(408, late, CLOSED) from None
         except ClientDisconnect:
-            raise HTTPException(400, "the browser is gone, and nothing was written", CLOSED) from None
+            raise HTTPException(
+                400, "the browser is gone, and nothing was written", CLOSED
+            ) from None
         form = parse_qs(sent.decode("ascii", "replace"), keep_blank_values=True, errors="replace")
         keys = ("path", "scene", "text", "before")
         name, *note = (form.get(key, [""])[0] for key in keys)
@@ -188,11 +212,19 @@ class View:
     def picture(self, request: Request) -> Response:
         [run] = self._listed([request.query_params.get("path", "")])
         name = request.query_params.get("name", "")
-        file = own_file(self.folder, run.name, name) if name in pictures(self.folder, run.name) else None
+        file = (
+            own_file(self.folder, run.name, name)
+            if name in pictures(self.folder, run.name)
+            else None
+        )
         if file is None:
-            raise HTTPException(404, f"{printable(run.name)} has no picture {printable(name)}; see its page")
-        policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",
-                  "Cross-Origin-Opener-Policy": "unsafe-none"}  # fmt: skip
+            raise HTTPException(
+                404, f"{printable(run.name)} has no picture {printable(name)}; see its page"
+            )
+        policy = {
+            "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",
+            "Cross-Origin-Opener-Policy": "unsafe-none",
+        }
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:

@@ -39,7 +39,9 @@ def view(
         if open_browser:
             import webbrowser
 
-            Thread(target=webbrowser.open, args=[_leading_to(url, Path(private))], daemon=True).start()
+            Thread(
+                target=webbrowser.open, args=[_leading_to(url, Path(private))], daemon=True
+            ).start()
 
     in_range("--port", port, 0, 65535)
     listed = runs(folder)  # says what is wrong with the folder
@@ -71,7 +73,9 @@ def _leading_to(url: str, folder: Path) -> str:
     A browser is given its address as an argument, which every user of the machine can see.
     """
     page = folder / "open.html"
-    page.write_text(f'<!doctype html><title>Runs</title><meta http-equiv="refresh" content="0; url={url}">')
+    page.write_text(
+        f'<!doctype html><title>Runs</title><meta http-equiv="refresh" content="0; url={url}">'
+    )
     return page.as_uri()
 
 
@@ -120,7 +124,9 @@ def history(
             if score := line.score:
                 value, n = written(score), str(score.n)
             who = printable(line.run.manifest.variant, VARIANT)
-            typer.echo(f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}")
+            typer.echo(
+                f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}"
+            )
     for name, error in wrong.items():
         typer.echo()
         echo_wrong(name, error)
@@ -130,8 +136,15 @@ def history(
 
 def _mapping(line: "Line") -> dict[str, object]:
     variant, score = line.run.manifest.variant, line.score
-    numbers = {key: getattr(score, key, None) for key in ("value", "low", "high", "n", "n_excluded")}
+    numbers = {
+        key: getattr(score, key, None) for key in ("value", "low", "high", "n", "n_excluded")
+    }
     return {
-        "run": line.name, "date": line.date.isoformat(), "model": variant.model, "prompt": variant.prompt,
-        "answer": variant.answer, "tags": line.run.manifest.tags, **numbers,
-    }  # fmt: skip
+        "run": line.name,
+        "date": line.date.isoformat(),
+        "model": variant.model,
+        "prompt": variant.prompt,
+        "answer": variant.answer,
+        "tags": line.run.manifest.tags,
+        **numbers,
+    }

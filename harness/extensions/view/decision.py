@@ -11,7 +11,9 @@ from harness.report.runs import Runs
 
 
 def with_decision(page: str, runs: Runs, scene: str) -> str:
-    """Return the page of some runs with everything about one decision of theirs, prompts and pictures too."""
+    """Return the page of some runs with everything about one decision of theirs,
+    prompts and pictures too.
+    """
     detail = library.packed({scene: everything(runs, scene)})
     return page.replace(
         "<script>", f'<script type="application/gzip" id="opened">{detail}</script>\n<script>', 1
@@ -21,7 +23,9 @@ def with_decision(page: str, runs: Runs, scene: str) -> str:
 def everything(runs: Runs, name: str) -> dict[str, Any]:
     """Return what a full page has of one decision point. Raises UserError if no run has it."""
     if not any(name in run.decisions.scenes for run in runs.runs):
-        raise UserError(f"no run here has a decision {printable(name, 40)}; see the list on its page")
+        raise UserError(
+            f"no run here has a decision {printable(name, 40)}; see the list on its page"
+        )
     scenes = replayed(runs, [name]) if runs.live else {}
     without = [left_out(run) for run in runs.runs]
     details = Details(runs.of_scenes([name]), scenes, frozenset([name]), prompts_of, True, without)

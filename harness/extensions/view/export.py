@@ -24,23 +24,36 @@ from harness.runs.suite import SuiteRun
 
 INDEX, PAGE = "index.html", "report.html"
 HEADS = (
-    "run", "success", f"gain over {BASELINE}", "unsafe", "n", "condition", "model", "prompt", "scenes",
-    "kind", "began",
-)  # fmt: skip
+    "run",
+    "success",
+    f"gain over {BASELINE}",
+    "unsafe",
+    "n",
+    "condition",
+    "model",
+    "prompt",
+    "scenes",
+    "kind",
+    "began",
+)
 OF_STUDIES = ("study", "kind", "of", "written")
 NOTE = (
-    "Success, with its 95 % interval over episodes, is that of the run's best condition that no warning of "
-    "its page is about. The gain is paired by episode. Unsafe episodes end in a collision or off the road, "
-    "under the same condition. n is the number of episodes. The best of several conditions looks better "
+    "Success, with its 95 % interval over episodes, is that of the run's best condition that no "
+    "warning of "
+    "its page is about. The gain is paired by episode. Unsafe episodes end in a collision or off "
+    "the road, "
+    "under the same condition. n is the number of episodes. The best of several conditions looks "
+    "better "
     "than it is, and runs of other episodes are not to be compared by this table."
 )
 
 
 def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[str]:
-    """Write the pages of a folder's finished runs, suites and studies to a new folder, to be published.
+    """Write the pages of a folder's finished runs, suites and studies to a new folder,
+    to be published.
 
-    Every page of a run is drawn anew: what else lies in its folder is not published. A study's page is
-    published as it is, if it begins as one that may run no script.
+    Every page of a run is drawn anew: what else lies in its folder is not published. A study's page
+    is published as it is, if it begins as one that may run no script.
 
     Args:
         folder: what `harness view` lists.
@@ -79,7 +92,8 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
             if not (rows or studies):
                 why = f" ({left[0]})" if left else ""
                 raise UserError(
-                    f"{printable(folder)} has no run that can be shown{why}; make one with `harness eval`"
+                    f"{printable(folder)} has no run that can be shown{why}; make one with "
+                    "`harness eval`"
                 )
             of_runs = Table("Finished runs, the newest first", HEADS, rows, NOTE, left=True)
             of_studies = Table("Studies, the newest first", OF_STUDIES, studies, left=True)
@@ -112,7 +126,8 @@ def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun | None]:
 def _study(folder: Path, run: Listed) -> str:
     file = own_file(folder, run.name, INDEX)
     page = whole_text(file) if file else ""
-    # What stands there forbids scripts in all that follows, and only a `http-equiv` could lead elsewhere.
+    # What stands there forbids scripts in all that follows, and only a `http-equiv` could lead
+    # elsewhere.
     head = document([Section("")]).partition("<title>")[0]
     if not page.startswith(head) or "http-equiv" in page.removeprefix(head).casefold():
         raise UserError(f"a {run.kind} without a page that this version wrote; make it again")
@@ -131,7 +146,9 @@ def _row(run: Listed, done: Run | SuiteRun) -> tuple[str, ...]:
     best, _ = words.compared(done)
     lead = lead_of(done)
     n = sum(len(part.grid.episodes) for part in _parts(done).values())
-    figures = (words.cell(done.score(best, metric)) for metric in (lead, GAINS[lead], "unsafe_rate"))
+    figures = (
+        words.cell(done.score(best, metric)) for metric in (lead, GAINS[lead], "unsafe_rate")
+    )
     agents = run.model or "–", run.prompt or "–", done.source, run.kind
     where = linked(run.name, quote(f"{run.name}/{PAGE}"))
     return where, *figures, str(n), f"{best}, {IN_WORDS[lead]}", *agents, f"{run.date:%Y-%m-%d}"

@@ -1,4 +1,6 @@
-"""What may be read: regular files that lie in the folder, links followed, and in no hidden folder of it."""
+"""What may be read: regular files that lie in the folder, links followed,
+and in no hidden folder of it.
+"""
 
 import os
 import stat
@@ -15,10 +17,14 @@ MAYBE = (NOTES, DIFFICULTY)  # what it may have besides
 
 
 def own_file(root: Path, run: str, name: str) -> Path | None:
-    """A file of a listed run's folder by its real path; None if it has none, or that may not be read."""
+    """A file of a listed run's folder by its real path;
+    None if it has none, or that may not be read.
+    """
     base = os.path.realpath(root)
     file = Path(os.path.realpath(os.path.join(base, run, name)))
-    if not file.is_relative_to(base) or any(part.startswith(".") for part in file.relative_to(base).parts):
+    if not file.is_relative_to(base) or any(
+        part.startswith(".") for part in file.relative_to(base).parts
+    ):
         return None
     try:
         return file if stat.S_ISREG(file.stat().st_mode) else None
@@ -42,11 +48,16 @@ def whole(root: Path, run: str) -> Path:
 
 
 def pictures(root: Path, run: str) -> list[str]:
-    """Return the names of a listed study's pictures; of one in several formats the one that scales."""
+    """Return the names of a listed study's pictures;
+    of one in several formats the one that scales.
+    """
     names = sorted(os.listdir(root / run))
     scaled = {Path(name).stem for name in names if name.endswith(".svg")}
     return [
-        name for name in names
-        if Path(name).suffix in PICTURES and (name.endswith(".svg") or Path(name).stem not in scaled)
-        and name.isprintable() and own_file(root, run, name)
-    ]  # fmt: skip
+        name
+        for name in names
+        if Path(name).suffix in PICTURES
+        and (name.endswith(".svg") or Path(name).stem not in scaled)
+        and name.isprintable()
+        and own_file(root, run, name)
+    ]

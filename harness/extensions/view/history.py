@@ -1,4 +1,6 @@
-"""A metric over the runs of a folder, by date. Runs of the same scenes make a group; no others compare."""
+"""A metric over the runs of a folder, by date. Runs of the same scenes make a group;
+no others compare.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -34,17 +36,20 @@ class Group:
     """Runs of the same scenes."""
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
-    # of the values: the one that was asked for, or the last of those that most of the runs have; `all` of a
-    # metric that depends on none
+    # of the values: the one that was asked for, or the last of those that most of the runs have;
+    # `all` of a metric that depends on none
     condition: str
     metric: str  # of the values
     lines: tuple[Line, ...]  # by date, the oldest first
 
 
 def history(
-    folder: Path, metric: str | None, condition: str | None = None, dataset: str | None = None,
+    folder: Path,
+    metric: str | None,
+    condition: str | None = None,
+    dataset: str | None = None,
     wrong: Callable[[str, UserError], object] = lambda name, error: None,
-) -> list[Group]:  # fmt: skip
+) -> list[Group]:
     """Return the finished runs in a folder, the group whose last run is the newest first.
 
     Args:
@@ -52,7 +57,8 @@ def history(
         metric: a metric of `summary.csv`; None for the success that leads in a group.
         condition: of the values; None for the last of those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
-        wrong: called with the name of a run that is left out since a file of it is broken, and the error.
+        wrong: called with the name of a run that is left out since a file of it is broken,
+            and the error.
 
     Raises:
         UserError: there is no such folder, metric, condition or dataset.
@@ -79,7 +85,11 @@ def history(
     ):
         if name is not None and name not in known:
             raise unknown(f"{what} of these runs", name, known)
-    groups = [_group(of, metric, condition) for of in lines.values() if dataset in (None, _scenes(of[0].run))]
+    groups = [
+        _group(of, metric, condition)
+        for of in lines.values()
+        if dataset in (None, _scenes(of[0].run))
+    ]
     return sorted(groups, key=lambda group: group.lines[-1].date, reverse=True)
 
 
@@ -107,8 +117,10 @@ def write(groups: Sequence[Group], out: Path) -> None:
     """Write the page. Raises UserError if `out` cannot be written."""
     place, labels = beside(out), dict.fromkeys(entry(group.metric).label for group in groups)
     about = (
-        "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or answers that a "
-        "value is the mean of. Only runs in one table compare, since they have the same scenes; a run with "
+        "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or "
+        "answers that a "
+        "value is the mean of. Only runs in one table compare, since they have the same scenes; a "
+        "run with "
         "fewer episodes has other scenes."
     )
     tables = [_table(group, place) for group in groups]
@@ -124,8 +136,15 @@ def _table(group: Group, place: Place) -> Table:
     for line in group.lines:
         variant, score = line.run.manifest.variant, line.score
         drawn = (forest(score, *scale), str(score.n)) if score else ("", "")
-        rows.append((
-            linked(line.name, place(line.run)), f"{line.date:%Y-%m-%d %H:%M} UTC", variant.model,
-            variant.prompt, variant.answer, cell(score), *drawn,
-        ))  # fmt: skip
+        rows.append(
+            (
+                linked(line.name, place(line.run)),
+                f"{line.date:%Y-%m-%d %H:%M} UTC",
+                variant.model,
+                variant.prompt,
+                variant.answer,
+                cell(score),
+                *drawn,
+            )
+        )
     return Table(f"{group.of}, {group.condition}", heads, rows, left=True)

@@ -1,4 +1,6 @@
-"""What people noted on decision points of a run, in its folder: `notes.json`, which `harness view` writes."""
+"""What people noted on decision points of a run, in its folder:
+`notes.json`, which `harness view` writes.
+"""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -38,11 +40,14 @@ def notes(run: Path) -> list[Note]:
 
 def note_on(notes: Sequence[Note], scene: str) -> Note:
     """Return the note on a decision point; an empty one if it has none."""
-    return next((note for note in notes if note.scene == scene), Note(scene=scene, text="", date=""))
+    return next(
+        (note for note in notes if note.scene == scene), Note(scene=scene, text="", date="")
+    )
 
 
 def write(run: Path, scene: str, text: str, before: str) -> None:
-    """Note something on a decision point, in the place of what was noted there; an empty text deletes that.
+    """Note something on a decision point, in the place of what was noted there;
+    an empty text deletes that.
 
     Args:
         run: its folder.
@@ -50,20 +55,22 @@ def write(run: Path, scene: str, text: str, before: str) -> None:
         text: the note.
         before: the date of the note whose place it takes; empty if there is none.
 
-    Raises UserError if another note is there, it is too long, or the file is full, broken or cannot be
-    written.
+    Raises UserError if another note is there, it is too long, or the file is full,
+    broken or cannot be written.
     """
     every = notes(run)
     if note_on(every, scene).date != before:
         raise UserError(
-            f"{printable(scene)} has another note than this form began with; go back, copy your text, and "
+            f"{printable(scene)} has another note than this form began with; go back, copy your "
+            "text, and "
             "open the notes again"
         )
     kept = [note for note in every if note.scene != scene]
     text = "\n".join(text.split("\r\n")).strip()
     if len(text) > LONGEST or (text and len(kept) >= MOST):
         raise UserError(
-            f"a note has {LONGEST} characters at most, and a run {MOST} notes; shorten it, or delete some"
+            f"a note has {LONGEST} characters at most, and a run {MOST} notes; shorten it, or "
+            "delete some"
         )
     if text:
         date = datetime.now(UTC).isoformat(timespec="seconds")

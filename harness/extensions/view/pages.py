@@ -33,20 +33,25 @@ TEMPLATES = Path(__file__).parent / "templates"
 LISTED_OF_EACH = 10  # episodes and requests, in a comparison
 NEWEST = "-date"
 WAY_BACK = (  # a report's navigation begins at the top of its page and would lie over the link
-    '<style>.way-back + nav { margin-top: 0; }</style>\n<p class="way-back"><a href="/">← All runs</a></p>'
+    '<style>.way-back + nav { margin-top: 0; }</style>\n<p class="way-back"><a href="/">← All '
+    "runs</a></p>"
 )
 COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
 def report(folders: Sequence[Path], written: Path | None = None, scene: str | None = None) -> str:
-    """Return the report of one run or several, `written` or new, with all there is of a scene's decision."""
+    """Return the report of one run or several, `written` or new,
+    with all there is of a scene's decision.
+    """
     runs = gather(folders)
     page = render(runs) if written is None else whole_text(written)
     return page if scene is None else with_decision(page, runs, scene)
 
 
 def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = "/") -> str:
-    """Return a page of a run with links before all that it says itself: to the list, and more with texts."""
+    """Return a page of a run with links before all that it says itself:
+    to the list, and more with texts.
+    """
     more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
     way_back = WAY_BACK.replace('"/"', f'"{home}"').replace("</p>", f"{more}</p>")
     return page.replace("<body>", f"<body>\n{way_back}", 1)
@@ -63,7 +68,9 @@ def compared(folder: Path, a: Path, b: Path) -> str:
 
 
 def around(a: str, b: str) -> list[tuple[str, str]]:
-    """Return links of a comparison, each with its text: A and B swapped, and all answers of both."""
+    """Return links of a comparison, each with its text:
+    A and B swapped, and all answers of both.
+    """
     both = [("path", a), ("path", b)]
     differing = urlencode({"decisions": "", "differ": "answers"})
     return [
@@ -92,9 +99,11 @@ def _place(folder: Path, run: Run) -> str:
 
 
 def listed(folder: Path, words: str, order: str) -> str:
-    """The runs that have all of these words somewhere, sorted by a column; `-` before it turns it around.
+    """The runs that have all of these words somewhere, sorted by a column;
+    `-` before it turns it around.
 
-    While one of them is going, the page runs `script`, and is allowed it by the digest of that alone.
+    While one of them is going, the page runs `script`,
+    and is allowed it by the digest of that alone.
     """
     every = runs(folder)
     how_far = extents(folder, every)
@@ -104,10 +113,19 @@ def listed(folder: Path, words: str, order: str) -> str:
     links = {column: urlencode({"sort": _next(column, order), **asked}) for column in COLUMNS}
     going = any(run.name in how_far and how_far[run.name].going for run in shown)
     return _page(
-        "list.html.j2", folder=str(folder), every=len(every), runs=shown, words=words, order=order,
-        links=links, kinds=RUNS, unread=UNREAD, now=now(every, how_far),
-        going=going, script=Markup(script()),
-    )  # fmt: skip
+        "list.html.j2",
+        folder=str(folder),
+        every=len(every),
+        runs=shown,
+        words=words,
+        order=order,
+        links=links,
+        kinds=RUNS,
+        unread=UNREAD,
+        now=now(every, how_far),
+        going=going,
+        script=Markup(script()),
+    )
 
 
 def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
@@ -119,7 +137,8 @@ def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any
     """Return what changes in the list while runs go on.
 
     Returns:
-        `listed`, another text once a run begins or ends, `going`, whether one goes on, and `unfinished`, by
+        `listed`, another text once a run begins or ends, `going`,
+            whether one goes on, and `unfinished`, by
         the name that the list shows how far each is.
     """
     states = json.dumps([(run.name, run.state) for run in every])
@@ -127,7 +146,9 @@ def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any
         "listed": sha256_bytes(states.encode()),
         "going": any(extent.going for extent in how_far.values()),
         "unfinished": {
-            visible(run.name): progress(run, how_far[run.name]) for run in every if run.name in how_far
+            visible(run.name): progress(run, how_far[run.name])
+            for run in every
+            if run.name in how_far
         },
     }
 
@@ -165,7 +186,9 @@ def style() -> str:
 
 
 def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
-    """Return a link to the notes on a run, with its text; or to a new note on one decision point of it."""
+    """Return a link to the notes on a run, with its text;
+    or to a new note on one decision point of it.
+    """
     where = {"path": run}
     if scene is not None:
         where["scene"] = scene
@@ -180,13 +203,15 @@ def notes(path: Path, name: str, scene: str) -> str:
 
 
 def note(path: Path, scene: str, text: str, before: str) -> None:
-    """Write a note on a decision point of a run, in the place of the one that was written at `before`.
+    """Write a note on a decision point of a run,
+    in the place of the one that was written at `before`.
 
     Raises UserError if the run has no such point, or that another note.
     """
     if scene not in read_run(path).decisions.labels("scene"):
         raise UserError(
-            f"{printable(path.name)} has no decision point {printable(scene)!r}; copy one from its page"
+            f"{printable(path.name)} has no decision point {printable(scene)!r}; copy one from its "
+            "page"
         )
     run_notes.write(path, scene, text, before)
 
@@ -201,12 +226,23 @@ def _page(template: str, **values: Any) -> str:
 
 
 def _has(run: Listed, words: str) -> bool:
-    reason = (run.name, run.kind, run.state, run.model, run.prompt, run.answer, run.condition, *run.tags)
+    reason = (
+        run.name,
+        run.kind,
+        run.state,
+        run.model,
+        run.prompt,
+        run.answer,
+        run.condition,
+        *run.tags,
+    )
     text = " ".join(part for part in reason if part is not None).casefold()
     return all(word in text for word in words.casefold().split())
 
 
 def _next(column: str, order: str) -> str:
-    """Return what a click on a column's head asks for: numbers and dates begin with the greatest."""
+    """Return what a click on a column's head asks for:
+    numbers and dates begin with the greatest.
+    """
     first = f"-{column}" if column in ("success", "date") else column
     return (column if first.startswith("-") else f"-{column}") if order == first else first

@@ -21,4 +21,6 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
         UserError: the port is not available.
     """
     token = secrets.token_urlsafe()
-    web.serve(app(folder, token), web.LOOPBACK, port, lambda url: listening(f"{url}/?{TOKEN}={token}"))
+    web.serve(
+        app(folder, token), web.LOOPBACK, port, lambda url: listening(f"{url}/?{TOKEN}={token}")
+    )

@@ -15,12 +15,21 @@ from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.leading import lead_of
-from harness.runs.metrics import ADJUSTED, METRICS, ONE_OPTIMAL, SUCCESS, difference, entry, known_in
+from harness.runs.metrics import (
+    ADJUSTED,
+    METRICS,
+    ONE_OPTIMAL,
+    SUCCESS,
+    difference,
+    entry,
+    known_in,
+)
 from harness.runs.records import Answer
 from harness.runs.sources import prompt_of
 from harness.runs.success import Success
 
-LOST_BY = ("B", "A", None)  # in the order of the list: what B gave away comes first, then what A did
+# in the order of the list: what B gave away comes first, then what A did
+LOST_BY = ("B", "A", None)
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,8 @@ class DecisionFlip:
     seeds: tuple[int, ...]  # in which they do
     a: str  # action of A
     b: str  # action of B
-    lost_by: str | None  # the run whose action alone gave success away; None where neither, both or unknown
+    # the run whose action alone gave success away; None where neither, both or unknown
+    lost_by: str | None
 
 
 @dataclass(frozen=True)
@@ -40,9 +50,11 @@ class Difference:
     """One metric in one condition, in its own unit (shares from 0 to 1)."""
 
     metric: str  # its name
-    a: float  # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
+    # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
+    a: float
     b: float  # mean of B over the same
-    # B - A, paired by episode and seed, with a 95 % interval over episodes; of a percentile a bootstrap's
+    # B - A, paired by episode and seed, with a 95 % interval over episodes; of a percentile a
+    # bootstrap's
     change: Estimate
     p_value: float | None = None  # of no difference, by that interval; None where there is none
     # by Holm's method (Holm 1979) for the primary metrics in all conditions; None where exploratory
@@ -101,8 +113,8 @@ class AnswerChanged:
 class AnswersHeld:
     """The answers of both runs to the same questions, held against each other.
 
-    The same question is the same messages and the same picture. Under another prompt no question is the same,
-    and a fusion call is another question as soon as one message in it is another.
+    The same question is the same messages and the same picture. Under another prompt no question is
+    the same, and a fusion call is another question as soon as one message in it is another.
     """
 
     same: int  # how many questions were the same
@@ -120,12 +132,14 @@ class Comparison:
     """B against A."""
 
     pair: Pair  # the two runs
-    settings: tuple[tuple[str, str | None, str | None], ...]  # that differ: name, A's value, B's, or None
+    # that differ: name, A's value, B's, or None
+    settings: tuple[tuple[str, str | None, str | None], ...]
     conditions: tuple[InCondition, ...]  # what changed in each
     answers: tuple[AnswersFlipped, ...]  # which answers changed their verdict
     answers_in_both: dict[str, int]  # answers by role that both runs have
     held: AnswersHeld  # which answers to the same questions changed, in their text too
-    prompts: PromptChange | str | None  # what differs; None where nothing; a sentence why it is not known
+    # what differs; None where nothing; a sentence why it is not known
+    prompts: PromptChange | str | None
 
 
 def compare(pair: Pair) -> Comparison:
@@ -133,7 +147,9 @@ def compare(pair: Pair) -> Comparison:
     a, b = ({answer.id: answer for answer in side.run.answers} for side in (pair.a, pair.b))
     both = [request for request in a if request in b]
     conditions = [_in_condition(pair, name) for name in pair.conditions]
-    lost = {f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)}
+    lost = {
+        f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)
+    }
     both.sort(key=lambda request: lost.get(a[request].scene, len(LOST_BY)))
     flipped: dict[tuple[str, str, str], list[str]] = {}
     for request in both:
@@ -168,7 +184,9 @@ def _question(answer: Answer) -> tuple[str, str | None]:
 
 def _prompts(pair: Pair) -> PromptChange | str | None:
     """Return what differs between the egos' prompts, and between the first helpers'."""
-    a, b = ([side.run.manifest.agent(place)["prompt"] for place in (0, 1)] for side in (pair.a, pair.b))
+    a, b = (
+        [side.run.manifest.agent(place)["prompt"] for place in (0, 1)] for side in (pair.a, pair.b)
+    )
     if [prompt["sha256"] for prompt in a] == [prompt["sha256"] for prompt in b]:
         return None
     here = []
@@ -177,7 +195,8 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
         version = prompt_of(side.run, prompt)
         if version is None:
             return (
-                f"what differs between the prompts is not known: {name}'s {printable(prompt['version'], 40)} "
+                f"what differs between the prompts is not known: {name}'s "
+                f"{printable(prompt['version'], 40)} "
                 f"with sha256 {printable(prompt['sha256'], 13)} is not here"
             )
         here.append(version)
@@ -185,8 +204,12 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
 
 
 def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
-    """Correct the p-values of the primary metrics, as they count among each other in all conditions."""
-    p_values = [p for c in conditions for d in c.differences if d.primary and (p := d.p_value) is not None]
+    """Correct the p-values of the primary metrics,
+    as they count among each other in all conditions.
+    """
+    p_values = [
+        p for c in conditions for d in c.differences if d.primary and (p := d.p_value) is not None
+    ]
     corrected = iter(holm(p_values))
 
     def with_p(d: Difference) -> Difference:
@@ -198,9 +221,11 @@ def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
 def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
     a, b = pair.a.settings, pair.b.settings
     left_out = tuple(
-        f"condition.{name}." for side in (pair.a, pair.b) for name in side.run.conditions
+        f"condition.{name}."
+        for side in (pair.a, pair.b)
+        for name in side.run.conditions
         if name not in pair.conditions
-    )  # fmt: skip
+    )
     for name in {**a, **b}:
         # A description changes nothing, and the sample behind a time is no setting.
         if a.get(name) != b.get(name) and not name.startswith(
@@ -215,7 +240,9 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     names = {metric.percentile: metric.name for metric in METRICS.values()}
     before, after = (pair.latencies(side, condition) for side in (pair.a, pair.b))
     differences += [
-        Difference(names[percent], a, b, change, p_of_bootstrap(change.value, change.low, change.high))
+        Difference(
+            names[percent], a, b, change, p_of_bootstrap(change.value, change.low, change.high)
+        )
         for percent, a, b, change in percentiles.differences(before, after, len(pair.episodes))
     ]
     judged_a, judged_b = (pair.judged(side, condition) for side in (pair.a, pair.b))
@@ -292,9 +319,13 @@ def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
 
 
 def _decision_flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip, ...]]:
-    """Count the decisions of both runs in a condition; list the flips by `LOST_BY`, then by most seeds."""
+    """Count the decisions of both runs in a condition;
+    list the flips by `LOST_BY`, then by most seeds.
+    """
     names = sorted({*pair.a.run.decisions.scenes, *pair.b.run.decisions.scenes})
-    (keys_a, rows_a), (keys_b, rows_b) = (_keys(pair, side, condition, names) for side in (pair.a, pair.b))
+    (keys_a, rows_a), (keys_b, rows_b) = (
+        _keys(pair, side, condition, names) for side in (pair.a, pair.b)
+    )
     _, of_a, of_b = np.intersect1d(keys_a, keys_b, assume_unique=True, return_indices=True)
     rows_a, rows_b = rows_a[of_a], rows_b[of_b]
     a, b = pair.a.run.decisions, pair.b.run.decisions
@@ -318,11 +349,19 @@ def _decision_flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip
 
 
 def _keys(pair: Pair, side: Side, condition: str, names: Sequence[str]) -> tuple[Ints, Ints]:
-    """Return a number for each decision in a condition, the same in both runs, and the decision's row."""
+    """Return a number for each decision in a condition, the same in both runs,
+    and the decision's row.
+    """
     run = side.run
     d = run.decisions
     rows = np.flatnonzero(d.codes("condition", run.conditions) == run.conditions.index(condition))
     rows = rows[np.isin(d.whole("episode")[rows], pair.episodes)]
-    scene, episode, seed = d.codes("scene", names)[rows], d.whole("episode")[rows], d.whole("seed")[rows]
-    place = np.searchsorted(pair.episodes, episode) * len(pair.seeds) + np.searchsorted(pair.seeds, seed)
+    scene, episode, seed = (
+        d.codes("scene", names)[rows],
+        d.whole("episode")[rows],
+        d.whole("seed")[rows],
+    )
+    place = np.searchsorted(pair.episodes, episode) * len(pair.seeds) + np.searchsorted(
+        pair.seeds, seed
+    )
     return scene * (len(pair.episodes) * len(pair.seeds)) + place, rows

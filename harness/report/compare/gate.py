@@ -11,11 +11,16 @@ from harness.report.compare.difference import Comparison
 from harness.runs.metrics import METRICS
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
-    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
-}  # fmt: skip
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
 # A condition may have colons in its name, and a metric has none.
 _GATE = re.compile(
-    r"(?:(?P<condition>.+):)?\s*(?P<metric>\w+)(?:\.(?P<end>\w+))?\s*(?P<op>[<>]=?)\s*(?P<number>\S+)\s*"
+    r"(?:(?P<condition>.+):)?\s*"
+    r"(?P<metric>\w+)(?:\.(?P<end>\w+))?\s*"
+    r"(?P<op>[<>]=?)\s*(?P<number>\S+)\s*"
 )
 ENDS = ("low", "high")
 
@@ -34,16 +39,22 @@ class Gate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a gate: the conditions in which it failed, each with the value that failed it."""
+    """The result of a gate: the conditions in which it failed,
+    each with the value that failed it.
+    """
 
     gate: str
     failed: tuple[tuple[str, float], ...]
 
 
 def gate(
-    text: str, names: Sequence[str] = (), place: str = "CONDITION", example: str = "6g:success_rate < -0.01"
+    text: str,
+    names: Sequence[str] = (),
+    place: str = "CONDITION",
+    example: str = "6g:success_rate < -0.01",
 ) -> Gate:
-    """Return a gate from `success_rate < -0.01`, `6g:success_rate < -0.01` or `success_rate.high < 0`.
+    """Return a gate from `success_rate < -0.01`,
+    `6g:success_rate < -0.01` or `success_rate.high < 0`.
 
     Args:
         text: as it was typed.
@@ -61,7 +72,8 @@ def gate(
         number = math.nan
     if not match or not math.isfinite(number):
         raise UserError(
-            f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP NUMBER "
+            f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP "
+            "NUMBER "
             f"with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
     names = names or [name for name, m in METRICS.items() if m.compared]
@@ -71,7 +83,12 @@ def gate(
         raise unknown(f"end of {match['metric']}'s interval in --fail-if", match["end"], ENDS)
     condition = match["condition"]
     return Gate(
-        text, condition and condition.strip(), match["metric"], match["end"] or "value", match["op"], number
+        text,
+        condition and condition.strip(),
+        match["metric"],
+        match["end"] or "value",
+        match["op"],
+        number,
     )
 
 
@@ -94,8 +111,10 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
             if math.isnan(value):
                 # A gate that passes because nothing is known would guard nothing.
                 raise UserError(
-                    f"--fail-if {printable(gate.text)!r}: {printable(condition.condition)} has no such "
-                    f"number in these runs; name a condition or a metric that has, or compare more episodes"
+                    f"--fail-if {printable(gate.text)!r}: {printable(condition.condition)} has no "
+                    "such "
+                    "number in these runs; name a condition or a metric that has, or compare more "
+                    "episodes"
                 )
             # Means over seeds carry rounding errors, which decide no gate.
             if OPERATORS[gate.op](round(value, 9), gate.number):

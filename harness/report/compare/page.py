@@ -26,7 +26,9 @@ Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
 def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
-    """Yield the page; `most` episodes and requests are listed of each kind, with links to the runs' pages."""
+    """Yield the page; `most` episodes and requests are listed of each kind,
+    with links to the runs' pages.
+    """
     pair = comparison.pair
     lost = {name: _lost(side) for name, side in (("A", pair.a), ("B", pair.b))}
 
@@ -45,16 +47,28 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
             raw = next((answer.raw for answer in answers if answer.role == "ego"), "nothing")
             yield name, printable(raw, RAW), where and f"{where}#{urlencode(asked)}"
 
-    return environment(TEMPLATES).get_template("compare.html.j2").render(
-        comparison=comparison, pair=pair, verdicts=verdicts, most=most, words=words, links=links,
-        decided=decided, marked=marked, forest=_forest(comparison),
-    )  # fmt: skip
+    return (
+        environment(TEMPLATES)
+        .get_template("compare.html.j2")
+        .render(
+            comparison=comparison,
+            pair=pair,
+            verdicts=verdicts,
+            most=most,
+            words=words,
+            links=links,
+            decided=decided,
+            marked=marked,
+            forest=_forest(comparison),
+        )
+    )
 
 
 def beside(out: Path) -> Place:
     """Return links from a file to the pages in the runs' folders, where there are any.
 
-    A link names no folder of the machine: both lie below the current folder, or the page below the file.
+    A link names no folder of the machine:
+    both lie below the current folder, or the page below the file.
     """
     here, at = Path.cwd(), out.resolve().parent
 
@@ -67,10 +81,16 @@ def beside(out: Path) -> Place:
 
 
 def _lost(side: Side) -> dict[tuple[str, int, int], str]:
-    """By condition, seed and episode the decision that lost it; where none is known to, the last."""
+    """By condition, seed and episode the decision that lost it;
+    where none is known to, the last.
+    """
     run = side.run
     d = run.decisions
-    condition, seed, episode = d.codes("condition", run.conditions), d.whole("seed"), d.whole("episode")
+    condition, seed, episode = (
+        d.codes("condition", run.conditions),
+        d.whole("seed"),
+        d.whole("episode"),
+    )
     regret = np.nan_to_num(d["regret"]) == 1.0
     last: dict[tuple[str, int, int], str] = {}
     losing: dict[tuple[str, int, int], str] = {}
@@ -84,7 +104,9 @@ def _lost(side: Side) -> dict[tuple[str, int, int], str]:
 
 
 def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:
-    """Return what draws a difference: rates on one scale, any other metric on its own in all conditions."""
+    """Return what draws a difference:
+    rates on one scale, any other metric on its own in all conditions.
+    """
 
     def scale(metric: str) -> str:
         return "rate" if entry(metric).interval == "rate" else metric

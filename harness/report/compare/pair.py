@@ -26,9 +26,21 @@ from harness.world.parameters import DIALS
 
 # The order in which settings are told; one that is not here comes after them.
 ORDER = (
-    "model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip", "temperature",
-    "sampling_seed", "helpers", "ties", "dtype", "latency",
-)  # fmt: skip
+    "model",
+    "prompt",
+    "answer",
+    "thinking",
+    "image",
+    "letters",
+    "sums",
+    "flip",
+    "temperature",
+    "sampling_seed",
+    "helpers",
+    "ties",
+    "dtype",
+    "latency",
+)
 TOLD = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
 
 
@@ -45,7 +57,8 @@ class Side:
     """One of the two runs."""
 
     run: Run  # as it was read
-    settings: Mapping[str, str]  # those that may make a difference, by dotted name; None is left out
+    # those that may make a difference, by dotted name; None is left out
+    settings: Mapping[str, str]
     values: Mapping[str, Floats]  # of each metric, (C, S, E) by the run's grid; NaN where unknown
 
     @cached_property
@@ -73,8 +86,12 @@ class Pair:
 
     @cached_property
     def pool(self) -> Pool | None:
-        """The layouts that both might have come to, and how hard they are; None where there are no more."""
-        a, b = ({layout.episode: layout for layout in side.run.layouts} for side in (self.a, self.b))
+        """The layouts that both might have come to, and how hard they are;
+        None where there are no more.
+        """
+        a, b = (
+            {layout.episode: layout for layout in side.run.layouts} for side in (self.a, self.b)
+        )
         if any(b.get(episode, layout) != layout for episode, layout in a.items()):
             return None  # of one dataset both say the same, unless somebody changed a file
         both = {*(a or self.a.run.grid.episodes)} & {*(b or self.b.run.grid.episodes)}
@@ -82,19 +99,25 @@ class Pair:
         return Pool.of(known, self.episodes) if len(known) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
-        """Return the decisions in `episodes` with exactly one optimal action, by their place there."""
+        """Return the decisions in `episodes` with exactly one optimal action,
+        by their place there.
+        """
         rows, place = self._rows(side, condition)
         p, safe = (side.run.decisions.of_actions(name)[rows] for name in ("fused", "safe"))
         return Judged.of(p, safe == 1.0, place)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
-        """Of each seed, the episodes' places in `episodes` and the latencies in ms of their decisions."""
+        """Of each seed, the episodes' places in `episodes` and the latencies in ms of their
+        decisions.
+        """
         rows, place = self._rows(side, condition)
         seed, latency_ms = (side.run.decisions[name][rows] for name in ("seed", "latency_ms"))
         return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
 
     def _rows(self, side: Side, condition: str) -> tuple[Ints, Ints]:
-        """Return the rows of a condition's decisions in `episodes`, and the place of each there, (n,)."""
+        """Return the rows of a condition's decisions in `episodes`,
+        and the place of each there, (n,).
+        """
         decisions = side.run.decisions
         names, episode = side.run.conditions, decisions.whole("episode")
         of_condition = decisions.codes("condition", names) == names.index(condition)
@@ -107,8 +130,8 @@ def pair(a: Path, b: Path) -> Pair:
     """Read two runs.
 
     Raises:
-        UserError: a folder is no finished run or contradicts itself, or the two have not the same scenes and
-            seeds, or no condition or episode in common.
+        UserError: a folder is no finished run or contradicts itself, or the two have not the same
+            scenes and seeds, or no condition or episode in common.
     """
     first, second = read(a), read(b)
     for run in (first, second):
@@ -116,7 +139,8 @@ def pair(a: Path, b: Path) -> Pair:
     shown = f"{printable(a)} and {printable(b)}"
     if first.world != second.world:
         raise UserError(
-            f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a kind, or "
+            f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a "
+            "kind, or "
             "see `harness study fidelity`"
         )
     side_a, side_b = _side(first), _side(second)
@@ -130,7 +154,9 @@ def pair(a: Path, b: Path) -> Pair:
     conditions = tuple(name for name in first.conditions if name in second.conditions)
     if not conditions:
         names = " and ".join(printable(", ".join(run.conditions), 60) for run in (first, second))
-        raise UserError(f"{shown} have no condition in common ({names}); make both with the same --condition")
+        raise UserError(
+            f"{shown} have no condition in common ({names}); make both with the same --condition"
+        )
     episodes = set(first.grid.episodes) & set(second.grid.episodes)
     if not episodes:
         raise UserError(f"{shown} have no episode in common; make both on the same episodes")
@@ -148,4 +174,6 @@ def _side(run: Run) -> Side:
     points = [OperatingPoint.from_dict(condition).record() for condition in stated["conditions"]]
     named["condition"] = {point["name"]: point for point in points}
     settings = {name: str(value) for name, value in facts(nameless(named)) if value is not None}
-    return Side(run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes))
+    return Side(
+        run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes)
+    )

@@ -20,12 +20,16 @@ from harness.report.compare.pair import where
 from harness.runs.leading import SUCCESS
 
 WIDTH = 80
-ANSWERS = ("request", "role", "verdict_a", "verdict_b", "raw_a", "raw_b")  # of an answer that changed
+# of an answer that changed
+ANSWERS = ("request", "role", "verdict_a", "verdict_b", "raw_a", "raw_b")
 WHOLE = 10**6  # lists are cut by number, never in the middle of an id
 
 
-def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False) -> str:
-    """Write lines of at most `WIDTH` columns; `most` episodes, requests and so on are listed of each kind.
+def terminal(
+    comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
+) -> str:
+    """Write lines of at most `WIDTH` columns;
+    `most` episodes, requests and so on are listed of each kind.
 
     Unless `whole`, only those metrics are listed that come first.
     """
@@ -36,7 +40,9 @@ def terminal(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     )
 
 
-def _lines(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool) -> Iterator[str]:
+def _lines(
+    comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool
+) -> Iterator[str]:
     pair = comparison.pair
     yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
     yield from words.caveats(pair)
@@ -89,7 +95,9 @@ def _row(d: Difference) -> str:
     return f"{named:<27}{text.a:>7}{text.b:>9}{text.change:>9} {text.interval:>18}{text.p:>9}"
 
 
-def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False) -> str:
+def markdown(
+    comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
+) -> str:
     """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
@@ -100,7 +108,14 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     lines += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
     lines += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
     for c in comparison.conditions:
-        lines += [f"#### {code(c.condition)}", "", *_table(c, whole), "", words.success(c, pair), ""]
+        lines += [
+            f"#### {code(c.condition)}",
+            "",
+            *_table(c, whole),
+            "",
+            words.success(c, pair),
+            "",
+        ]
         lines += [f"- {line}" for line in words.adjusted(c)]
         lines += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
         lines += ["", words.decisions(c, pair), ""]
@@ -111,9 +126,13 @@ def markdown(comparison: Comparison, verdicts: Sequence[Verdict], most: int, who
     lines += [f"- {words.answers_held(comparison.held)}"]
     for changed in comparison.held.changed[:1]:
         lines += [f"- {code(line.strip())}" for line in words.first_changed(changed)]
-    lines += [f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)]
+    lines += [
+        f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)
+    ]
     lines += [f"- {code(setting)}" for setting in words.settings(comparison)]
-    lines += [f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))]
+    lines += [
+        f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))
+    ]
     return "\n".join([*lines, "", "</details>"])
 
 
@@ -131,14 +150,20 @@ def _table(c: InCondition, whole: bool) -> list[str]:
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     """Return the gates as test cases, for what shows JUnit's XML."""
-    runs = " against ".join(printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a))
+    runs = " against ".join(
+        printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a)
+    )
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
     return test_suite("harness compare", cases)
 
 
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
-    """Return the gates as test cases where they cannot be judged, since a model could not be asked."""
-    return test_suite("harness compare", [Case("harness compare", gate, error=reason) for gate in gates])
+    """Return the gates as test cases where they cannot be judged,
+    since a model could not be asked.
+    """
+    return test_suite(
+        "harness compare", [Case("harness compare", gate, error=reason) for gate in gates]
+    )
 
 
 def code(text: str) -> str:
@@ -155,7 +180,8 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
     return {
         **{
             name: {
-                "run": str(side.run.path), "settings": dict(side.settings),
+                "run": str(side.run.path),
+                "settings": dict(side.settings),
                 "answer_times": msgspec.to_builtins(side.run.manifest.answer_times),
             }
             for name, side in (("a", pair.a), ("b", pair.b))
@@ -165,29 +191,44 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
         "settings": [{"name": name, "a": a, "b": b} for name, a, b in comparison.settings],
-        "prompts": asdict(change) if isinstance(change := comparison.prompts, PromptChange) else change,
+        "prompts": asdict(change)
+        if isinstance(change := comparison.prompts, PromptChange)
+        else change,
         "conditions": [_in_condition(c, most) for c in comparison.conditions],
         "answers_in_both": comparison.answers_in_both,
         "answers": [
-            {"role": t.role, "a": t.a, "b": t.b, "count": len(t.requests), "requests": t.requests[:most]}
+            {
+                "role": t.role,
+                "a": t.a,
+                "b": t.b,
+                "count": len(t.requests),
+                "requests": t.requests[:most],
+            }
             for t in comparison.answers
         ],
         "answers_changed": {
-            "count": len(comparison.held.changed), "verdicts": comparison.held.verdicts,
-            "of": comparison.held.same, "asked_otherwise": comparison.held.other,
+            "count": len(comparison.held.changed),
+            "verdicts": comparison.held.verdicts,
+            "of": comparison.held.same,
+            "asked_otherwise": comparison.held.other,
             "listed": changed_answers(comparison.held, most),
         },
         "gates": [
-            {"gate": v.gate, "passed": not v.failed,
-             "failed_in": [{"condition": name, "value": value} for name, value in v.failed]}
+            {
+                "gate": v.gate,
+                "passed": not v.failed,
+                "failed_in": [{"condition": name, "value": value} for name, value in v.failed],
+            }
             for v in verdicts
         ],
         "passed": not any(v.failed for v in verdicts),
-    }  # fmt: skip
+    }
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the answers that changed, each with both verdicts and texts; `most` of them, or all."""
+    """Return the answers that changed, each with both verdicts and texts;
+    `most` of them, or all.
+    """
     return [
         dict(zip(ANSWERS, (each.request, each.role, *each.verdicts, each.a, each.b), strict=True))
         for each in held.changed[:most]
@@ -197,16 +238,27 @@ def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str
 def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
     metrics = {
         d.metric: {
-            "a": d.a, "b": d.b, "difference": d.change.value, "low": _number(d.change.low),
-            "high": _number(d.change.high), "n": d.change.n, "n_excluded": d.change.n_excluded,
-            "p": d.p_value, "p_holm": d.p_corrected, "primary": d.primary,
+            "a": d.a,
+            "b": d.b,
+            "difference": d.change.value,
+            "low": _number(d.change.low),
+            "high": _number(d.change.high),
+            "n": d.change.n,
+            "n_excluded": d.change.n_excluded,
+            "p": d.p_value,
+            "p_holm": d.p_corrected,
+            "primary": d.primary,
         }
         for d in c.differences
-    }  # fmt: skip
+    }
     entry: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": _test(metrics)}
     for name, some in (("gained", c.gained), ("lost", c.lost)):
         listed = [asdict(t) for t in some[:most]]
-        entry[name] = {"count": sum(len(t.seeds) for t in some), "episodes": len(some), "listed": listed}
+        entry[name] = {
+            "count": sum(len(t.seeds) for t in some),
+            "episodes": len(some),
+            "listed": listed,
+        }
     flips = [asdict(flip) for flip in c.flips[:most]]
     count = sum(len(flip.seeds) for flip in c.flips)
     return {**entry, "flips": {"count": count, "of": c.decisions, "listed": flips}}
@@ -217,7 +269,12 @@ def _test(metrics: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
     if SUCCESS not in metrics or metrics[SUCCESS]["p"] is None:
         return None
     success = metrics[SUCCESS]
-    return {"method": "interval", "p_value": success["p"], "low": success["low"], "high": success["high"]}
+    return {
+        "method": "interval",
+        "p_value": success["p"],
+        "low": success["low"],
+        "high": success["high"],
+    }
 
 
 def _number(value: float) -> float | None:

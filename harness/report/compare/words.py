@@ -40,8 +40,8 @@ EXCERPT = 140  # characters of an answer in a line
 class Line:
     """A difference as text: the metric with its unit, both means, B - A, its interval and its p.
 
-    `verdict` is `better` or `worse` where the corrected p of a primary metric is at most 0.05; `hint` where
-    that of an exploratory one is, uncorrected.
+    `verdict` is `better` or `worse` where the corrected p of a primary metric is at most 0.05;
+    `hint` where that of an exploratory one is, uncorrected.
     """
 
     verdict: str
@@ -56,13 +56,21 @@ class Line:
 def line(d: Difference) -> Line:
     """Write a difference, with four figures at most; shares in percent."""
     unit, e = entry(d.metric).unit, d.change
-    interval = "–" if math.isnan(e.low) else f"[{', '.join(unit.number(x, '+', 4) for x in (e.low, e.high))}]"
+    interval = (
+        "–"
+        if math.isnan(e.low)
+        else f"[{', '.join(unit.number(x, '+', 4) for x in (e.low, e.high))}]"
+    )
     p = d.p_corrected if d.primary else d.p_value
     return Line(
-        verdict(d), f"{d.metric}{' %' if unit.name == '%' else ''}",
-        unit.number(d.a, digits=4), unit.number(d.b, digits=4), unit.number(e.value, "+", 4), interval,
+        verdict(d),
+        f"{d.metric}{' %' if unit.name == '%' else ''}",
+        unit.number(d.a, digits=4),
+        unit.number(d.b, digits=4),
+        unit.number(e.value, "+", 4),
+        interval,
         "–" if p is None else p_value(p).removeprefix("= "),
-    )  # fmt: skip
+    )
 
 
 def verdict(d: Difference) -> str:
@@ -83,23 +91,29 @@ def _visible(d: Difference) -> bool:
 
 
 def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
-    """Choose what is shown first: the primary metrics, and the exploratory ones that changed most clearly.
+    """Choose what is shown first: the primary metrics,
+    and the exploratory ones that changed most clearly.
 
-    Together they are `SHOWN` at most, and the number of decisions where one of them is over some alone. Those
-    of which one way is better come before all others, and before percentiles, which say again how long a
-    decision takes.
+    Together they are `SHOWN` at most, and the number of decisions where one of them is over some
+    alone. Those of which one way is better come before all others, and before percentiles, which
+    say again how long a decision takes.
     """
 
     def order(d: Difference) -> tuple[bool, float]:
         metric = entry(d.metric)
         # What changed alike in every episode has no interval.
-        return metric.better == "neither" or bool(metric.percentile), -1.0 if d.p_value is None else d.p_value
+        return metric.better == "neither" or bool(
+            metric.percentile
+        ), -1.0 if d.p_value is None else d.p_value
 
     primary = [d for d in c.differences if d.primary]
     changed = [
         d
         for d in c.differences
-        if not d.primary and d.metric != ONE_OPTIMAL and _visible(d) and (verdict(d) or d.p_value is None)
+        if not d.primary
+        and d.metric != ONE_OPTIMAL
+        and _visible(d)
+        and (verdict(d) or d.p_value is None)
     ]
     striking = sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
     if any(entry(d.metric).pooled for d in striking):
@@ -124,7 +138,9 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
             if math.isnan(d.change.low):
                 verdict = "not clear, since there is no interval"
             else:
-                verdict = row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
+                verdict = (
+                    row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
+                )
             interval = f" {row.interval}".removesuffix(" –")
             change = f"{IN_WORDS[lead]} {row.change} points{interval}: {verdict}"
             outcomes.append((f"{c.condition}: {change}{p}", row.verdict))
@@ -149,18 +165,24 @@ def paces(pair: Pair) -> list[str]:
     """Return what prefill and decode take, with the run's letter."""
     sides = (("A", pair.a.run), ("B", pair.b.run))
     return [
-        f"{name}: {finding.sentence.strip()}" for name, run in sides for finding in findings(run, Kind.PACE)
+        f"{name}: {finding.sentence.strip()}"
+        for name, run in sides
+        for finding in findings(run, Kind.PACE)
     ]
 
 
 def caveats(pair: Pair) -> list[str]:
-    """Return what must be said of the runs before their numbers, with the run's letter where it is of one."""
+    """Return what must be said of the runs before their numbers,
+    with the run's letter where it is of one.
+    """
     found = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
     return [*(finding.sentence for finding in found), *_any_time(pair)]
 
 
 def _any_time(pair: Pair) -> Iterator[str]:
-    """Yield each difference of success with an interval that holds at every look, if a run was looked at."""
+    """Yield each difference of success with an interval that holds at every look,
+    if a run was looked at.
+    """
     if all(side.run.manifest.world.looks is None for side in (pair.a, pair.b)):
         return
     for condition in pair.conditions:
@@ -168,7 +190,10 @@ def _any_time(pair: Pair) -> Iterator[str]:
         success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
         a, b = (pair.values(side, SUCCESS, condition).T for side in (pair.a, pair.b))
         change = shown(success.any_time_difference(b, a), POINTS, "+")
-        yield f"{printable(condition)}: {success.words} B - A {change} points, by an interval of every look"
+        yield (
+            f"{printable(condition)}: {success.words} B - A {change} points, by an interval of "
+            "every look"
+        )
 
 
 def paired(pair: Pair) -> str:
@@ -193,18 +218,25 @@ def differing(comparison: Comparison) -> str:
 def success(c: InCondition, pair: Pair) -> str:
     """Return how many successes were gained and lost."""
     gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
-    of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (" × seeds" if len(pair.seeds) > 1 else "")
+    of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (
+        " × seeds" if len(pair.seeds) > 1 else ""
+    )
     return f"success: {gained} gained, {lost} lost of {of}"
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
-    """Yield how success changed once corrected by the layouts' difficulty, from `SHOWN_FROM` layouts on."""
+    """Yield how success changed once corrected by the layouts' difficulty,
+    from `SHOWN_FROM` layouts on.
+    """
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
         better = changes.get(ADJUSTED[metric])
         if better and changes[metric].n >= SHOWN_FROM:
             gained = as_good_as(changes[metric], better)
-            yield f"{name} adjusted for difficulty: B - A {shown(better, POINTS, '+')} points, {gained}"
+            yield (
+                f"{name} adjusted for difficulty: B - A {shown(better, POINTS, '+')} points, "
+                f"{gained}"
+            )
 
 
 def many(comparison: Comparison) -> str:
@@ -215,25 +247,36 @@ def many(comparison: Comparison) -> str:
     p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
     hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
-        "p comes from the interval: it is 1 minus the confidence level at which the interval would just "
-        f"touch 0. Holm's method corrects that of the primary metrics, {len(p_values)} differences: the "
-        f"chance that one or more of them is at most {LEVEL} without a real difference is {100 * LEVEL:.0f} "
-        f"% at most. {sum(p <= LEVEL for p in p_values)} are at most {LEVEL}: {SIGNS[BETTER]} better, "
-        f"{SIGNS[WORSE]} worse. The other {len(tested) - len(p_values)} are exploratory and not corrected: "
-        f"{hints} are at most {LEVEL} ({SIGNS[HINT]}), and {LEVEL * (len(tested) - len(p_values)):.0f} would "
+        "p comes from the interval: it is 1 minus the confidence level at which the interval would "
+        "just "
+        f"touch 0. Holm's method corrects that of the primary metrics, {len(p_values)} "
+        "differences: the "
+        f"chance that one or more of them is at most {LEVEL} without a real difference is "
+        f"{100 * LEVEL:.0f} "
+        f"% at most. {sum(p <= LEVEL for p in p_values)} are at most {LEVEL}: {SIGNS[BETTER]} "
+        "better, "
+        f"{SIGNS[WORSE]} worse. The other {len(tested) - len(p_values)} are exploratory and not "
+        "corrected: "
+        f"{hints} are at most {LEVEL} ({SIGNS[HINT]}), and "
+        f"{LEVEL * (len(tested) - len(p_values)):.0f} would "
         "be by chance alone. Intervals and gates are not corrected"
     )
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Return what a condition lost and what it gained, where it did: up to so many episodes of each."""
+    """Return what a condition lost and what it gained, where it did:
+    up to so many episodes of each.
+    """
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
 
 def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Return up to so many episodes, each with how it failed; seeds where it is not all of them."""
-    episodes = [f"{t.episode} {t.a if t.b == 'success' else t.b}{_seeds(t.seeds, pair)}" for t in some[:most]]
+    episodes = [
+        f"{t.episode} {t.a if t.b == 'success' else t.b}{_seeds(t.seeds, pair)}"
+        for t in some[:most]
+    ]
     return _listed(episodes, len(some), most)
 
 
@@ -254,8 +297,9 @@ def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
             f"{by} alone gave success away",
             _listed([decision_flip(flip, pair) for flip in some[:most]], len(some), most),
         )
-        for by, some in kinds.items() if some
-    ]  # fmt: skip
+        for by, some in kinds.items()
+        if some
+    ]
 
 
 def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
@@ -268,13 +312,18 @@ def _seeds(seeds: Sequence[int], pair: Pair) -> str:
 
 
 def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
-    """Return what differs between the texts, up to so many changes; none where the prompts are the same."""
+    """Return what differs between the texts, up to so many changes;
+    none where the prompts are the same.
+    """
     change = comparison.prompts
     if change is None or isinstance(change, str):
         return [change] if change else []
     pair = comparison.pair
     ego, helper = (
-        [printable(side.run.manifest.agent(place)["prompt"]["version"], 40) for side in (pair.a, pair.b)]
+        [
+            printable(side.run.manifest.agent(place)["prompt"]["version"], 40)
+            for side in (pair.a, pair.b)
+        ]
         for place in (0, 1)
     )
     who = f"prompt {' → '.join(ego)}"
@@ -292,9 +341,15 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
         text = "".join(piece for _, piece in marked(hunk))
         lines += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
     if len(hunks) > most:
-        stated = [side.run.manifest.agent(place)["prompt"] for side in (pair.a, pair.b) for place in (0, 1)]
+        stated = [
+            side.run.manifest.agent(place)["prompt"]
+            for side in (pair.a, pair.b)
+            for place in (0, 1)
+        ]
         here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
-        seen = dict.fromkeys(f"`harness prompt compare {a} {b}`" for a, b in (ego, helper) if a != b)
+        seen = dict.fromkeys(
+            f"`harness prompt compare {a} {b}`" for a, b in (ego, helper) if a != b
+        )
         shown = " and ".join(seen) if here and seen else "the page of --html has them"
         lines.append(f"  {len(hunks) - most} more changes: {shown}")
     return lines
@@ -304,7 +359,8 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
     """Return how many answers of a role changed their verdict, and up to so many of them."""
     return [
         (
-            f"{role_word(t.role)} {t.a} → {t.b}: {len(t.requests)} of {comparison.answers_in_both[t.role]}",
+            f"{role_word(t.role)} {t.a} → {t.b}: {len(t.requests)} of "
+            f"{comparison.answers_in_both[t.role]}",
             _listed(t.requests[:most], len(t.requests), most),
         )
         for t in comparison.answers
@@ -317,7 +373,8 @@ def answers_held(held: AnswersHeld) -> str:
         return "the runs have no question in common"
     if not held.same:
         return (
-            f"none can be compared: each of the {held.other} questions that both runs have was asked "
+            f"none can be compared: each of the {held.other} questions that both runs have was "
+            "asked "
             "otherwise (prompt, messages or picture)"
         )
     text = f"{len(held.changed)} of {held.same} to the same questions changed"
@@ -339,7 +396,9 @@ def first_changed(changed: AnswerChanged) -> list[str]:
 
 
 def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
-    """Return A's answer and B's: letter of the run, verdict, and the text before, in and after its change."""
+    """Return A's answer and B's: letter of the run, verdict, and the text before,
+    in and after its change.
+    """
     a, b = changed.a, changed.b
     start = _alike(a, b)
     end = _alike(a[start:][::-1], b[start:][::-1])
@@ -374,4 +433,6 @@ def judged(verdict: Verdict, sign: str = "+") -> str:
     gate = printable(verdict.gate)
     if not verdict.failed:
         return f"passed: {gate}"
-    return f"FAILED: {gate} in " + ", ".join(f"{name} ({value:{sign}.4g})" for name, value in verdict.failed)
+    return f"FAILED: {gate} in " + ", ".join(
+        f"{name} ({value:{sign}.4g})" for name, value in verdict.failed
+    )

@@ -1,4 +1,6 @@
-"""What lies in a picture of a scene and in a video: roads, buildings, shade, vehicles, sight lines."""
+"""What lies in a picture of a scene and in a video:
+roads, buildings, shade, vehicles, sight lines.
+"""
 
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any
@@ -20,7 +22,12 @@ TEXT_PT = 6.5
 FAR_M = 4 * VIEW_M  # from an eye to the end of what is in shadow
 LOOKS: dict[str, dict[str, Any]] = {
     "ego": {"facecolor": ROLES["ego"], "edgecolor": INK, "linewidth": 1.0},
-    "helper": {"facecolor": HATCHED[0], "edgecolor": HATCHED[1], "hatch": "//////", "linewidth": 0.8},
+    "helper": {
+        "facecolor": HATCHED[0],
+        "edgecolor": HATCHED[1],
+        "hatch": "//////",
+        "linewidth": 0.8,
+    },
     "danger": {"facecolor": ROLES["danger"], "edgecolor": INK, "hatch": "xxxxxx", "linewidth": 0.8},
     "other": {"facecolor": "white", "edgecolor": INK, "linewidth": 0.8},
 }
@@ -52,7 +59,9 @@ def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
 
 
 def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
-    """Return a vehicle as one of `LOOKS`: red after a crash, and of a hidden one only a dashed line."""
+    """Return a vehicle as one of `LOOKS`:
+    red after a crash, and of a hidden one only a dashed line.
+    """
     style = dict(LOOKS[look])
     if hidden:
         edge = ROLES["danger"] if look == "danger" else style["edgecolor"]
@@ -69,8 +78,12 @@ def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) ->
     return LineCollection([np.array([at[viewer], place]) for place in there], **look)
 
 
-def named(buildings: Iterable[Building], view: View, tall_m: float) -> Iterator[tuple[str, float, float]]:
-    """The name of each building with room for one, and the north-west corner of what is in view of it."""
+def named(
+    buildings: Iterable[Building], view: View, tall_m: float
+) -> Iterator[tuple[str, float, float]]:
+    """The name of each building with room for one,
+    and the north-west corner of what is in view of it.
+    """
     for building in buildings:
         corners = north_up(building.corners())
         low, high = np.array([corners.min(axis=0), corners.max(axis=0)]).clip(*view.edges)

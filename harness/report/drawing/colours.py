@@ -1,16 +1,30 @@
 """The palette of pages, charts, figures, pictures and videos: a colour has one meaning.
 
-A sign or a name says it again. Blues are conditions, green to red is how something ended, purples are roles
-of vehicles, browns are actions. Conditions, outcomes and roles stand out from white and from dark paper (3 to
-1 at least); actions, from light to dark as they get faster, have an outline instead.
+A sign or a name says it again. Blues are conditions, green to red is how something ended, purples
+are roles of vehicles, browns are actions. Conditions, outcomes and roles stand out from white and
+from dark paper (3 to 1 at least); actions, from light to dark as they get faster, have an outline
+instead.
 """
 
 from collections.abc import Iterable
 
-INK, GREY, PALE, FAINT, WHITE, BLACK = "#222222", "#777777", "#DDDDDD", "#ECECEC", "#FFFFFF", "#000000"
+INK, GREY, PALE, FAINT, WHITE, BLACK = (
+    "#222222",
+    "#777777",
+    "#DDDDDD",
+    "#ECECEC",
+    "#FFFFFF",
+    "#000000",
+)
 GOOD, LATE, BAD = "#009E73", "#BA7F00", "#C8321F"
 OUTCOMES = {"good": GOOD, "late": LATE, "bad": BAD}
-ROLES = {"ego": "#9645B0", "helper": "#B07CC6", "danger": "#D6246E", "fusion": "#85709F", "other": "#FFFFFF"}
+ROLES = {
+    "ego": "#9645B0",
+    "helper": "#B07CC6",
+    "danger": "#D6246E",
+    "fusion": "#85709F",
+    "other": "#FFFFFF",
+}
 CONDITIONS = {"single-local": "#6B7480", "v2x": "#0072B2", "6g": "#2F97DB"}
 FAILURES = (BAD, "#E2685A", "#9C2416", "#F0988D", "#6E160B", "#F7C4BD")  # a shade a kind
 HATCHED = ("#E3CCEB", "#6A3D80")  # a helper on paper: between its lines, and the lines
@@ -22,8 +36,9 @@ PAGE = {
     "code": ("#EEF0F3", "#282D33"), "mark": ("#FFE28A", "#6B5200"),
 }  # fmt: skip
 SCENE = {
-    "ground": ("#F7F7F4", "#1F2327"), "road": ("#C9CCD1", "#3C4147"), "kerb": ("#8A8F98", "#8A8F98"),
-    "building": ("#EAE4D6", "#34312A"), "wall": ("#A79F8A", "#6E6755"), "shade": ("#3A4047", "#000000"),
+    "ground": ("#F7F7F4", "#1F2327"), "road": ("#C9CCD1", "#3C4147"),
+    "kerb": ("#8A8F98", "#8A8F98"), "building": ("#EAE4D6", "#34312A"),
+    "wall": ("#A79F8A", "#6E6755"), "shade": ("#3A4047", "#000000"),
     "other": (WHITE, "#D5D9DE"), "outline": (INK, INK), "white": (WHITE, WHITE),
 }  # fmt: skip
 LIGHT = {name: light for name, (light, _) in SCENE.items()}
@@ -37,11 +52,15 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each operating point: the paper's have their own, a change of one has another."""
+    """Return a colour for each operating point:
+    the paper's have their own, a change of one has another.
+    """
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
         free = [
-            c for c in (CONDITIONS.get(name), *_MORE, *CONDITIONS.values()) if c and c not in chosen.values()
+            c
+            for c in (CONDITIONS.get(name), *_MORE, *CONDITIONS.values())
+            if c and c not in chosen.values()
         ]
         chosen[name] = free[0] if free else GREY
     return chosen
@@ -57,5 +76,7 @@ def actions(names: Iterable[str]) -> dict[str, str]:
 def variables() -> str:
     """Return the palette as properties of CSS: `--paper`, `--ego-fill` and so on."""
     fills = [f"--{name}-fill: {colour};" for name, colour in (OUTCOMES | ROLES).items()]
-    pairs = [f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in (PAGE | SCENE).items()]
+    pairs = [
+        f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in (PAGE | SCENE).items()
+    ]
     return " ".join([*pairs, *fills])

@@ -15,10 +15,12 @@ from harness.world.scene_graph import Conflict, SceneGraph
 from harness.world.state import VehicleState, WorldState
 
 VIEW_M = 80.0  # from the origin to the edge of a picture
-LOW_M, LOW_SHAPE = 40.0, 0.6  # roads that reach no farther north to south; height by width of their pictures
+# roads that reach no farther north to south; height by width of their pictures
+LOW_M, LOW_SHAPE = 40.0, 0.6
 BEYOND_M = 80.0  # roads are drawn so far beyond the edge, for who is there
 MARGIN_M, LEAST_M = 8.0, 60.0  # around what a view holds; its width
-NEAR_M = VIEW_M - MARGIN_M  # what is farther north, south, east or west of the ego than this is not followed
+# what is farther north, south, east or west of the ego than this is not followed
+NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
@@ -45,13 +47,16 @@ def ground_of(scenario: Scenario) -> Ground:
 
 
 def shape_of(scenario: Scenario) -> float:
-    """Height by width of a picture of where it is decided: a road from west to east needs no square."""
+    """Height by width of a picture of where it is decided:
+    a road from west to east needs no square.
+    """
     outlines = scenario.road().ground_within(VIEW_M).outlines
     return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
 
 
 def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
-    """What lies behind walls and vehicles as seen from the middle of one: quadrangles (n, 4, 2) up to far_m.
+    """What lies behind walls and vehicles as seen from the middle of one:
+    quadrangles (n, 4, 2) up to far_m.
 
     All go round the same way, so that together they are one shape by the nonzero rule.
     """
@@ -60,7 +65,9 @@ def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
     a = north_up(np.array(shapes).reshape(-1, 4, 2))
     b, at = np.roll(a, -1, axis=1).reshape(-1, 2), north_up(np.array([eye.x_m, eye.y_m]))
     a = a.reshape(-1, 2)
-    beyond = [at + (p - at) * far_m / np.maximum(np.hypot(*(p - at).T), 1e-9)[:, None] for p in (b, a)]
+    beyond = [
+        at + (p - at) * far_m / np.maximum(np.hypot(*(p - at).T), 1e-9)[:, None] for p in (b, a)
+    ]
     quads = np.stack([a, b, *beyond], axis=1)
     across = (b - a)[:, 0] * (at - a)[:, 1] - (b - a)[:, 1] * (at - a)[:, 0]
     return np.where((across > 0)[:, None, None], quads[:, ::-1], quads)
@@ -93,19 +100,25 @@ class View:
 
 
 def spots(
-    state: WorldState, zone_m: tuple[float, float], graph: SceneGraph | None, who: Collection[str | None],
+    state: WorldState,
+    zone_m: tuple[float, float],
+    graph: SceneGraph | None,
+    who: Collection[str | None],
     crossed: tuple[list[Conflict], Floats] | None = None,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Return what a picture holds, (n, 2) m to the east and north, the ego first.
 
     Args:
         state: who is where.
         zone_m: where paths cross, in the frame of `harness.world.road`.
-        graph: of the vehicle whose sight is shown, for the conflicts that it sees; None for no more of them.
+        graph: of the vehicle whose sight is shown, for the conflicts that it sees;
+            None for no more of them.
         who: ids of whom else it holds: the danger and the helpers that were asked.
         crossed: the `conflict_points` of the graph, where they are known.
     """
-    conflicts, crossings = crossed or (conflict_points(state, graph) if graph else ([], np.empty((0, 2))))
+    conflicts, crossings = crossed or (
+        conflict_points(state, graph) if graph else ([], np.empty((0, 2)))
+    )
     wanted = {*who, state.ego.id, *(conflict.vehicle for conflict in conflicts)}
     wanted |= {graph.viewer} if graph else set()
     at = [(v.x_m, v.y_m) for v in state.vehicles if v.id in wanted]
@@ -115,7 +128,8 @@ def spots(
 
 
 def view_of(held: Floats, shape: float = 1.0) -> View:
-    """Return what holds spots (n, 2) with a margin, in the middle of it if the world goes on that far.
+    """Return what holds spots (n, 2) with a margin,
+    in the middle of it if the world goes on that far.
 
     Its height is `shape` times its width.
     """

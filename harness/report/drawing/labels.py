@@ -9,7 +9,9 @@ from harness.core.arrays import Floats
 from harness.report.drawing.colours import INK
 from harness.report.drawing.geometry import View
 
-DIRECTIONS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float)
+DIRECTIONS = np.array(
+    [[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=float
+)
 DISTANCES_M = (1.0, 4.0, 8.0, 13.0, 19.0, 26.0, 34.0, 44.0)  # in a picture of the whole world
 NOWHERE = np.zeros(2)
 
@@ -74,7 +76,9 @@ class Labels:
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def free(self, boxes: Sequence[Floats]) -> Floats:
-        """The first of some boxes (2, 2) that covers nothing so far, else the first; labels keep off it."""
+        """The first of some boxes (2, 2) that covers nothing so far, else the first;
+        labels keep off it.
+        """
         half = (boxes[0][1] - boxes[0][0]) / 2
         taken = covered(np.array([box.mean(axis=0) for box in boxes]), half, self._taken)
         self.block(boxes[int(taken.argmin())])
@@ -89,11 +93,15 @@ class Labels:
         colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
-        """A label for what lies at (2,) m and reaches radius_m, best on the side `toward` (2,) points to."""
+        """A label for what lies at (2,) m and reaches radius_m,
+        best on the side `toward` (2,) points to.
+        """
         self._waiting.append((at, radius_m, text, bold, colour, toward))
 
     def place(self) -> None:
-        """Put every label at the nearest free place, with a line to what it names if that is far."""
+        """Put every label at the nearest free place,
+        with a line to what it names if that is far.
+        """
         for at, radius_m, text, bold, colour, toward in self._waiting:
             half = self._half_size(text, bold)
             gaps = radius_m + self.view.scale * (np.array(DISTANCES_M) - 1)
@@ -105,10 +113,18 @@ class Labels:
                 self.axes.plot(*np.array([at, edge]).T, color=colour, linewidth=0.6, zorder=4)
                 self._leaders.append(np.array([at, edge]))
             self.axes.text(
-                spot[0], spot[1], text, size=self.size_pt, weight="bold" if bold else "normal", color=colour,
-                ha="center", va="center", linespacing=1.1, zorder=5,
+                spot[0],
+                spot[1],
+                text,
+                size=self.size_pt,
+                weight="bold" if bold else "normal",
+                color=colour,
+                ha="center",
+                va="center",
+                linespacing=1.1,
+                zorder=5,
                 bbox={"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 0.8},
-            )  # fmt: skip
+            )
 
     def _half_size(self, text: str, bold: bool) -> Floats:
         lines = text.split("\n")
@@ -116,10 +132,14 @@ class Labels:
         return size_em * self.size_pt / self.pt_per_m / 2 + 0.6 * self.view.scale
 
     def _cost(self, spots: Floats, half: Floats, at: Floats, toward: Floats) -> Floats:
-        """Return how far away each is, and far more than any distance for what would be covered or cut."""
+        """Return how far away each is, and far more than any distance for what would be covered or
+        cut.
+        """
         edges = at.clip(spots - half, spots + half)
         away: Floats = np.hypot(*(edges - at).T) / self.view.scale
-        away += np.where((spots - at) @ toward < 0, 10.0, 0.0) + 20.0 * crossed(at, edges, self._leaders)
+        away += np.where((spots - at) @ toward < 0, 10.0, 0.0) + 20.0 * crossed(
+            at, edges, self._leaders
+        )
         beyond = cut(spots, half, self.view) / self.view.scale
         return (
             away

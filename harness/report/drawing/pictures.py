@@ -60,7 +60,8 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
     with warnings.catch_warnings():
         # A name in a script that the measuring font lacks is still text in the SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        # `savefig` would draw everything twice, the first time to find what sticks out, which is not asked.
+        # `savefig` would draw everything twice, the first time to find what sticks out, which is
+        # not asked.
         if format == "svg":
             nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
             FigureCanvasSVG(figure).print_svg(data, metadata=nothing)  # type: ignore[no-untyped-call]

@@ -17,7 +17,14 @@ from harness.dataset.load import Scene
 from harness.report.drawing import artists
 from harness.report.drawing.artists import HIDDEN, LOOKS, TEXT_PT
 from harness.report.drawing.colours import BUILDING_NAME, GREY, INK, LIGHT, ROLES
-from harness.report.drawing.geometry import View, conflict_points, north_up, shape_of, spots, view_of
+from harness.report.drawing.geometry import (
+    View,
+    conflict_points,
+    north_up,
+    shape_of,
+    spots,
+    view_of,
+)
 from harness.report.drawing.labels import Labels
 from harness.report.drawing.pictures import Format, save, styled
 from harness.world import scenarios
@@ -28,8 +35,11 @@ SIDE_IN = 5.8  # how wide the picture is
 RING_M = 4.6  # from the middle of the dangerous vehicle to the corners of its diamond
 
 DIAMOND: dict[str, Any] = {
-    "marker": "D", "markerfacecolor": "none", "markeredgecolor": ROLES["danger"], "markeredgewidth": 1.4,
-}  # fmt: skip
+    "marker": "D",
+    "markerfacecolor": "none",
+    "markeredgecolor": ROLES["danger"],
+    "markeredgewidth": 1.4,
+}
 CROSS: dict[str, Any] = {"marker": "X", "color": INK, "markeredgecolor": INK, "markersize": 7}
 NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other": "other vehicle"}
 
@@ -60,17 +70,27 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     place = 0.1 / (SIDE_IN + 0.2), 0.5 / height, SIDE_IN / (SIDE_IN + 0.2), SIDE_IN * shape / height
     low, high = view.edges
     axes = figure.add_axes(place)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xticks=[], yticks=[], facecolor=LIGHT["ground"])
+    axes.set(
+        xlim=(low[0], high[0]),
+        ylim=(low[1], high[1]),
+        xticks=[],
+        yticks=[],
+        facecolor=LIGHT["ground"],
+    )
     axes.set_autoscale_on(False)
     # All of it lies under what is plotted, whatever its kind.
     hidden = artists.shade(state, state.vehicle(viewer))
-    for order, artist in enumerate([*artists.roads(scenario), hidden, *artists.walls(state.buildings)]):
+    for order, artist in enumerate(
+        [*artists.roads(scenario), hidden, *artists.walls(state.buildings)]
+    ):
         artist.set_zorder(0.1 * (1 + order))
         axes.add_artist(artist)
     labels = Labels(axes, SIDE_IN * 72 / view.width_m, TEXT_PT, view)
     for box in road.ground_within(float(np.abs(view.edges).max())).boxes:
         labels.discourage(box)
-    lines = artists.sight(state, viewer, seen - {viewer}, colors=LIGHT["kerb"], linewidths=0.7, alpha=0.75)
+    lines = artists.sight(
+        state, viewer, seen - {viewer}, colors=LIGHT["kerb"], linewidths=0.7, alpha=0.75
+    )
     axes.add_artist(lines)
     for vehicle in state.vehicles:
         _vehicle(axes, labels, view, vehicle, _look(scene, vehicle), hidden=vehicle.id not in seen)
@@ -85,7 +105,9 @@ def _look(scene: Scene, vehicle: VehicleState) -> str:
     return "danger" if vehicle.id == scene.record.danger.vehicle else vehicle.part
 
 
-def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look: str, hidden: bool) -> None:
+def _vehicle(
+    axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look: str, hidden: bool
+) -> None:
     marks = [f"{vehicle.speed_mps:.0f} m/s"]
     marks += [look] if look != "other" else []
     marks += ["hidden"] if hidden else []
@@ -100,7 +122,9 @@ def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look
         east, north = away / half
         horizontal, vertical = "<" if east < 0 else ">", "v" if north < 0 else "^"
         marker = horizontal if abs(east) > abs(north) else vertical
-        axes.plot(*edge, marker=marker, color=ROLES["danger"] if look == "danger" else GREY, markersize=5)
+        axes.plot(
+            *edge, marker=marker, color=ROLES["danger"] if look == "danger" else GREY, markersize=5
+        )
         labels.add(edge, 1.5 * unit, f"{text}\n{beyond_m:.0f} m farther", bold=look == "danger")
         return
     corners = north_up(vehicle.corners())
@@ -112,18 +136,25 @@ def _vehicle(axes: Axes, labels: Labels, view: View, vehicle: VehicleState, look
     axes.plot(*np.vstack([wings[0], nose, wings[1]]).T, color=colour, linewidth=0.8, zorder=3)
     if vehicle.speed_mps > 0.5:
         arrow = {
-            "arrowstyle": "-|>,head_width=0.15,head_length=0.3", "color": INK, "linewidth": 0.8,
-            "shrinkA": 0, "shrinkB": 0,
-        }  # fmt: skip
+            "arrowstyle": "-|>,head_width=0.15,head_length=0.3",
+            "color": INK,
+            "linewidth": 0.8,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
         tip = nose + along * vehicle.speed_mps
-        way = axes.annotate("", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow, annotation_clip=False)
+        way = axes.annotate(
+            "", (tip[0], tip[1]), (nose[0], nose[1]), arrowprops=arrow, annotation_clip=False
+        )
         if way.arrow_patch:
             way.arrow_patch.set_clip_path(axes.patch)
         labels.block(np.array([nose, tip]))
     radius_m = vehicle.length_m / 2
     if look == "danger":
         ring = centre + RING_M * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-        axes.add_patch(Polygon(ring, facecolor="none", edgecolor=ROLES["danger"], linewidth=1.4, zorder=3))
+        axes.add_patch(
+            Polygon(ring, facecolor="none", edgecolor=ROLES["danger"], linewidth=1.4, zorder=3)
+        )
         radius_m = max(radius_m, RING_M)
         labels.block(ring)
     labels.block(corners)
@@ -144,28 +175,45 @@ def _conflicts(axes: Axes, labels: Labels, view: View, scene: Scene, viewer: str
 
 
 def _signs(axes: Axes, labels: Labels, view: View, scene: Scene) -> None:
-    """The scale and where north is, each in a corner that no vehicle is in, and the names of buildings."""
+    """The scale and where north is, each in a corner that no vehicle is in,
+    and the names of buildings.
+    """
     (west, south), (east, north) = view.edges
     unit = view.scale
     long_m, pad, wide, high, half = artists.scale_m(view), 4 * unit, 24 * unit, 6 * unit, 3 * unit
     low, up, left, right = south + pad, north - pad - high, west + pad, east - pad - wide
-    box = labels.free([np.array([[x, y], [x + wide, y + high]]) for x in (left, right) for y in (low, up)])
+    box = labels.free(
+        [np.array([[x, y], [x + wide, y + high]]) for x in (left, right) for y in (low, up)]
+    )
     start, foot = box[0]
     bar = [start, start + long_m]
     axes.plot(bar, [foot, foot], color=INK, linewidth=1.5, solid_capstyle="butt", zorder=5)
     axes.text(
-        start + long_m / 2, foot + unit, f"{long_m} m", size=TEXT_PT, ha="center", va="bottom", zorder=5
+        start + long_m / 2,
+        foot + unit,
+        f"{long_m} m",
+        size=TEXT_PT,
+        ha="center",
+        va="bottom",
+        zorder=5,
     )
     tall = 13 * unit
     low, up, left, right = south + half, north - half - tall, west + half, east - half - 2 * half
     box = labels.free(
-        [np.array([[x, y], [x + 2 * half, y + tall]]) for x, y in ((right, up), (left, up), (right, low))]
+        [
+            np.array([[x, y], [x + 2 * half, y + tall]])
+            for x, y in ((right, up), (left, up), (right, low))
+        ]
     )
     x, (y, top) = box[:, 0].mean(), box[:, 1]
     arrow = {"arrowstyle": "-|>", "color": INK}
-    axes.annotate("N", (x, top), (x, y + 2 * unit), size=8, ha="center", va="center", arrowprops=arrow)
+    axes.annotate(
+        "N", (x, top), (x, y + 2 * unit), size=8, ha="center", va="center", arrowprops=arrow
+    )
     for name, left, up in artists.named(scene.state.buildings, view, TEXT_PT / labels.pt_per_m):
-        axes.text(left + unit, up - unit, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top")
+        axes.text(
+            left + unit, up - unit, name, color=BUILDING_NAME, size=TEXT_PT, ha="left", va="top"
+        )
 
 
 def _when(arrival: EgoArrival) -> str:
@@ -177,7 +225,10 @@ def _when(arrival: EgoArrival) -> str:
 def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
     state, graph = scene.state, scene.graphs[viewer]
     left, height = 0.1 / figure.get_figwidth(), figure.get_figheight()
-    title = f"Scene {printable(scene.id, 40)} at {state.time_s:.1f} s, ego {state.ego.speed_mps:.1f} m/s"
+    title = (
+        f"Scene {printable(scene.id, 40)} at {state.time_s:.1f} s, ego {state.ego.speed_mps:.1f} "
+        "m/s"
+    )
     figure.text(left, 1 - 0.24 / height, title, size=10, weight="bold")
     neighbours = [v.id for v in state.vehicles if v.id != viewer]
     parts = [
@@ -197,9 +248,14 @@ def _words(figure: Figure, scene: Scene, viewer: str, seen: set[str]) -> None:
         Line2D([], [], color=INK, marker=">", markersize=3, linewidth=0.8, label="way in 1 s"),
     ]
     figure.legend(
-        handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=7.5, borderpad=0.2,
+        handles=handles,
+        loc="lower center",
+        ncols=4,
+        frameon=False,
+        fontsize=7.5,
+        borderpad=0.2,
         columnspacing=1.6,
-    )  # fmt: skip
+    )
 
 
 def _list(names: Any) -> str:

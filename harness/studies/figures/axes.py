@@ -15,8 +15,12 @@ if TYPE_CHECKING:
 ROOM_IN = 0.5  # for names below a figure, in its height
 
 
-def paper_values(marks: "pd.DataFrame | None", panel: str, metric: str, **place: str) -> "pd.DataFrame":
-    """Return what the paper says of a metric in a panel; nothing if its values are not to be drawn."""
+def paper_values(
+    marks: "pd.DataFrame | None", panel: str, metric: str, **place: str
+) -> "pd.DataFrame":
+    """Return what the paper says of a metric in a panel;
+    nothing if its values are not to be drawn.
+    """
     import pandas as pd
 
     if marks is None:
@@ -36,7 +40,9 @@ def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
         axes.plot(x[single], low[single], "x", label="the paper", **look)
     if not single.all():
         middle, half = (low + high)[~single] / 2, (high - low)[~single] / 2
-        axes.errorbar(x[~single], middle, half, fmt="none", ecolor=INK, capsize=2, linewidth=1, zorder=5)
+        axes.errorbar(
+            x[~single], middle, half, fmt="none", ecolor=INK, capsize=2, linewidth=1, zorder=5
+        )
 
 
 def lead_in(rows: "pd.DataFrame") -> str:
@@ -45,7 +51,9 @@ def lead_in(rows: "pd.DataFrame") -> str:
 
 
 def interval_of(rows: "pd.DataFrame") -> str:
-    """Return `episodes` where every seed plays the same ones, `seed means` where a seed has its own."""
+    """Return `episodes` where every seed plays the same ones,
+    `seed means` where a seed has its own.
+    """
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
 
 
@@ -57,14 +65,20 @@ def plain(axes: Any, lines: str) -> None:
 
 
 def key(figure: "Figure", named: Mapping[str, Any], most: int = 4) -> None:
-    """Name what is drawn below a figure, in `most` columns or as few as fit, and make room for the rows."""
+    """Name what is drawn below a figure, in `most` columns or as few as fit,
+    and make room for the rows.
+    """
     if not named:
         return
     for columns in range(min(most, len(named)), 0, -1):
         legend = figure.legend(
-            list(named.values()), list(named), loc="outside lower center", ncols=columns, frameon=False,
+            list(named.values()),
+            list(named),
+            loc="outside lower center",
+            ncols=columns,
+            frameon=False,
             fontsize=7,
-        )  # fmt: skip
+        )
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
             break
         legend.remove()

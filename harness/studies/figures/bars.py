@@ -11,7 +11,15 @@ from harness.report.drawing.colours import GREY, INK, conditions
 from harness.report.drawing.pictures import styled
 from harness.runs.leading import IN_WORDS, SUCCESS
 from harness.studies.axes import CORE
-from harness.studies.figures.axes import cross, interval_of, key, lead_in, lettered, paper_values, plain
+from harness.studies.figures.axes import (
+    cross,
+    interval_of,
+    key,
+    lead_in,
+    lettered,
+    paper_values,
+    plain,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,8 +32,8 @@ SHORT = 13  # characters of a name that fit under a bar
 def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Figure:
     """Draw latency, success and communication of the operating points, with 95 % intervals.
 
-    `core` has the rows of a study's summary that are theirs. `paper` has the paper's values: `low` and `high`
-    by `panel`, `condition`, `value` and `metric`, equal where it gives one.
+    `core` has the rows of a study's summary that are theirs. `paper` has the paper's values: `low`
+    and `high` by `panel`, `condition`, `value` and `metric`, equal where it gives one.
     """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)
@@ -44,19 +52,33 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
             mean, down, up = _value(core, name, metric, scale)
             axes.bar(x, mean, width=0.65, color=colours[name], edgecolor=INK, linewidth=0.5)
             axes.errorbar(x, mean, yerr=[[down], [up]], color=INK, capsize=2.5, linewidth=1.0)
-            theirs = paper_values(paper, CORE, SUCCESS if axes is success else metric, condition=name)
+            theirs = paper_values(
+                paper, CORE, SUCCESS if axes is success else metric, condition=name
+            )
             cross(axes, theirs, x)
             axes.annotate(
-                f"{mean:.1f}", (x, np.nanmax([mean, mean + up, *theirs.high])),
-                xytext=(0, 2 if theirs.empty else 4), textcoords="offset points", ha="center", fontsize=6,
-            )  # fmt: skip
+                f"{mean:.1f}",
+                (x, np.nanmax([mean, mean + up, *theirs.high])),
+                xytext=(0, 2 if theirs.empty else 4),
+                textcoords="offset points",
+                ha="center",
+                fontsize=6,
+            )
         if axes is latency:
-            axes.bar(0, CLOUD_MS, width=0.65, color="white", edgecolor=GREY, hatch="////", linewidth=0.8)
+            axes.bar(
+                0, CLOUD_MS, width=0.65, color="white", edgecolor=GREY, hatch="////", linewidth=0.8
+            )
             axes.text(0, CLOUD_MS + 8, f"{CLOUD_MS:.0f}", ha="center", va="bottom", fontsize=7)
             axes.text(
-                0, CLOUD_MS / 2, "cited, not runnable", ha="center", va="center", rotation=90, fontsize=6.5,
+                0,
+                CLOUD_MS / 2,
+                "cited, not runnable",
+                ha="center",
+                va="center",
+                rotation=90,
+                fontsize=6.5,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.5},
-            )  # fmt: skip
+            )
         ticks += [name.replace("-", "-\n") for name in bars]
         axes.set_xticks(range(len(ticks)), [] if in_legend else ticks, fontsize=7)
         axes.set_ylabel(label)
@@ -72,7 +94,9 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
     rate = talk.twinx()
     for n, name in enumerate(talking):
         mean, down, up = _value(core, name, "trigger_rate", 100.0)
-        rate.errorbar(n + 0.2, mean, yerr=[[down], [up]], marker="D", color=INK, capsize=2, markersize=4)
+        rate.errorbar(
+            n + 0.2, mean, yerr=[[down], [up]], marker="D", color=INK, capsize=2, markersize=4
+        )
         cross(rate, paper_values(paper, CORE, "trigger_rate", condition=name), n + 0.33)
     rate.set(ylim=(0, 112), ylabel="trigger rate, % (diamonds)")
     rate.spines[["top"]].set_visible(False)
@@ -85,6 +109,8 @@ def _value(
 ) -> tuple[float, float, float]:
     """Return the mean, and how far the interval reaches below and above it."""
     of = rows[(rows.condition == condition) & (rows.metric == metric)]
-    [estimate] = of[of.interval == interval_of(of)][["mean", "ci_low", "ci_high"]].to_numpy(dtype=float)
+    [estimate] = of[of.interval == interval_of(of)][["mean", "ci_low", "ci_high"]].to_numpy(
+        dtype=float
+    )
     mean, low, high = scale * estimate
     return mean, mean - low, high - mean

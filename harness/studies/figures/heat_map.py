@@ -16,11 +16,16 @@ COLUMN_IN, CHARACTER_IN = 0.72, 0.065  # widths
 
 @styled
 def heat_map(
-    panels: Mapping[str, Floats], rows: Sequence[str], columns: Sequence[str], row: str = "", column: str = ""
+    panels: Mapping[str, Floats],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    row: str = "",
+    column: str = "",
 ) -> Figure:
     """Draw percent (R, C) by title, with the names of rows and columns, and of what they are.
 
-    Panels of few columns stand beside each other where their titles have room, others below each other.
+    Panels of few columns stand beside each other where their titles have room,
+    others below each other.
     """
     room = COLUMN_IN * len(columns) / CHARACTER_IN
     beside = len(columns) <= MOST_BESIDE and max(map(len, panels)) <= room
@@ -35,9 +40,13 @@ def heat_map(
         figure.subplots(*shape, squeeze=False).flat, panels.items(), strict=True
     ):
         edges = beside or axes is figure.axes[-1], not beside or axes is figure.axes[0]
-        axes.imshow(percent, cmap="Blues", vmin=low - 0.1 * (high - low) - 1, vmax=high + 1, aspect="auto")
+        axes.imshow(
+            percent, cmap="Blues", vmin=low - 0.1 * (high - low) - 1, vmax=high + 1, aspect="auto"
+        )
         axes.set_title(title, fontsize=8)
-        axes.set_xticks(range(len(columns)), columns if edges[0] else [], rotation=40, ha="right", fontsize=7)
+        axes.set_xticks(
+            range(len(columns)), columns if edges[0] else [], rotation=40, ha="right", fontsize=7
+        )
         axes.set_yticks(range(len(rows)), rows if edges[1] else [], fontsize=7)
         axes.set(xlabel=column if edges[0] else "", ylabel=row if edges[1] else "")
         axes.tick_params(length=0)

@@ -15,7 +15,15 @@ from harness.report.drawing.colours import COLOURS, FAINT, GREY, INK, MARKERS, c
 from harness.report.drawing.pictures import styled
 from harness.runs.leading import IN_WORDS, SUCCESS
 from harness.studies.axes import axis_of
-from harness.studies.figures.axes import cross, interval_of, key, lead_in, lettered, paper_values, plain
+from harness.studies.figures.axes import (
+    cross,
+    interval_of,
+    key,
+    lead_in,
+    lettered,
+    paper_values,
+    plain,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,7 +35,8 @@ Curve = tuple[str, str]  # a source and a condition
 PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: the paper's panel of swarm sizes
 LEAST_IN = 3.6  # width of a figure
 BEST_BAND = (0.65, 0.70)  # of tau, the paper's
-BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}  # of success
+# of success
+BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}
 
 
 @styled
@@ -36,10 +45,12 @@ def along(
     paper: "pd.DataFrame | None" = None,
     colours: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Draw success along one axis a panel, several sources in one, with loss or trigger rate beside it.
+    """Draw success along one axis a panel, several sources in one,
+    with loss or trigger rate beside it.
 
-    Panels are parts of a study's summary. With the paper's values, as in `bars`, its best band of tau is
-    drawn. Conditions have their own colours, or those of `colours`; of several sources, each curve has one.
+    Panels are parts of a study's summary. With the paper's values, as in `bars`, its best band of
+    tau is drawn. Conditions have their own colours, or those of `colours`; of several sources, each
+    curve has one.
     """
     width = max(2.5 * len(panels) + 0.2, LEAST_IN)
     figure = Figure(figsize=(width, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
@@ -50,7 +61,9 @@ def along(
     lettered(drawn)
     named: dict[str, Any] = {}
     for axes in figure.axes:
-        named |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        named |= {
+            label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
     key(figure, named, most=3)
     return figure
 
@@ -77,12 +90,16 @@ def _along(
         beside.spines[["top"]].set_visible(False)
         curves.append((beside, metric, label))
     ticks = list(dict.fromkeys(panel.value)) if axis_of(variable).worded else []
-    for n, (source, condition) in enumerate(dict.fromkeys(zip(panel.source, panel.condition, strict=True))):
+    for n, (source, condition) in enumerate(
+        dict.fromkeys(zip(panel.source, panel.condition, strict=True))
+    ):
         rows = panel[(panel.source == source) & (panel.condition == condition)]
         name = condition if len(set(panel.source)) == 1 else f"{source}, {condition}"
         for where, metric, label in curves:
             at = rows[(rows.metric == metric) & (rows.interval == interval_of(rows))]
-            mean, low, high = (100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high"))
+            mean, low, high = (
+                100 * at[k].to_numpy(dtype=float) for k in ("mean", "ci_low", "ci_high")
+            )
             look: dict[str, Any] = {
                 "color": colours[source, condition] if where is axes else GREY,
                 "marker": MARKERS[n % len(MARKERS)],
@@ -91,7 +108,9 @@ def _along(
             if ticks:
                 x = [ticks.index(value) + 0.12 * n for value in at.value]
                 spread = [mean - low, high - mean]
-                where.errorbar(x, mean, yerr=spread, capsize=2, linestyle="none", markersize=4, **look)
+                where.errorbar(
+                    x, mean, yerr=spread, capsize=2, linestyle="none", markersize=4, **look
+                )
                 continue
             x = at.value.tolist()
             where.plot(x, mean, "-" if where is axes else ":", markersize=3, linewidth=1.2, **look)
@@ -115,7 +134,8 @@ def _along(
 def reception(
     name: str, channel: "Physical", messages: "Sequence[Drawn]", against: "Sequence[Compared]"
 ) -> Figure:
-    """Draw a radio's reception against distance, and beside it, if there are any, against others' curves.
+    """Draw a radio's reception against distance, and beside it, if there are any,
+    against others' curves.
 
     Args:
         name: of the condition.
@@ -125,16 +145,27 @@ def reception(
     """
     distances_m = np.linspace(1, messages[-1].distance_m, 250)
     curves = by_sight(channel, distances_m)
-    figure = Figure(figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1))
+    figure = Figure(
+        figsize=(7.2 if against else 3.8, 3.0), layout=ConstrainedLayoutEngine(w_pad=0.1)
+    )
     axes = figure.add_subplot(1, 2 if against else 1, 1)
-    for (label, curve), colour, dashes in zip(curves.items(), COLOURS, ("-", "--", ":"), strict=False):
+    for (label, curve), colour, dashes in zip(
+        curves.items(), COLOURS, ("-", "--", ":"), strict=False
+    ):
         axes.plot(distances_m, 100 * curve, dashes, color=colour, linewidth=1.4, label=label)
     crossing = [each.crossing for each in messages]
     value, low, high = 100 * np.array([(each.value, each.low, each.high) for each in crossing]).T
     axes.errorbar(
-        [each.distance_m for each in messages], value, yerr=[value - low, high - value], fmt="o", color=INK,
-        markersize=2.5, capsize=2, linewidth=0.8, label=f"messages, n = {crossing[0].n} each",
-    )  # fmt: skip
+        [each.distance_m for each in messages],
+        value,
+        yerr=[value - low, high - value],
+        fmt="o",
+        color=INK,
+        markersize=2.5,
+        capsize=2,
+        linewidth=0.8,
+        label=f"messages, n = {crossing[0].n} each",
+    )
     axes.set(xlabel="distance, m", ylabel="received, %", ylim=(-2, 102), xlim=(0, None))
     axes.set_title(name, fontsize=8)
     axes.legend(fontsize=6, frameon=False)
@@ -142,18 +173,31 @@ def reception(
         axes = figure.add_subplot(1, 2, 2)
         axes.axline((0, 0), (100, 100), color=GREY, linewidth=0.8)
         for each in against:
-            axes.plot(100 * each.curve.reception, 100 * each.reception, ".", color=COLOURS[0], markersize=2.5)
+            axes.plot(
+                100 * each.curve.reception,
+                100 * each.reception,
+                ".",
+                color=COLOURS[0],
+                markersize=2.5,
+            )
         mean = 100 * np.mean([each.mean_difference for each in against])
         axes.set(
-            xlabel="others' curves, %", ylabel="model, %", xlim=(-2, 102), ylim=(-2, 102), aspect="equal"
+            xlabel="others' curves, %",
+            ylabel="model, %",
+            xlim=(-2, 102),
+            ylim=(-2, 102),
+            aspect="equal",
         )
-        axes.set_title(f"{amount(len(against), 'curve')}, {mean:.1f} points apart on average", fontsize=8)
+        axes.set_title(
+            f"{amount(len(against), 'curve')}, {mean:.1f} points apart on average", fontsize=8
+        )
     return figure
 
 
 @styled
 def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) -> Figure:
-    """Draw the loss of one transmission against vehicles in the radius: radios beside the paper's line.
+    """Draw the loss of one transmission against vehicles in the radius:
+    radios beside the paper's line.
 
     Args:
         vehicles: `(n,)`, sender and receiver included.
@@ -163,10 +207,22 @@ def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) ->
     figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.add_subplot()
     radios = dict(losses)
-    axes.plot(vehicles, 100 * radios.pop("paper"), color=INK, linewidth=1.2, label="the paper's line")
+    axes.plot(
+        vehicles, 100 * radios.pop("paper"), color=INK, linewidth=1.2, label="the paper's line"
+    )
     axes.plot(*zip(*PAPER_LOSS, strict=True), "x", color=INK, label="the paper's three points")
-    for (name, loss), colour, marker in zip(radios.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
-        axes.plot(vehicles, 100 * loss, marker=marker, markersize=3, linewidth=1.0, color=colour, label=name)
+    for (name, loss), colour, marker in zip(
+        radios.items(), cycle(COLOURS), cycle(MARKERS), strict=False
+    ):
+        axes.plot(
+            vehicles,
+            100 * loss,
+            marker=marker,
+            markersize=3,
+            linewidth=1.0,
+            color=colour,
+            label=name,
+        )
     axes.set(
         xscale="log",
         xlabel="vehicles in the radius, the ego included",

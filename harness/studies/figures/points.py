@@ -1,4 +1,6 @@
-"""Points with intervals, on their own or one quantity over another, and fronts: what one costs in another."""
+"""Points with intervals, on their own or one quantity over another, and fronts:
+what one costs in another.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -39,8 +41,8 @@ class Rows:
 def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
     """Draw estimates with their 95 % intervals along rows.
 
-    A series has a colour, and a marker that says it again. Where an interval is not known, the point stands
-    alone.
+    A series has a colour, and a marker that says it again.
+    Where an interval is not known, the point stands alone.
     """
     heights = [len(panel.names) * (0.1 + 0.1 * len(panel.series)) + 0.5 for panel in panels]
     # One below the other, as a telephone can show them.
@@ -50,18 +52,28 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
         for n, (name, estimates) in enumerate(panel.series.items()):
             shift = 0.7 * ((n + 0.5) / len(panel.series) - 0.5)
             known = [
-                (y + shift, each) for y, each in enumerate(estimates) if each and not np.isnan(each.value)
+                (y + shift, each)
+                for y, each in enumerate(estimates)
+                if each and not np.isnan(each.value)
             ]
             ends = np.array([(each.value, each.low, each.high) for _, each in known]).reshape(-1, 3)
             value, low, high = panel.scale * ends.T
             axes.errorbar(
-                value, [y for y, _ in known], xerr=np.nan_to_num([value - low, high - value]),
-                fmt=MARKERS[n % len(MARKERS)], color=colours[name], label=name, markersize=4, capsize=2,
-                linewidth=1, clip_on=False,
-            )  # fmt: skip
+                value,
+                [y for y, _ in known],
+                xerr=np.nan_to_num([value - low, high - value]),
+                fmt=MARKERS[n % len(MARKERS)],
+                color=colours[name],
+                label=name,
+                markersize=4,
+                capsize=2,
+                linewidth=1,
+                clip_on=False,
+            )
         axes.set_yticks(range(len(panel.names)), panel.names)
         axes.set(xlabel=panel.quantity, ylim=(len(panel.names) - 0.5, -0.5))
-        axes.axvspan(0, panel.scale, color="none")  # the whole range, so that small differences look small
+        # the whole range, so that small differences look small
+        axes.axvspan(0, panel.scale, color="none")
         axes.tick_params(axis="y", length=0)
         plain(axes, "x")
     lettered(drawn)
@@ -82,7 +94,9 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> 
         figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels, strict=True
     ):
         for line in lines:
-            axes.plot(line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look)
+            axes.plot(
+                line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look
+            )
         axes.set(xlabel=cost, ylabel=f"{success}, %" if axes is figure.axes[0] else "")
         axes.set_title(title, fontsize=8)
         axes.margins(x=0.1, y=0.1)
@@ -90,9 +104,14 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> 
         for line in lines:  # a name extends to the middle, away from the ends of the axis
             right = line.x[-1] > sum(axes.get_xlim()) / 2
             axes.annotate(
-                line.name, (line.x[-1], line.y[-1]), xytext=(5 if right else -5, 5),
-                textcoords="offset points", ha="right" if right else "left", fontsize=6.5, color=INK,
-            )  # fmt: skip
+                line.name,
+                (line.x[-1], line.y[-1]),
+                xytext=(5 if right else -5, 5),
+                textcoords="offset points",
+                ha="right" if right else "left",
+                fontsize=6.5,
+                color=INK,
+            )
     handles, labels = figure.axes[0].get_legend_handles_labels()
     key(figure, dict(zip(labels, handles, strict=True)))
     return figure

@@ -1,7 +1,8 @@
-"""Create an environment of highway-env from its scenario name, and access its actions and configuration.
+"""Create an environment of highway-env from its scenario name,
+and access its actions and configuration.
 
-The name is `env:` and the id that gymnasium knows, and for a changed configuration also `:config=` and the
-changes as JSON. So the name alone is enough to create the same environment again.
+The name is `env:` and the id that gymnasium knows, and for a changed configuration also `:config=`
+and the changes as JSON. So the name alone is enough to create the same environment again.
 """
 
 import json
@@ -20,9 +21,11 @@ from harness.core.strangers import strangers
 from harness.world.road import Lane
 
 PREFIX, CHANGES = "env:", ":config="
-IMPORTS = "SWARMDRIVE_IMPORTS"  # environment variable: modules, with commas, that names may have imported
+# environment variable: modules, with commas, that names may have imported
+IMPORTS = "SWARMDRIVE_IMPORTS"
 OWN_PACKAGE = "highway_env"
-OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")  # what the ego of meta-actions has
+# what the ego of meta-actions has
+OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
@@ -50,7 +53,8 @@ def shown(name: str) -> str:
 
 
 def allow(name: str) -> None:
-    """Let a name that the user typed import its module, in this process and in those that it starts.
+    """Let a name that the user typed import its module,
+    in this process and in those that it starts.
 
     A name from a file, such as a dataset's manifest or a run's, is never given to this function.
     """
@@ -59,7 +63,9 @@ def allow(name: str) -> None:
 
 
 def module_of(name: str) -> str:
-    """Return the module that an environment's name has imported; empty for one of highway-env's own."""
+    """Return the module that an environment's name has imported;
+    empty for one of highway-env's own.
+    """
     return _id_and_changes(name)[0].rpartition(":")[0]
 
 
@@ -83,7 +89,8 @@ def _only_allowed(name: str, env_id: str, changed: Mapping[str, Any]) -> None:
     for module in filter(None, (of_id, *paths)):
         if not any(f"{module}.".startswith(f"{known}.") for known in (OWN_PACKAGE, *_allowed())):
             raise UserError(
-                f"{shown(name)} would import the module {printable(module, 40)}; if you trust it, set "
+                f"{shown(name)} would import the module {printable(module, 40)}; if you trust it, "
+                "set "
                 f"{IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
             )
 
@@ -109,7 +116,9 @@ def reset(name: str, seed: int) -> Any:
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"{shown(name)} cannot be reset: {raised(error)}; mind its config") from None
+        raise UserError(
+            f"{shown(name)} cannot be reset: {raised(error)}; mind its config"
+        ) from None
     meta_actions(name, env)
     _only_drivable(name, env)
     return env
@@ -139,7 +148,9 @@ def _only_drivable(name: str, env: Any) -> None:
 
 
 def hittable(thing: Any) -> bool:
-    """Return whether others can run into a vehicle or an object of highway-env: not into a ghost."""
+    """Return whether others can run into a vehicle or an object of highway-env:
+    not into a ghost.
+    """
     return bool(thing.collidable and thing.solid)
 
 
@@ -148,7 +159,8 @@ def _create(name: str) -> Any:
     import highway_env
     from highway_env.envs.common.abstract import AbstractEnv
 
-    gymnasium.logger.min_level = gymnasium.logger.ERROR  # no warning of an old version: the user named it
+    # no warning of an old version: the user named it
+    gymnasium.logger.min_level = gymnasium.logger.ERROR
     highway_env._register_highway_envs()
     env_id, changes = _id_and_changes(name)
     changed = _changed(name, changes or "{}")
@@ -167,12 +179,15 @@ def _create(name: str) -> Any:
             f"{shown(name)}: {missing}; install the package, or put its folder on PYTHONPATH"
         ) from None
     except gymnasium.error.Error as error:
-        raise UserError(f"{shown(name)}: {printable(error)}; give an id that gymnasium.make knows") from None
+        raise UserError(
+            f"{shown(name)}: {printable(error)}; give an id that gymnasium.make knows"
+        ) from None
     except Exception as error:
         raise UserError(f"{shown(name)} cannot be made: {raised(error)}") from None
     if not isinstance(env, AbstractEnv):
         raise UserError(
-            f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class must be a "
+            f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class "
+            "must be a "
             "subclass of highway_env's AbstractEnv"
         )
     for key, value in changed.items():
@@ -193,12 +208,16 @@ def _changed(name: str, changes: str) -> dict[str, Any]:
         if not isinstance(changed, dict):
             raise ValueError(type(changed).__name__)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{shown(name)}: its config is no JSON object ({printable(error)})") from None
+        raise UserError(
+            f"{shown(name)}: its config is no JSON object ({printable(error)})"
+        ) from None
     return changed
 
 
 def _merged(default: Any, value: Any) -> Any:
-    """Merge a change into a part of a configuration; a part that names its own type replaces the default."""
+    """Merge a change into a part of a configuration;
+    a part that names its own type replaces the default.
+    """
     if isinstance(default, dict) and isinstance(value, dict) and "type" not in value:
         return {**default, **{key: _merged(default.get(key), each) for key, each in value.items()}}
     return value
@@ -206,12 +225,16 @@ def _merged(default: Any, value: Any) -> Any:
 
 def config(name: str) -> dict[str, Any]:
     """Return an environment's whole configuration."""
-    whole: dict[str, Any] = json.loads(json.dumps(_create(name).config, default=str), parse_constant=str)
+    whole: dict[str, Any] = json.loads(
+        json.dumps(_create(name).config, default=str), parse_constant=str
+    )
     return whole
 
 
 def meta_actions(name: str, env: Any) -> Any:
-    """Return the type of the ego's actions. Raises UserError unless they are meta-actions of speed."""
+    """Return the type of the ego's actions.
+    Raises UserError unless they are meta-actions of speed.
+    """
     from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 
     kind = env.action_type
@@ -220,11 +243,13 @@ def meta_actions(name: str, env: Any) -> Any:
     if not isinstance(kind, DiscreteMetaAction):
         raise UserError(
             f"{shown(name)} has no meta-actions but {type(kind).__name__}; config "
-            '{"action": {"type": "DiscreteMetaAction"}} gives it some, where its vehicles can take them'
+            '{"action": {"type": "DiscreteMetaAction"}} gives it some, where its vehicles can take '
+            "them"
         )
     if missing := sorted({*KNOWN_ACTIONS}.difference(kind.actions.values())):
         raise UserError(
-            f"{shown(name)} has no action {', '.join(missing)}; set `longitudinal` in its action config"
+            f"{shown(name)} has no action {', '.join(missing)}; set `longitudinal` in its action "
+            "config"
         )
     return kind
 
@@ -248,7 +273,8 @@ def lane_of(v: Any) -> Lane:
         x_m, y_m = v.position
         who = v.spawn.id if hasattr(v, "spawn") else "the ego"
         raise UserError(
-            f"environment: {who}, a {type(v).__name__} at {x_m:.1f}, {y_m:.1f} m, has no lane; make every "
+            f"environment: {who}, a {type(v).__name__} at {x_m:.1f}, {y_m:.1f} m, has no lane; "
+            "make every "
             "vehicle with the road, and on one of its lanes"
         ) from None
     return str(begin), str(end), int(number or 0)
@@ -256,7 +282,9 @@ def lane_of(v: Any) -> Lane:
 
 @dataclass(frozen=True)
 class Constants:
-    """Class constants of highway-env's vehicles, such as IDM's gaps, which some environments overwrite."""
+    """Class constants of highway-env's vehicles, such as IDM's gaps,
+    which some environments overwrite.
+    """
 
     values: Mapping[tuple[type, str], Any]
 
@@ -270,7 +298,9 @@ class Constants:
             for kind in vars(module).values()
             if isinstance(kind, type) and kind.__module__ == module.__name__
         }
-        return cls({(kind, key): v for kind in kinds for key, v in vars(kind).items() if key.isupper()})
+        return cls(
+            {(kind, key): v for kind in kinds for key, v in vars(kind).items() if key.isupper()}
+        )
 
     def restore(self) -> None:
         """Set all constants to these values."""

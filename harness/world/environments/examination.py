@@ -1,4 +1,6 @@
-"""Check once whether an environment can be frozen, before a dataset is built or an episode is driven."""
+"""Check once whether an environment can be frozen,
+before a dataset is built or an episode is driven.
+"""
 
 from collections.abc import Sequence
 
@@ -14,14 +16,15 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 def examine(scenario: Scenario, seed: int) -> None:
     """Raise UserError unless equal seeds give equal traffic, also for copies and frame by frame.
 
-    Some decisions are simulated by the environment's own `step`, twice, and frame by frame by copies of
-    copies.
+    Some decisions are simulated by the environment's own `step`, twice,
+    and frame by frame by copies of copies.
     """
     name = shown(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))
     if once != again:
         raise UserError(
-            f"{name}: its traffic differs between two runs of seed {seed}; draw from env.np_random, and keep "
+            f"{name}: its traffic differs between two runs of seed {seed}; draw from "
+            "env.np_random, and keep "
             "nothing between episodes"
         )
     world = EnvironmentWorld.begun(scenario, seed)
@@ -30,7 +33,8 @@ def examine(scenario: Scenario, seed: int) -> None:
             world = world.branch()
         except Exception as error:
             raise UserError(
-                f"{name} cannot be copied: {raised(error)}; keep files, locks and the like out of its "
+                f"{name} cannot be copied: {raised(error)}; keep files, locks and the like out of "
+                "its "
                 "attributes"
             ) from None
         world.take(action)
@@ -39,7 +43,8 @@ def examine(scenario: Scenario, seed: int) -> None:
             return
         if _places(world.env) != expected:
             raise UserError(
-                f"{name}: frame by frame its traffic is another than by its step(); what its step() changes "
+                f"{name}: frame by frame its traffic is another than by its step(); what its "
+                "step() changes "
                 "must come after super().step()"
             )
 

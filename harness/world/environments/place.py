@@ -17,9 +17,11 @@ from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings,
 
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 MOST_HZ = 1000
-AFTER, LIMIT = 2, 5  # decision periods after the last decision: to the goal by cruising, to the time limit
+# decision periods after the last decision: to the goal by cruising, to the time limit
+AFTER, LIMIT = 2, 5
 REACH_M = 500.0  # paths are built up to this distance from the middle of an episode
-BEHIND_M, BEYOND_M = 30.0, 40.0  # watched parts of the ego's ways, behind its start and beyond its goal
+# watched parts of the ego's ways, behind its start and beyond its goal
+BEHIND_M, BEYOND_M = 30.0, 40.0
 BEFORE_M = (5.0, 45.0)  # watched part of a path that meets the ego's, before that point
 HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the middle of pictures
 
@@ -30,17 +32,22 @@ class Parameters(Common):
 
     braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
     acceleration_mps2: float = 20.0
-    helpers: int = 3  # number of helpers: other controlled vehicles first, then those nearest to the ego
+    # number of helpers: other controlled vehicles first, then those nearest to the ego
+    helpers: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("decisions", "helpers"):
             if not 0 < getattr(self, name) <= 9:
-                raise UserError(f"scenario: {name} is {getattr(self, name)}; it must be from 1 to 9")
+                raise UserError(
+                    f"scenario: {name} is {getattr(self, name)}; it must be from 1 to 9"
+                )
 
     @property
     def goal_s(self) -> float:
-        """Time in which the ego would reach its goal at its first target speed; it defines the goal."""
+        """Time in which the ego would reach its goal at its first target speed;
+        it defines the goal.
+        """
         return (self.decisions + AFTER) * self.decision_period_s
 
 
@@ -64,7 +71,9 @@ def first_target_mps(ego: Any) -> float:
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
     """Return where a network's lanes begin and end, m."""
     return {
-        index: tuple(np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist())
+        index: tuple(
+            np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist()
+        )
         for index, lane in lanes_of(network).items()
     }
 
@@ -116,18 +125,25 @@ def _goal_m(speed_mps: float, begin_m: float, parameters: Parameters) -> float:
 def _parameters(name: str, env: Any, actions: int) -> Parameters:
     hz, decisions_hz = (env.config[f"{kind}_frequency"] for kind in ("simulation", "policy"))
     for kind, value in (("simulation", hz), ("policy", decisions_hz)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= MOST_HZ:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not 0 < value <= MOST_HZ
+        ):
             raise UserError(
-                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a number "
+                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a "
+                "number "
                 f"above 0, at most {MOST_HZ}, in its config"
             )
     if hz % decisions_hz:
         raise UserError(
-            f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of policy_frequency "
+            f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of "
+            "policy_frequency "
             f"{decisions_hz:g}; set one in its config"
         )
     period_s = 1 / decisions_hz
-    # A tree has about a hundred decision points: three actions lead to 2.4 new ones each, five to 3.4.
+    # A tree has about a hundred decision points: three actions lead to 2.4 new ones each, five to
+    # 3.4.
     decisions = 6 if actions == 3 else 4
     return Parameters(
         target_speeds_mps=tuple(float(speed) for speed in env.vehicle.target_speeds),
@@ -153,7 +169,8 @@ def _sectors(
         points = paths[key].points_at(np.linspace(*watched_m, 15))
         before = np.concatenate([*sectors.values(), np.full((1, 2), np.inf)])
         apart_m = np.hypot(*(points[:, None] - before).T).min(axis=0)
-        if (own := points[apart_m > ONE_LANE_M]).size:  # of a way that parts later only what is its own
+        # of a way that parts later only what is its own
+        if (own := points[apart_m > ONE_LANE_M]).size:
             sectors[key[1]] = own
     for key, at in meetings.items():
         if key[0] not in sectors:

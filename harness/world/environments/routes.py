@@ -1,7 +1,7 @@
 """Derive the paths of any road network of highway-env: every route through it, on every lane.
 
-A road is named by its two nodes. A route is a chain of consecutive roads, from one without a predecessor to
-one without a successor. A path keeps to one lane as long as there is one.
+A road is named by its two nodes. A route is a chain of consecutive roads, from one without a
+predecessor to one without a successor. A path keeps to one lane as long as there is one.
 """
 
 import math
@@ -18,7 +18,8 @@ from harness.world.road import Lane, Path, PathKey
 
 Street = tuple[str, str]  # the two nodes of a road
 Route = tuple[Street, ...]
-GAP_M = 6.0  # a lane that begins farther from another's end does not continue it; lanes are 4 m wide
+# a lane that begins farther from another's end does not continue it; lanes are 4 m wide
+GAP_M = 6.0
 TURN_RAD = math.radians(60.0)  # nor does a lane that is turned by more than this
 MOST_ROUTES = 200
 TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the right
@@ -34,7 +35,9 @@ class Routes:
     ways: dict[Route, tuple[PathKey, ...]]  # the paths of each route from left to right
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
-        """Return the roads that a vehicle in a lane will take by highway-env's rule and its plan, if any."""
+        """Return the roads that a vehicle in a lane will take by highway-env's rule and its plan,
+        if any.
+        """
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
             end = self.network.get_lane(lane)
@@ -46,7 +49,9 @@ class Routes:
         return tuple(streets)
 
     def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
-        """Return the paths that a vehicle in this lane may be on, those that best match its route first."""
+        """Return the paths that a vehicle in this lane may be on,
+        those that best match its route first.
+        """
         ahead = self.ahead(lane, plan)
         on_lane = [key for key, path in self.paths.items() if lane in path.lanes]
         return sorted(on_lane, key=lambda key: -_together(ahead, self.paths[key].lanes))
@@ -65,10 +70,11 @@ def routes(
     origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
 ) -> Routes:
-    """Build every path of a network, as far as it lies within `reach_m` of the origin of the paths' frame.
+    """Build every path of a network, as far as it lies within `reach_m` of the origin of the paths'
+    frame.
 
-    A route on a ring begins at the road `begin`. Raises UserError, with the environment's `name`, if there
-    are more than MOST_ROUTES routes.
+    A route on a ring begins at the road `begin`.
+    Raises UserError, with the environment's `name`, if there are more than MOST_ROUTES routes.
     """
     every = list(_routes(name, network, begin))
     labels = _labels(network, every)
@@ -93,7 +99,9 @@ def routes(
 
 def _left_over(network: Any, covered: set[Lane]) -> Iterator[list[Lane]]:
     """Yield chains of lanes that no route takes, such as the inner lane of a roundabout."""
-    for lane in ((*street, n) for street in _streets(network) for n in range(len(_lanes(network, street)))):
+    for lane in (
+        (*street, n) for street in _streets(network) for n in range(len(_lanes(network, street)))
+    ):
         chain: list[Lane] = []
         while lane not in covered:
             covered.add(lane)
@@ -121,7 +129,8 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
     def extend(route: Route) -> None:
         if len(complete) + len(rings) > MOST_ROUTES:
             raise UserError(
-                f"{printable(name)}: its road has more than {MOST_ROUTES} routes; give it fewer junctions"
+                f"{printable(name)}: its road has more than {MOST_ROUTES} routes; give it fewer "
+                "junctions"
             )
         following = [street for street in after[route[-1]] if street not in route]
         for street in following:
@@ -143,7 +152,8 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
 def _goes_on(network: Any, street: Street, following: Street) -> bool:
     """Return whether some lane of the second road continues one of the first."""
     return any(
-        _apart_m(a, b) <= GAP_M and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
+        _apart_m(a, b) <= GAP_M
+        and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
         for a in _lanes(network, street)
         for b in _lanes(network, following)
     )
@@ -159,7 +169,9 @@ def _apart_m(lane: Any, following: Any) -> float:
 
 
 def _variants(network: Any, route: Route) -> list[list[Lane]]:
-    """Return the lanes of a route's paths, from left to right: one path for each lane of its widest road."""
+    """Return the lanes of a route's paths, from left to right:
+    one path for each lane of its widest road.
+    """
     widest = max(range(len(route)), key=lambda n: len(_lanes(network, route[n])))
     variants = []
     for number in range(len(_lanes(network, route[widest]))):
@@ -175,7 +187,9 @@ def _variants(network: Any, route: Route) -> list[list[Lane]]:
 
 
 def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
-    """Return the lane of the next or previous road that joins a lane: by number, or else the nearest."""
+    """Return the lane of the next or previous road that joins a lane:
+    by number, or else the nearest.
+    """
     here, lanes = network.get_lane(lane), _lanes(network, street)
     if len(lanes) == len(_lanes(network, lane[:2])):
         return lane[2]
@@ -184,7 +198,9 @@ def _beside(network: Any, lane: Lane, street: Street, after: bool) -> int:
 
 
 def _labels(network: Any, every: Sequence[Route]) -> list[str]:
-    """Name routes by their turn if that is unique among those of one beginning, or else by their end."""
+    """Name routes by their turn if that is unique among those of one beginning,
+    or else by their end.
+    """
     turns = [(route[0][0], _turn(network, route)) for route in every]
     ends = [(route[0][0], f"to {route[-1][1]}") for route in every]
     by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)

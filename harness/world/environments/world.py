@@ -1,8 +1,10 @@
-"""Simulate an episode of an environment of highway-env, frame by frame; make a scenario of an environment.
+"""Simulate an episode of an environment of highway-env, frame by frame;
+make a scenario of an environment.
 
-`env.step` simulates a whole decision period and hides the frame in which something happened. So the frames
-are simulated here, as `env._simulate` does, and at the end of each period `env.step` is called without
-simulating frames: whatever an environment adds to it (new traffic, rewards, endings) happens as usual.
+`env.step` simulates a whole decision period and hides the frame in which something happened. So the
+frames are simulated here, as `env._simulate` does, and at the end of each period `env.step` is
+called without simulating frames: whatever an environment adds to it (new traffic, rewards, endings)
+happens as usual.
 """
 
 import copy
@@ -54,16 +56,20 @@ class EnvironmentWorld(World):
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """Start a seed's episode. Raises UserError if its road or the ego's way differs from seed 0's."""
+        """Start a seed's episode. Raises UserError if its road or the ego's way differs from seed
+        0's.
+        """
         name, env = scenario.name, reset(scenario.name, seed)
         here, ego = place(name), env.vehicle
         if ends_of(env.road.network) != here.ends:
             raise UserError(
-                f"{shown(name)}: its road is another in seed {seed} than in seed 0; fix it in its config"
+                f"{shown(name)}: its road is another in seed {seed} than in seed 0; fix it in its "
+                "config"
             )
         if not set(here.routes.keys(lane_of(ego), ego.route)).intersection(here.road.ways):
             raise UserError(
-                f"{shown(name)}: the ego starts on another road in seed {seed} than in seed 0; fix it in its "
+                f"{shown(name)}: the ego starts on another road in seed {seed} than in seed 0; fix "
+                "it in its "
                 "config"
             )
         layout = Layout((), _buildings(env, here.road.origin_m), None, None)
@@ -72,7 +78,9 @@ class EnvironmentWorld(World):
         ego.to_go_m = p.goal_s * first_target_mps(ego)
         world._enter(ego, "ego")
         traffic = (v for v in _solid(env.road) if v is not ego)
-        nearest = sorted(traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego)))
+        nearest = sorted(
+            traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego))
+        )
         for n, v in enumerate(nearest):
             world._enter(v, "helper" if n < p.helpers else "other")
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
@@ -103,7 +111,8 @@ class EnvironmentWorld(World):
         self.born += 1
         if self.born > MOST_VEHICLES:
             raise UserError(
-                f"{shown(self.scenario.name)}: more than {MOST_VEHICLES} vehicles; set fewer in its config"
+                f"{shown(self.scenario.name)}: more than {MOST_VEHICLES} vehicles; set fewer in "
+                "its config"
             )
         v.spawn, v.braking = Spawn(f"v{self.born}", _kind(v), part, "", "", 0.0, 0.0), False
         self._place(v)
@@ -143,7 +152,10 @@ class EnvironmentWorld(World):
 
     def target_after(self, action: str, agent: int = 0) -> Target:
         ego, kept = self.everybody[0], (self.action, self.taken)
-        own = {name: list(value) if isinstance(value, list) else value for name, value in vars(ego).items()}
+        own = {
+            name: list(value) if isinstance(value, list) else value
+            for name, value in vars(ego).items()
+        }
         self.take(action)
         target = self.target()
         vars(ego).update(own)
@@ -164,20 +176,28 @@ class EnvironmentWorld(World):
         if frames:
             poses = self._in_road_frame(frames)
             sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
-            [gap_m] = least_gaps_m(poses[None], sizes_m, np.array([self.outcome.least_gap_m])).tolist()
-            first, hz = np.array([self.frame + 1 - len(frames)]), self.scenario.parameters.simulation_hz
+            [gap_m] = least_gaps_m(
+                poses[None], sizes_m, np.array([self.outcome.least_gap_m])
+            ).tolist()
+            first, hz = (
+                np.array([self.frame + 1 - len(frames)]),
+                self.scenario.parameters.simulation_hz,
+            )
             [conflicts] = observe([self.journey.conflicts], poses[None], sizes_m, first, hz)
             self.passed(poses)
             speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
             self.journey.passed(speeds_mps, gap_m, conflicts, hz)
 
     def _recast(self) -> None:
-        """Remove vehicles that have left, and add new ones. Raises UserError if the ego has left."""
+        """Remove vehicles that have left, and add new ones.
+        Raises UserError if the ego has left.
+        """
         solid = _solid(self.road)
         present, places = {id(v) for v in solid}, {id(v): n for n, v in enumerate(self.everybody)}
         if id(self.everybody[0]) not in present:
             raise UserError(
-                f"{shown(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep it in "
+                f"{shown(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep "
+                "it in "
                 "self.road.vehicles, collidable and solid"
             )
         self.everybody = [v for v in self.everybody if id(v) in present]
@@ -238,23 +258,31 @@ class EnvironmentWorld(World):
 
 def _reads_observations(env: Any) -> bool:
     """Return whether observations, each as slow as many frames, affect the episode."""
-    own = any(not f.__module__.startswith("highway_env.") for f in (type(env).step, type(env)._info))
+    own = any(
+        not f.__module__.startswith("highway_env.") for f in (type(env).step, type(env)._info)
+    )
     return own or type(env.observation_type).__name__ == "KinematicsGoalObservation"
 
 
 def _kind(v: Any) -> Kind:
     """Return the kind whose size is nearest to the vehicle's."""
     kinds: tuple[Kind, ...] = ("car", "van", "truck")
-    return min(kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH))
+    return min(
+        kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH)
+    )
 
 
 def _solid(road: Any) -> list[Any]:
-    """Return the vehicles that can be hit: one that collides with nothing hides nothing, and helps nobody."""
+    """Return the vehicles that can be hit:
+    one that collides with nothing hides nothing, and helps nobody.
+    """
     return list(filter(hittable, road.vehicles))
 
 
 def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
-    """Return the solid objects nearest to the ego as buildings, by their axis-parallel bounding boxes."""
+    """Return the solid objects nearest to the ego as buildings,
+    by their axis-parallel bounding boxes.
+    """
     solid = sorted(filter(hittable, env.road.objects), key=partial(_apart_m, env.vehicle))
     boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
     return tuple(
@@ -271,13 +299,15 @@ def _apart_m(first: Any, second: Any) -> float:
 def scenario(name: str) -> Scenario:
     """Make a scenario of an environment. Raises UserError if there is none, or it lacks something.
 
-    The harness knows neither an environment's layout nor a danger, and the environment says who has cleared.
+    The harness knows neither an environment's layout nor a danger,
+    and the environment says who has cleared.
     """
     here = place(name)
     where = here.road.ego[1].partition(" lane ")[0]
     return Scenario(
         name=name,
-        description=f"Scenario {name}: {here.kind} of highway-env, with its own vehicles and traffic.\n",
+        description=f"Scenario {name}: {here.kind} of highway-env, "
+        "with its own vehicles and traffic.\n",
         actions=here.actions,
         parameters=here.parameters,
         road=lambda: here.road,

@@ -1,11 +1,12 @@
 """Render the pictures of a vehicle's cameras: the front above the rear, each 120° wide.
 
-Both are pinhole cameras at the vehicle's centre, where the rays of its sensors start as well (`rays`). A
-vehicle that the sensors do not report owns no pixel, and a column of pixels sees past a vehicle only what is
-higher. A frame is a pure function of the state, so datasets store none.
+Both are pinhole cameras at the vehicle's centre, where the rays of its sensors start as well
+(`rays`). A vehicle that the sensors do not report owns no pixel, and a column of pixels sees past a
+vehicle only what is higher. A frame is a pure function of the state, so datasets store none.
 
-Everything is a box on a flat road: what is on the far side of a lower one shows above it. Heights, paint and
-lamps are declared for this harness; light and weather are those of `harness.world.ambient`.
+Everything is a box on a flat road: what is on the far side of a lower one shows above it. Heights,
+paint and lamps are declared for this harness; light and weather are those of
+`harness.world.ambient`.
 """
 
 import math
@@ -34,7 +35,8 @@ SIZE_PX = (512, 256)  # width and height of both cameras' pictures together
 EYE_M = 1.4  # height of a camera above the road
 BUILDING_M = 6.0
 HORIZON = 0.36  # share of a camera's rows that are above the horizon
-REACH_M, CELL_M = 160.0, 0.2  # reach of the ground map from the origin (grass beyond), and its cell size
+# reach of the ground map from the origin (grass beyond), and its cell size
+REACH_M, CELL_M = 160.0, 0.2
 BLOCK = 32  # cells of the map along a side of what is judged at once
 LINE_M = 0.4  # width of a painted line
 DASH_M, GAP_M = 3.0, 4.5
@@ -46,9 +48,21 @@ GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
 WALL, BRICK = (182, 166, 142), (150, 132, 108)
 ROWS, COLUMNS = 32, 48  # resolution of the paint on a wall
 GLASS, TYRE, PLATE = (38, 48, 60), (28, 28, 30), (226, 226, 220)
-HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (250, 246, 222), (128, 22, 26), (255, 36, 32), (255, 170, 20)
+HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (
+    (250, 246, 222),
+    (128, 22, 26),
+    (255, 36, 32),
+    (255, 170, 20),
+)
 # No coat has the colour of a lamp.
-COATS = ((36, 74, 140), (226, 228, 230), (56, 58, 62), (146, 150, 156), (44, 102, 70), (196, 176, 138))
+COATS = (
+    (36, 74, 140),
+    (226, 228, 230),
+    (56, 58, 62),
+    (146, 150, 156),
+    (44, 102, 70),
+    (196, 176, 138),
+)
 FRONT, RIGHT, REAR, LEFT = range(4)  # walls of a vehicle, as `VehicleState.corners` has them
 SHADE = np.array([0.96, 0.80, 0.88, 0.72])
 LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
@@ -57,7 +71,8 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 class Frame(Image):
     """A picture of a vehicle's cameras, with the ids of the vehicles and buildings that it shows.
 
-    `owners` are the places in `ids` of what each pixel shows, (height, width); -1 for road, grass and sky.
+    `owners` are the places in `ids` of what each pixel shows, (height, width);
+    -1 for road, grass and sky.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
@@ -65,19 +80,27 @@ class Frame(Image):
         self.owners, self.ids = owners, ids
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
-        """Return each object's bounding boxes in either half: left, top, right and bottom (exclusive)."""
+        """Return each object's bounding boxes in either half:
+        left, top, right and bottom (exclusive).
+        """
         half, boxes = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
         for place, name in enumerate(self.ids):
             for top in (0, half):
                 rows, columns = np.nonzero(self.owners[top : top + half] == place)
                 if len(rows):
                     box = columns.min(), top + rows.min(), columns.max() + 1, top + rows.max() + 1
-                    boxes.setdefault(name, []).append((int(box[0]), int(box[1]), int(box[2]), int(box[3])))
+                    boxes.setdefault(name, []).append(
+                        (int(box[0]), int(box[1]), int(box[2]), int(box[3]))
+                    )
         return boxes
 
 
-def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX) -> Frame:
-    """Render the cameras of one vehicle, in a picture of this width and height; the height is even."""
+def frame(
+    scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX
+) -> Frame:
+    """Render the cameras of one vehicle, in a picture of this width and height;
+    the height is even.
+    """
     width, height = size_px
     viewer = state.vehicle(viewer_id)
     ambient = scenario.parameters.light
@@ -90,16 +113,20 @@ def frame(scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[
     pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
     if ambient.glare_rad:
         sun = sun_rad(state.episode_seed) - viewer.heading_rad
-        pixels = np.concatenate([
-            _dazzling(half, sun - turned, ambient)
-            for half, turned in zip(np.split(pixels, 2), (0.0, np.pi), strict=True)
-        ])  # fmt: skip
+        pixels = np.concatenate(
+            [
+                _dazzling(half, sun - turned, ambient)
+                for half, turned in zip(np.split(pixels, 2), (0.0, np.pi), strict=True)
+            ]
+        )
     return Frame(pixels, owners, tuple(box.name for box in boxes))
 
 
 @dataclass(frozen=True, eq=False)
 class Sight(Image):
-    """A frame that is rendered when its pixels are read, and not stored; it is pickled as its pixels."""
+    """A frame that is rendered when its pixels are read, and not stored;
+    it is pickled as its pixels.
+    """
 
     scenario: Scenario
     state: WorldState
@@ -139,12 +166,20 @@ def focal_px(width: int) -> float:
 
 
 def _half(
-    scenario: Scenario, viewer: VehicleState, boxes: list[Box], turned_rad: float, width: int, rows: int
+    scenario: Scenario,
+    viewer: VehicleState,
+    boxes: list[Box],
+    turned_rad: float,
+    width: int,
+    rows: int,
 ) -> tuple[Pixels, Places]:
     """Render pixels and owners of one camera, (rows, width, ...)."""
     eye, focal = np.array([viewer.x_m, viewer.y_m]), focal_px(width)
     heading = viewer.heading_rad + turned_rad
-    ahead, right = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    ahead, right = (
+        np.array([np.cos(heading), np.sin(heading)]),
+        np.array([-np.sin(heading), np.cos(heading)]),
+    )
     # A column's ray has a component of 1 m ahead, so that its parameter is the depth in metres.
     across = (np.arange(width) + 0.5 - width / 2) / focal
     rays = ahead + across[:, None] * right
@@ -158,10 +193,15 @@ def _half(
     t, along = t.reshape(width, -1, 4), along.reshape(width, -1, 4)
     wall = t.argmin(axis=2)
     depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
-    heights, walls = np.array([box.height_m for box in boxes]), np.array([box.walls for box in boxes])
+    heights, walls = (
+        np.array([box.height_m for box in boxes]),
+        np.array([box.walls for box in boxes]),
+    )
     lamps = np.array([box.lamps for box in boxes])
     near_first = np.argsort(depth, axis=1, kind="stable")
-    up_to_m = np.where(np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0)
+    up_to_m = np.where(
+        np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0
+    )
     nearer_m = np.pad(np.maximum.accumulate(up_to_m, axis=1), ((0, 0), (1, 0)))[:, :-1]
     # All boxes are higher than the camera, so one shows only if it is higher than all nearer ones.
     for place, shows in reversed(list(zip(near_first.T, (up_to_m > nearer_m).T, strict=True))):
@@ -176,9 +216,10 @@ def _half(
         shades = SHADE[side, None, None] * walls[box, side, :, onward]
         # A strip for each column, from the road up.
         strips = np.where(
-            lamps[box, side, :, onward][..., None], _hazy(shades, z[:, None], LAMPS),
+            lamps[box, side, :, onward][..., None],
+            _hazy(shades, z[:, None], LAMPS),
             _hazy(ambient.light * shades, z[:, None], ambient),
-        ).astype(np.uint8)  # fmt: skip
+        ).astype(np.uint8)
         up = (height_m[row, column] * (ROWS / heights[box])[column]).astype(int)
         at = row * width + columns[column]
         pixels.reshape(-1, 3)[at] = strips[column, up]
@@ -189,16 +230,21 @@ def _half(
 def _vehicle(state: WorldState, v: VehicleState) -> Box:
     """Return the box of a vehicle with its lamps; the colour of its coat tells nothing about it."""
     coat = COATS[int(noise.uniforms((1,), "coat", state.episode_seed, v.id)[0] * len(COATS))]
-    return Box(v.id, v.corners(), HEIGHTS_M[v.kind], *_vehicle_walls(v.kind, coat, v.indicator, v.braking))
+    return Box(
+        v.id, v.corners(), HEIGHTS_M[v.kind], *_vehicle_walls(v.kind, coat, v.indicator, v.braking)
+    )
 
 
 @lru_cache(maxsize=256)
 def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tuple[Pixels, Lit]:
-    """Paint the walls of a vehicle from the road up; return them and which parts are shining lamps."""
+    """Paint the walls of a vehicle from the road up;
+    return them and which parts are shining lamps.
+    """
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = coat
     low, high = {"car": (0.55, 0.92), "van": (0.52, 0.86), "truck": (0.45, 0.72)}[kind]
-    cab = {"car": 0.80, "van": 0.28, "truck": 0.20}[kind]  # of the length, from the front, that has windows
+    # of the length, from the front, that has windows
+    cab = {"car": 0.80, "van": 0.28, "truck": 0.20}[kind]
     side = (low, high, 0.06 if kind != "car" else 0.18, cab)
     _paint(walls[FRONT], (low, high, 0.08, 0.92), GLASS)
     _paint(walls[REAR], (low, high, 0.12, 0.88), GLASS if kind == "car" else PLATE)
@@ -210,9 +256,12 @@ def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tu
     dark = walls.copy()
     for mirrored in (False, True):
         _paint(walls[FRONT], (0.30, 0.44, 0.04, 0.20), HEADLAMP, mirrored)
-        _paint(walls[REAR], (0.30, 0.50, 0.02, 0.20), BRAKE_LAMP if braking else REAR_LAMP, mirrored)
+        _paint(
+            walls[REAR], (0.30, 0.50, 0.02, 0.20), BRAKE_LAMP if braking else REAR_LAMP, mirrored
+        )
     if indicator != "off":
-        to_right = indicator == "right"  # the front wall begins at the left, the rear one at the right
+        # the front wall begins at the left, the rear one at the right
+        to_right = indicator == "right"
         _paint(walls[FRONT], (0.44, 0.58, 0.0, 0.16), AMBER, to_right)
         _paint(walls[REAR], (0.50, 0.64, 0.0, 0.16), AMBER, not to_right)
         _paint(walls[RIGHT if to_right else LEFT], (0.30, 0.45, 0.0, 0.08), AMBER, not to_right)
@@ -235,11 +284,15 @@ def _building_walls() -> tuple[Pixels, Lit]:
 def _paint(
     wall: Pixels, part: tuple[float, float, float, float], colour: Colour, mirrored: bool = False
 ) -> None:
-    """Paint a rectangle, given by shares of the wall's height and length (bottom, top, start, end)."""
+    """Paint a rectangle, given by shares of the wall's height and length (bottom, top, start,
+    end).
+    """
     bottom, top, start, end = part
     if mirrored:
         start, end = 1 - end, 1 - start
-    wall[round(bottom * ROWS) : round(top * ROWS), round(start * COLUMNS) : round(end * COLUMNS)] = colour
+    wall[
+        round(bottom * ROWS) : round(top * ROWS), round(start * COLUMNS) : round(end * COLUMNS)
+    ] = colour
 
 
 def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) -> Pixels:
@@ -253,9 +306,10 @@ def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) ->
     ground = _ground_map(scenario)
     x, y = (
         ((np.multiply.outer(depth_m, rays[:, k]) + (eye[k] + REACH_M)) / CELL_M)
-        .astype(np.int32).clip(0, len(ground) - 1)
+        .astype(np.int32)
+        .clip(0, len(ground) - 1)
         for k in (0, 1)
-    )  # fmt: skip
+    )
     # Of each row.
     colours = _hazy(ambient.light * np.array([GRASS, ASPHALT, PAINT]), depth_m[:, None], ambient)
     what = ground[y, x] + 3 * np.arange(len(depth_m))[:, None]
@@ -279,7 +333,9 @@ def _dazzling(pixels: Pixels, sun_rad: float, ambient: Ambient) -> Pixels:
 
 @lru_cache(maxsize=8)
 def _ground_map(scenario: Scenario) -> Pixels:
-    """Map the ground in cells of `CELL_M`, (y, x) from the north-west: 0 grass, 1 asphalt, 2 paint."""
+    """Map the ground in cells of `CELL_M`, (y, x) from the north-west:
+    0 grass, 1 asphalt, 2 paint.
+    """
     ground = scenario.road().ground_within(REACH_M)
     middles = (np.arange(round(2 * REACH_M / CELL_M)) + 0.5) * CELL_M - REACH_M
     edges = [shapely.Polygon(edge * NORTH) for edge in ground.outlines]
@@ -294,16 +350,19 @@ def _ground_map(scenario: Scenario) -> Pixels:
     for line in (*marks, *(edge.exterior for edge in edges)):
         row, column, inside = _inside(line.buffer(LINE_M / 2, cap_style="flat"), sides)
         blocks[row, column] = np.where(inside & (blocks[row, column] > 0), 2, blocks[row, column])
-    surface[[0, -1]] = surface[:, [0, -1]] = 0  # grass, since look-ups beyond the map are clipped to its edge
+    # grass, since look-ups beyond the map are clipped to its edge
+    surface[[0, -1]] = surface[:, [0, -1]] = 0
     return surface
 
 
 def _inside(
     area: shapely.Geometry, sides: Floats
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the blocks that an area touches, by row and column, and which of each one's cells lie in it.
+    """Return the blocks that an area touches, by row and column,
+    and which of each one's cells lie in it.
 
-    `sides` are the middles of the cells along each side of the map, block by block, (blocks, BLOCK) m.
+    `sides` are the middles of the cells along each side of the map, block by block,
+    (blocks, BLOCK) m.
     """
     west, north, east, south = area.bounds
     columns = np.flatnonzero((sides[:, -1] >= west) & (sides[:, 0] <= east))
@@ -315,7 +374,9 @@ def _inside(
     column, row, boxes = column[touched], row[touched], boxes[touched]
     inside = np.ones((len(boxes), BLOCK, BLOCK), dtype=bool)
     part = ~shapely.contains_properly(area, boxes)
-    inside[part] = shapely.contains_xy(area, sides[column[part], None, :], sides[row[part], :, None])
+    inside[part] = shapely.contains_xy(
+        area, sides[column[part], None, :], sides[row[part], :, None]
+    )
     return row, column, inside
 
 

@@ -85,12 +85,18 @@ def tenths(value: float) -> float:
 def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     """Return where vehicles are, each on the path that it seems to follow.
 
-    That is the nearest that fits its heading and indicator; of equally good paths, the road's first one.
+    That is the nearest that fits its heading and indicator;
+    of equally good paths, the road's first one.
     """
-    x, y, own = np.array(
-        [(d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad) for d in detections]
-    ).reshape(-1, 3).T  # fmt: skip
-    projected = np.stack([path.project_all(x, y) for path in road.paths.values()], axis=-1)  # (3, n, paths)
+    x, y, own = (
+        np.array(
+            [(d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad) for d in detections]
+        )
+        .reshape(-1, 3)
+        .T
+    )
+    # (3, n, paths)
+    projected = np.stack([path.project_all(x, y) for path in road.paths.values()], axis=-1)
     thing, path = np.nonzero(projected[1] <= ON_PATH_M)
     arc, lateral, heading = projected[:, thing, path]
     cos = np.cos(own[thing] - heading)
@@ -124,14 +130,19 @@ def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]
         for n, conflict in _along(road, all_known):
             met[n].append(conflict)
     for n, known in enumerate(all_known):
-        # Who comes on a path of its own through a lane that both share has one place to meet, the crossing.
-        if all(conflict.kind == "oncoming" for conflict in met[n]) and (meeting := _meeting(road, known)):
+        # Who comes on a path of its own through a lane that both share has one place to meet, the
+        # crossing.
+        if all(conflict.kind == "oncoming" for conflict in met[n]) and (
+            meeting := _meeting(road, known)
+        ):
             met[n] = [meeting]
     return met
 
 
 def _meeting(road: Road, known: Encounter) -> Conflict | None:
-    """Return the conflict where another's path crosses or merges into the ego's; None if one is past it."""
+    """Return the conflict where another's path crosses or merges into the ego's;
+    None if one is past it.
+    """
     crossing = road.crossings.get(known.key)
     if crossing is None:
         return None
@@ -139,15 +150,20 @@ def _meeting(road: Road, known: Encounter) -> Conflict | None:
     length = SIZES_M[d.kind or "car"][0]
     if road.ways and road.paths[known.own].project(crossing.x_m, crossing.y_m)[1] > ON_PATH_M:
         return None  # it meets another of the ego's ways
-    to_go, ego_to_go = crossing.other_arc_m - known.place.arc_m, crossing.ego_arc_m - known.ego_arc_m
+    to_go, ego_to_go = (
+        crossing.other_arc_m - known.place.arc_m,
+        crossing.ego_arc_m - known.ego_arc_m,
+    )
     if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
         return None
     return Conflict(
-        d.id, *known.key, known.seat.relative(crossing.x_m, crossing.y_m),
+        d.id,
+        *known.key,
+        known.seat.relative(crossing.x_m, crossing.y_m),
         EgoArrival(tenths(ego_to_go), _time_s(ego_to_go, ego.speed_mps)),
         known.arrival(to_go, _time_s(to_go, d.speed_mps)),
         *((crossing.kind, "own") if road.form == 2 else ()),
-    )  # fmt: skip
+    )
 
 
 def _time_s(to_go_m: float, speed_mps: float) -> float | None:
@@ -158,13 +174,15 @@ def _time_s(to_go_m: float, speed_mps: float) -> float | None:
 def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Conflict]]:
     """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
 
-    Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a distance to
-    go; of two that meet head-on, both have.
+    Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a
+    distance to go; of two that meet head-on, both have.
     """
     shared = [
-        (n, side, key) for n, known in enumerate(all_known) for side, key in road.beside(known.own).items()
+        (n, side, key)
+        for n, known in enumerate(all_known)
+        for side, key in road.beside(known.own).items()
         if key in known.place.near
-    ]  # fmt: skip
+    ]
     apart = _apart(road, [(all_known[n], key) for n, _, key in shared])
     its_heading = _at(road, [(known.key, known.place.arc_m) for known in all_known])[:, 2]
     numbers = [n for n, _, _ in shared]
@@ -186,14 +204,28 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
         time_s = tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
         pairs.append((n, side, key, kind, gap, share, time_s))
     points = _at(
-        road, [(key, all_known[n].ego_arc_m + max(gap, 0.0) * share) for n, _, key, _, gap, share, _ in pairs]
+        road,
+        [
+            (key, all_known[n].ego_arc_m + max(gap, 0.0) * share)
+            for n, _, key, _, gap, share, _ in pairs
+        ],
     )
-    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(pairs, points.tolist(), strict=True):
+    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(
+        pairs, points.tolist(), strict=True
+    ):
         known = all_known[n]
-        yield n, Conflict(
-            known.d.id, *known.key, known.seat.relative(x, y), EgoArrival(tenths(abs(gap) * share), time_s),
-            known.arrival(abs(gap) * (1 - share), time_s), kind, side,
-        )  # fmt: skip
+        yield (
+            n,
+            Conflict(
+                known.d.id,
+                *known.key,
+                known.seat.relative(x, y),
+                EgoArrival(tenths(abs(gap) * share), time_s),
+                known.arrival(abs(gap) * (1 - share), time_s),
+                kind,
+                side,
+            ),
+        )
 
 
 def _apart(road: Road, shared: Sequence[tuple[Encounter, PathKey]]) -> list[bool]:
@@ -212,5 +244,7 @@ def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:
     for n, (key, _) in enumerate(asked):
         places[key].append(n)
     for key, numbers in places.items():
-        poses[numbers] = np.stack(road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1)
+        poses[numbers] = np.stack(
+            road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1
+        )
     return poses

@@ -12,7 +12,16 @@ from harness.world.perception.rays import Look, Surfaces, hidden, surfaces
 from harness.world.perception.sensors import Detection, among, reports
 from harness.world.road import Road
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import BY_BEACON, Conflict, Ego, Node, Role, SceneGraph, Sector, Viewer
+from harness.world.scene_graph import (
+    BY_BEACON,
+    Conflict,
+    Ego,
+    Node,
+    Role,
+    SceneGraph,
+    Sector,
+    Viewer,
+)
 from harness.world.state import Part, VehicleState, WorldState
 
 OCCLUDED_BELOW = 0.5  # share of a sector in sight below which the sector counts as occluded
@@ -23,7 +32,9 @@ AT_ONCE = 32  # the rays of more viewers do not fit into the processor's cache
 def scene_graph(
     scenario: Scenario, state: WorldState, viewer_id: str, left_out: Collection[str] = ()
 ) -> SceneGraph:
-    """Return the scene graph of one vehicle's sensors; ids in `left_out` are treated as undetected."""
+    """Return the scene graph of one vehicle's sensors;
+    ids in `left_out` are treated as undetected.
+    """
     [graph] = scene_graphs(scenario, [(state, viewer_id)], left_out)
     return graph
 
@@ -33,15 +44,20 @@ def scene_graphs(
 ) -> list[SceneGraph]:
     """Return the scene graphs of some states, each as the vehicle with an id sees it."""
     return [
-        graph for begin in range(0, len(looks), AT_ONCE)
+        graph
+        for begin in range(0, len(looks), AT_ONCE)
         for graph in _perceived(
-            scenario, [(s, s.vehicle(viewer)) for s, viewer in looks[begin : begin + AT_ONCE]], left_out
+            scenario,
+            [(s, s.vehicle(viewer)) for s, viewer in looks[begin : begin + AT_ONCE]],
+            left_out,
         )
-    ]  # fmt: skip
+    ]
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
-    """Return the ego's graph with everything in view and no noise, which only `full-view` may read."""
+    """Return the ego's graph with everything in view and no noise,
+    which only `full-view` may read.
+    """
     [graph] = truth_graphs(scenario, [state])
     return graph
 
@@ -49,16 +65,29 @@ def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
     """Return the `truth_graph` of each state."""
     exact = [list(map(_exact, state.vehicles[1:])) for state in states]
-    return listed_graphs(scenario, [(state, state.ego) for state in states], exact, [[] for _ in states])
+    return listed_graphs(
+        scenario, [(state, state.ego) for state in states], exact, [[] for _ in states]
+    )
 
 
 def _exact(v: VehicleState) -> Detection:
     return Detection(
-        v.id, ("truth",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
+        v.id,
+        ("truth",),
+        v.kind,
+        v.indicator,
+        v.x_m,
+        v.y_m,
+        v.heading_rad,
+        v.speed_mps,
+        None,
+        v.braking,
     )
 
 
-def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]) -> list[SceneGraph]:
+def _perceived(
+    scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]
+) -> list[SceneGraph]:
     around = surfaces(looks)
     reported = reports(looks, around, scenario.parameters)
     detected: list[list[Detection]] = [[] for _ in looks]
@@ -75,9 +104,11 @@ def _perceived(scenario: Scenario, looks: Sequence[Look], left_out: Collection[s
 def _announced(
     scenario: Scenario, state: WorldState, viewer: VehicleState, known: Collection[str]
 ) -> Iterator[Detection]:
-    """Yield who else sends beacons, by the last one that the viewer has; nobody without a radio has any.
+    """Yield who else sends beacons, by the last one that the viewer has;
+    nobody without a radio has any.
 
-    Helpers are among them if they have goals of their own, since only then they may be in the ego's way.
+    Helpers are among them if they have goals of their own,
+    since only then they may be in the ego's way.
     """
     for v in state.vehicles:
         sends = v.radio or (scenario.seats is not None and v.part == "helper")
@@ -90,9 +121,11 @@ def _announced(
 
 
 def listed_graphs(
-    scenario: Scenario, looks: Sequence[Look], detected: Sequence[Sequence[Detection]],
+    scenario: Scenario,
+    looks: Sequence[Look],
+    detected: Sequence[Sequence[Detection]],
     sectors: Sequence[Sequence[Sector]],
-) -> list[SceneGraph]:  # fmt: skip
+) -> list[SceneGraph]:
     """Return the graph of each viewer, of what it detected and of its sectors."""
     if not looks:
         return []
@@ -103,7 +136,9 @@ def listed_graphs(
     ego_arcs, own_arcs = (_arcs(road, vehicles) for vehicles in (egos, viewers))
     x, y, heading = np.array([(v.x_m, v.y_m, v.heading_rad) for v in viewers]).T
     zone_m = np.hypot(x - road.zone_m[0], y - road.zone_m[1]).tolist()
-    places_m = zip(x.tolist(), y.tolist(), np.cos(heading).tolist(), np.sin(heading).tolist(), strict=True)
+    places_m = zip(
+        x.tolist(), y.tolist(), np.cos(heading).tolist(), np.sin(heading).tolist(), strict=True
+    )
     seats = [Seat(*place) for place in places_m]
     # The viewer itself may be in the ego's way, too.
     listed = [
@@ -115,8 +150,9 @@ def listed_graphs(
     kept = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
     known = [
         Encounter(seats[n], d, where[k], egos[n], ego_arcs[n], scenario.brake_lamps)
-        for k in kept for n, d in [things[k]]
-    ]  # fmt: skip
+        for k in kept
+        for n, d in [things[k]]
+    ]
     met: list[list[Conflict]] = [[] for _ in looks]
     for k, some in zip(kept, conflicts(road, known), strict=True):
         met[things[k][0]] += some
@@ -127,27 +163,45 @@ def listed_graphs(
         if d.id != viewers[n].id:
             lane = road.paths[place.key].lane_role(place.arc_m) if place.key else "off-lane"
             at = seats[n].relative(d.x_m, d.y_m)
-            nodes[n].append(Node(
-                d.id, d.kind or "vehicle", at.forward_m, at.left_m,
-                None if d.heading_rad is None else round(aside_deg), tenths(d.speed_mps),
-                None if d.range_rate_mps is None else tenths(d.range_rate_mps), lane, d.indicator, d.sensors,
-                d.braking if scenario.brake_lamps else UNSET,
-            ))  # fmt: skip
+            nodes[n].append(
+                Node(
+                    d.id,
+                    d.kind or "vehicle",
+                    at.forward_m,
+                    at.left_m,
+                    None if d.heading_rad is None else round(aside_deg),
+                    tenths(d.speed_mps),
+                    None if d.range_rate_mps is None else tenths(d.range_rate_mps),
+                    lane,
+                    d.indicator,
+                    d.sensors,
+                    d.braking if scenario.brake_lamps else UNSET,
+                )
+            )
     graphs = []
     for n, ((state, viewer), ego, beacon) in enumerate(zip(looks, egos, beacons, strict=True)):
         at = seats[n].relative(ego.x_m, ego.y_m)
         stated = beacon.target_speed_mps if beacon else None
         itself = Viewer(
-            tenths(viewer.speed_mps), road.paths[viewer.approach, viewer.route].lane_role(own_arcs[n]),
-            tenths(zone_m[n]), UNSET if road.form == 1 else viewer.kind,
-        )  # fmt: skip
+            tenths(viewer.speed_mps),
+            road.paths[viewer.approach, viewer.route].lane_role(own_arcs[n]),
+            tenths(zone_m[n]),
+            UNSET if road.form == 1 else viewer.kind,
+        )
         known_ego = Ego(
-            ego.id, tenths(ego.speed_mps), state.target_speed_mps if stated is None else stated,
+            ego.id,
+            tenths(ego.speed_mps),
+            state.target_speed_mps if stated is None else stated,
             round(state.time_s - beacon.time_s, 2) if beacon else 0.0,
-            tenths(road.zone_arc_m - ego_arcs[n]), at.forward_m, at.left_m, ego.route if road.ways else UNSET,
-        )  # fmt: skip
+            tenths(road.zone_arc_m - ego_arcs[n]),
+            at.forward_m,
+            at.left_m,
+            ego.route if road.ways else UNSET,
+        )
         knows = tuple(nodes[n]), tuple(met[n]), tuple(sectors[n])
-        graphs.append(SceneGraph(viewer.id, ROLES[viewer.part], state.step, itself, known_ego, *knows))
+        graphs.append(
+            SceneGraph(viewer.id, ROLES[viewer.part], state.step, itself, known_ego, *knows)
+        )
     return graphs
 
 
@@ -159,7 +213,8 @@ def _arcs(road: Road, vehicles: Sequence[VehicleState]) -> list[float]:
 
 
 def _sectors(road: Road, around: Surfaces, solid: Bools) -> list[list[Sector]]:
-    """Return the share of each sector's points in each viewer's sight, and which known objects hide the rest.
+    """Return the share of each sector's points in each viewer's sight,
+    and which known objects hide the rest.
 
     Known are the surfaces that are `solid`, (n,).
     """

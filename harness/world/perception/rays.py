@@ -24,12 +24,15 @@ class Sweep:
 
     bearing_rad: Floats  # direction of each ray in the world frame, (RAYS,)
     range_m: Floats  # distance to the first surface, (RAYS,); inf if there is none
-    hits: dict[str, NDArray[np.intp]]  # indices of the rays that end on each vehicle or building, by id
+    # indices of the rays that end on each vehicle or building, by id
+    hits: dict[str, NDArray[np.intp]]
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What stops the rays of some viewers (v), viewer by viewer: other vehicles in their order, buildings."""
+    """What stops the rays of some viewers (v), viewer by viewer:
+    other vehicles in their order, buildings.
+    """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
     ids: tuple[tuple[str, ...], ...]  # ids of each viewer's surfaces
@@ -39,7 +42,9 @@ class Surfaces:
     corners_m: Floats  # its corners, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
-        """Lay values of the surfaces (n,) out as (v, most surfaces of one); 0 or false without a surface."""
+        """Lay values of the surfaces (n,) out as (v, most surfaces of one);
+        0 or false without a surface.
+        """
         table = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
         table[self.viewer, self.place] = values
         return table
@@ -53,7 +58,9 @@ def turned(angle_rad: Any) -> Any:
 def surfaces(looks: Sequence[Look]) -> Surfaces:
     """Return everything that stops a ray of each viewer, except the viewer itself."""
     states = {id(state): state for state, _ in looks}
-    vehicles = [(v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles]
+    vehicles = [
+        (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles
+    ]
     boxes = [building.corners() for state in states.values() for building in state.buildings]
     outlines = rectangle(*np.ascontiguousarray(np.array(vehicles).T))
     corners = np.concatenate([outlines, np.array(boxes).reshape(-1, 4, 2)])
@@ -73,23 +80,29 @@ def surfaces(looks: Sequence[Look]) -> Surfaces:
     whose = np.repeat(np.arange(len(looks)), sizes)
     place = np.concatenate([np.arange(size) for size in sizes])
     return Surfaces(
-        np.array([(v.x_m, v.y_m) for _, v in looks]), tuple(ids), whose, place,
-        place < np.array(counts)[whose], corners[np.array(at, dtype=int)],
-    )  # fmt: skip
+        np.array([(v.x_m, v.y_m) for _, v in looks]),
+        tuple(ids),
+        whose,
+        place,
+        place < np.array(counts)[whose],
+        corners[np.array(at, dtype=int)],
+    )
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
     """Intersect rays (r, 2) from a place (2,) with the walls of surfaces (n, 4, 2), all in metres.
 
-    Wall k of a surface goes from its corner k to the next. Returned are the ray parameter, (r, 4n), which is
-    1 at the target and inf if a wall is not met, and the position along the wall from 0 to 1, (r, 4n).
+    Wall k of a surface goes from its corner k to the next. Returned are the ray parameter, (r, 4n),
+    which is 1 at the target and inf if a wall is not met, and the position along the wall from 0 to
+    1, (r, 4n).
     """
     walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
     return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
 
 
 def _walls(origins: Floats, corners: Floats) -> Floats:
-    """Return what `_met` reads of the walls of surfaces (n, 4, 2) as seen from origins (n, 2), (5, 4, n).
+    """Return what `_met` reads of the walls of surfaces (n, 4, 2) as seen from origins (n, 2), (5,
+    4, n).
 
     These are x and y of a wall's beginning, those of its vector, and their cross product.
     """
@@ -99,7 +112,9 @@ def _walls(origins: Floats, corners: Floats) -> Floats:
 
 
 def _met(walls: Floats, ray_x: Floats, ray_y: Floats) -> tuple[Floats, Floats]:
-    """Compute `meetings` for walls (5, ...) and rays whose coordinates broadcast against each other."""
+    """Compute `meetings` for walls (5, ...) and rays whose coordinates broadcast against each
+    other.
+    """
     x, y, dx, dy, cross = walls
     # Solve origin + t * ray = start + u * along for every ray and edge by Cramer's rule.
     determinant = ray_x * dy - ray_y * dx
@@ -110,10 +125,12 @@ def _met(walls: Floats, ray_x: Floats, ray_y: Floats) -> tuple[Floats, Floats]:
 
 
 def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats, Ints]:
-    """Find which surface each target's ray meets first; of equally near ones, that with the lowest number.
+    """Find which surface each target's ray meets first;
+    of equally near ones, that with the lowest number.
 
-    A surface, by ascending number, may be met on the way to a target at ray parameter t, all (m,). Returned
-    are the ray parameter and the number of the surface, (targets,); inf and -1 if nothing is met.
+    A surface, by ascending number, may be met on the way to a target at ray parameter t, all (m,).
+    Returned are the ray parameter and the number of the surface, (targets,); inf and -1 if nothing
+    is met.
     """
     least, met = np.full(targets, np.inf), np.full(targets, -1)
     np.minimum.at(least, target, t)
@@ -140,7 +157,9 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     rays = cast(around, np.ones(len(around.place), dtype=bool))
     distance, met = _first(rays.surface, rays.target, rays.t, RAYS)
     hits = {name: np.flatnonzero(met == n) for n, name in enumerate(around.ids[0])}
-    return Sweep(_all_round()[0], distance, {name: rays for name, rays in hits.items() if len(rays)})
+    return Sweep(
+        _all_round()[0], distance, {name: rays for name, rays in hits.items() if len(rays)}
+    )
 
 
 def cast(around: Surfaces, of: Bools) -> Rays:
@@ -161,7 +180,8 @@ def cast(around: Surfaces, of: Bools) -> Rays:
 
 
 def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
-    """Return how many rays of its viewer come to each surface, (n,), if only `solid` ones (n,) stop any.
+    """Return how many rays of its viewer come to each surface, (n,),
+    if only `solid` ones (n,) stop any.
 
     Returned is also which surface stops the ray of each meeting, (m,); -1 if none does.
     """
@@ -169,11 +189,15 @@ def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
     ended = rays.of(stops)
     least, met = _first(ended.surface, ended.target, ended.t, len(around.ids) * RAYS)
     come = rays.surface[~stops & (rays.t < least[rays.target])]
-    return np.bincount(np.concatenate([met[met >= 0], come]), minlength=len(solid)), met[rays.target]
+    return np.bincount(np.concatenate([met[met >= 0], come]), minlength=len(solid)), met[
+        rays.target
+    ]
 
 
 def _towards(around: Surfaces) -> tuple[Ints, Ints]:
-    """Return the first ray that may meet each surface, (n,), and how many may, between its outer corners."""
+    """Return the first ray that may meet each surface, (n,), and how many may,
+    between its outer corners.
+    """
     to = around.corners_m - around.origins_m[around.viewer, None]
     bearing = np.arctan2(to[..., 1], to[..., 0])
     aside = turned(bearing - bearing[:, :1])
@@ -187,13 +211,16 @@ def _towards(around: Surfaces) -> tuple[Ints, Ints]:
 
 @lru_cache(maxsize=1)
 def _all_round() -> tuple[Floats, Floats]:
-    """Return bearings (RAYS,) and their directions (2, RAYS); shared arrays, not to be written to."""
+    """Return bearings (RAYS,) and their directions (2, RAYS);
+    shared arrays, not to be written to.
+    """
     bearing = np.linspace(0, 2 * np.pi, RAYS, endpoint=False)
     return bearing, np.stack([np.cos(bearing), np.sin(bearing)])
 
 
 def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
-    """Return for each viewer and each of the points (k, 2) which surface hides it, (v, k); -1 if it is seen.
+    """Return for each viewer and each of the points (k, 2) which surface hides it, (v, k);
+    -1 if it is seen.
 
     Surfaces hide nothing where `solid` (n,) is false.
     """
@@ -203,12 +230,16 @@ def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
     x, y = points.T[:, None] - around.origins_m.T[..., None]
     t, _ = _met(walls[..., None], x[viewer], y[viewer])
     target = viewer[:, None] * len(points) + np.arange(len(points))
-    least, met = _first(np.repeat(surface, len(points)), target.ravel(), t.min(axis=0).ravel(), x.size)
+    least, met = _first(
+        np.repeat(surface, len(points)), target.ravel(), t.min(axis=0).ravel(), x.size
+    )
     return np.where(least < 1, met, -1).reshape(x.shape)
 
 
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
-    """Return for each of the points (k, 2) the id of what blocks the view of it; None if it is seen."""
+    """Return for each of the points (k, 2) the id of what blocks the view of it;
+    None if it is seen.
+    """
     around = surfaces([(state, viewer)])
     met = hidden(around, points, np.ones(len(around.place), dtype=bool))
     return [around.ids[0][n] if n >= 0 else None for n in met[0].tolist()]

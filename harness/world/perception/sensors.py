@@ -1,11 +1,11 @@
 """The three sensors of every vehicle, with their range and their noise.
 
-LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8 m/s.
-Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°, range rate
-to 0.15 m/s, and tracking with it gives speed to 0.2 m/s.
-Camera: 60° to either side of the front and of the rear, 60 m by day and else as `harness.world.ambient`
-says; class and turn indicator. It never adds to a position, because the LiDAR sees all that it sees and
-places it better. Noise is Gaussian with those standard deviations (declared for this harness, typical of
+LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8
+m/s. Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°,
+range rate to 0.15 m/s, and tracking with it gives speed to 0.2 m/s. Camera: 60° to either side of
+the front and of the rear, 60 m by day and else as `harness.world.ambient` says; class and turn
+indicator. It never adds to a position, because the LiDAR sees all that it sees and places it
+better. Noise is Gaussian with those standard deviations (declared for this harness, typical of
 automotive data sheets, no particular product), keyed by episode, step, viewer and object.
 """
 
@@ -31,7 +31,8 @@ BEARING_NOISE_RAD = np.radians(1.0)  # of the radar
 SPEED_NOISE_MPS = {True: 0.2, False: 0.8}  # with the radar, or by the LiDAR's tracking alone
 # Names of the sensors that report, by whether each of them does.
 SENSORS = {
-    flags: tuple(compress(("camera", "lidar", "radar"), flags)) for flags in product((False, True), repeat=3)
+    flags: tuple(compress(("camera", "lidar", "radar"), flags))
+    for flags in product((False, True), repeat=3)
 }
 
 
@@ -41,12 +42,14 @@ class Detection(Struct, frozen=True):
     id: str  # the object's id (association across vehicles is assumed to be perfect)
     sensors: tuple[str, ...]  # those of `camera`, `lidar` and `radar` that reported it
     kind: Kind | None  # class from the camera; None without one
-    indicator: str | None  # turn indicator from the camera: `left`, `right` or `off`; None without one
+    # turn indicator from the camera: `left`, `right` or `off`; None without one
+    indicator: str | None
     x_m: float  # estimated position of the centre
     y_m: float  # estimated position of the centre
     heading_rad: float | None  # estimated heading; None if only the radar saw it
     speed_mps: float  # estimated speed
-    range_rate_mps: float | None  # range rate from the radar, negative when closing; None without one
+    # range rate from the radar, negative when closing; None without one
+    range_rate_mps: float | None
     braking: bool | None = None  # whether it is seen to brake, from the camera; None without one
 
 
@@ -59,11 +62,12 @@ def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> l
 def reports(
     looks: Sequence[Look], around: Surfaces, parameters: Parameters
 ) -> dict[tuple[int, int], Detection]:
-    """Return what sensors report, by the number of the viewer and the vehicle's place among its surfaces.
+    """Return what sensors report, by the number of the viewer and the vehicle's place among its
+    surfaces.
 
-    Under `perception` 1 a vehicle of which nothing is reported, since too few rays end on it or no sensor
-    reaches so far, hides what is behind it. Under 2 it hides nothing: a vehicle is reported if enough rays
-    come to it past buildings and past vehicles that are reported.
+    Under `perception` 1 a vehicle of which nothing is reported, since too few rays end on it or no
+    sensor reaches so far, hides what is behind it. Under 2 it hides nothing: a vehicle is reported
+    if enough rays come to it past buildings and past vehicles that are reported.
     """
     nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
     known: dict[tuple[int, int], Detection | None] = {}
@@ -83,7 +87,8 @@ def reports(
     if parameters.perception == 1:
         return now
     solid = ~around.vehicle | among(around, now)
-    # What is reported although all hide each other stays so. The other rays end on what is not reported.
+    # What is reported although all hide each other stays so. The other rays end on what is not
+    # reported.
     passing = (first >= 0) & ~solid[first]
     rays, first, certain = rays.of(passing), first[passing], np.where(solid, count, 0)
     if not (~solid[rays.surface] & (rays.t < np.inf) & (rays.surface != first)).any():
@@ -94,13 +99,16 @@ def reports(
         if np.array_equal(after, solid):
             return then
         if np.array_equal(after, before):
-            # Vehicles that run into each other may hide each other in turns: none of them is reported.
+            # Vehicles that run into each other may hide each other in turns: none of them is
+            # reported.
             return {pair: d for pair, d in then.items() if pair in now}
         before, solid, now = solid, after, then
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
-    """Return which surfaces (n,) are among pairs of a viewer's number and a place among its surfaces."""
+    """Return which surfaces (n,) are among pairs of a viewer's number and a place among its
+    surfaces.
+    """
     table = np.zeros((len(around.ids), max(map(len, around.ids), default=0)), dtype=bool)
     table[tuple(np.array(list(pairs), dtype=int).reshape(-1, 2).T)] = True
     return table[around.viewer, around.place]
@@ -109,7 +117,8 @@ def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
 def detections(
     pairs: Sequence[tuple[WorldState, VehicleState, VehicleState]], ambient: Ambient
 ) -> list[Detection | None]:
-    """Return what all sensors of a viewer together report of another vehicle in its sight; None if nothing.
+    """Return what all sensors of a viewer together report of another vehicle in its sight;
+    None if nothing.
 
     Each of the `pairs` is a state, a viewer and a vehicle on which enough of its rays end.
     """
@@ -136,7 +145,8 @@ def detections(
         draws = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id)
         z[:, k] = draws.standard_normal(8)
 
-    # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both see.
+    # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both
+    # see.
     r, b = distance + RADAR_NOISE_M * z[0], bearing + BEARING_NOISE_RAD * z[1]
     x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], its_x + r * np.cos(b))
     y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], its_y + r * np.sin(b))
@@ -145,18 +155,29 @@ def detections(
     ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     rate = np.vecdot(np.stack(parting, axis=-1), ways) + 0.15 * z[2]
     its_heading_rad = heading + np.radians(2.0) * z[3]
-    speed_mps = np.maximum(speed + np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False]) * z[4], 0.0)
+    speed_mps = np.maximum(
+        speed + np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False]) * z[4], 0.0
+    )
     columns = (camera, lidar, radar, reported, x_m, y_m, its_heading_rad, speed_mps, rate)
     return [
         Detection(
-            v.id, SENSORS[by_camera, by_lidar, by_radar], v.kind if by_camera else None,
-            v.indicator if by_camera else None, at_x, at_y, to_rad if by_lidar else None, mps,
-            away_mps if by_radar else None, v.braking if by_camera else None,
-        ) if there else None
+            v.id,
+            SENSORS[by_camera, by_lidar, by_radar],
+            v.kind if by_camera else None,
+            v.indicator if by_camera else None,
+            at_x,
+            at_y,
+            to_rad if by_lidar else None,
+            mps,
+            away_mps if by_radar else None,
+            v.braking if by_camera else None,
+        )
+        if there
+        else None
         for (*_, v), by_camera, by_lidar, by_radar, there, at_x, at_y, to_rad, mps, away_mps in zip(
             pairs, *(column.tolist() for column in columns), strict=True
         )
-    ]  # fmt: skip
+    ]
 
 
 def _dazzled(episode_seeds: Sequence[int], bearing_rad: Floats, ambient: Ambient) -> Bools:

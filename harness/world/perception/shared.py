@@ -1,10 +1,12 @@
-"""Merge the objects that helpers share into the ego's scene graph, as a receiver of CPMs or SDSMs does.
+"""Merge the objects that helpers share into the ego's scene graph,
+as a receiver of CPMs or SDSMs does.
 
-A helper's message says where it is, with the errors of a beacon, and lists what its sensors report in its
-own frame, with the regions that it has in sight (ETSI TS 103 324: originating vehicle, perceived objects,
-perception regions). Ids are the sender's own and do not say who is meant: reports of two senders are of one
-object if places and speeds agree as far as their errors go (the gate of a chi-squared test, as in tracking).
-The most precise report of an object stands. All see at the same moment, so nothing is extrapolated.
+A helper's message says where it is, with the errors of a beacon, and lists what its sensors report
+in its own frame, with the regions that it has in sight (ETSI TS 103 324: originating vehicle,
+perceived objects, perception regions). Ids are the sender's own and do not say who is meant:
+reports of two senders are of one object if places and speeds agree as far as their errors go (the
+gate of a chi-squared test, as in tracking). The most precise report of an object stands. All see at
+the same moment, so nothing is extrapolated.
 """
 
 from collections.abc import Sequence
@@ -62,7 +64,9 @@ class Report:
 
 
 def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
-    """Return the ego's graph of each case with the objects that messages add, or report more precisely."""
+    """Return the ego's graph of each case with the objects that messages add,
+    or report more precisely.
+    """
     reports = [_reports(scenario.parameters, case) for case in cases]
     kept = [[report.node.id for report in some if report.node] for some in reports]
     heard = [[report.detection for report in some if report.node is None] for some in reports]
@@ -112,8 +116,8 @@ def stated(p: Parameters, state: WorldState, sender: str) -> VehicleState:
 def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
     """Return a car that does not exist and is in the ego's way, in a viewer's frame.
 
-    It comes on the first path that meets the ego's, as far from there as the ego and as fast; where no path
-    does, it stands `STANDS_M` ahead of the ego.
+    It comes on the first path that meets the ego's, as far from there as the ego and as fast; where
+    no path does, it stands `STANDS_M` ahead of the ego.
     """
     road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
     path, speed_mps = road.paths[ego.approach, ego.route], 0.0
@@ -128,14 +132,25 @@ def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
     at, turned = seat.relative(x, y), (degrees(sender.heading_rad - heading) + 180) % 360 - 180
     lane, sensors = path.lane_role(arc_m), ("lidar", "radar")
     return Node(
-        NOBODY, "car", at.forward_m, at.left_m, round(turned), tenths(speed_mps), None, lane, "off", sensors
+        NOBODY,
+        "car",
+        at.forward_m,
+        at.left_m,
+        round(turned),
+        tenths(speed_mps),
+        None,
+        lane,
+        "off",
+        sensors,
     )
 
 
 def _joined(accepted: Sequence[Report], reports: Sequence[Report]) -> list[Report]:
-    """Return the accepted reports with those of one more sender; of two reports of an object the better one.
+    """Return the accepted reports with those of one more sender;
+    of two reports of an object the better one.
 
-    Nearest pairs are joined first, and no report twice. The first accepted report, the ego, always stands.
+    Nearest pairs are joined first, and no report twice.
+    The first accepted report, the ego, always stands.
     """
     apart = _distances(accepted, reports)
     joined, new = list(accepted), dict(enumerate(reports))
@@ -155,7 +170,10 @@ def _joined(accepted: Sequence[Report], reports: Sequence[Report]) -> list[Repor
 def _distances(accepted: Sequence[Report], reports: Sequence[Report]) -> Floats:
     """Return the squared Mahalanobis distance of each pair of reports, (accepted, reports)."""
     place, speed, place_m2, speed_m2 = (
-        tuple(np.array([value(r) for r in some]).reshape(len(some), *shape) for some in (accepted, reports))
+        tuple(
+            np.array([value(r) for r in some]).reshape(len(some), *shape)
+            for some in (accepted, reports)
+        )
         for value, shape in (
             (lambda r: (r.detection.x_m, r.detection.y_m), (2,)),
             (lambda r: r.detection.speed_mps, ()),
@@ -166,18 +184,32 @@ def _distances(accepted: Sequence[Report], reports: Sequence[Report]) -> Floats:
     d = place[0][:, None] - place[1][None]
     covariance = place_m2[0][:, None] + place_m2[1][None]
     metres = np.einsum("...i,...i", d, np.linalg.solve(covariance, d[..., None])[..., 0])
-    return np.asarray(metres + (speed[0][:, None] - speed[1]) ** 2 / (speed_m2[0][:, None] + speed_m2[1]))
+    return np.asarray(
+        metres + (speed[0][:, None] - speed[1]) ** 2 / (speed_m2[0][:, None] + speed_m2[1])
+    )
 
 
 def _itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
     """Return what a vehicle's message says of the vehicle itself."""
     detection = Detection(
-        v.id, (f"v2v:{v.id}",), v.kind, v.indicator, v.x_m, v.y_m, v.heading_rad, v.speed_mps, None, v.braking
+        v.id,
+        (f"v2v:{v.id}",),
+        v.kind,
+        v.indicator,
+        v.x_m,
+        v.y_m,
+        v.heading_rad,
+        v.speed_mps,
+        None,
+        v.braking,
     )
     sure = exact or p.perfect_knowledge
     place = ROUNDED_M if sure else hypot(ROUNDED_M, p.beacon_noise_m)
     return Report(
-        detection, None, np.eye(2) * place**2, (0.1 if sure else hypot(0.1, p.beacon_noise_mps)) ** 2
+        detection,
+        None,
+        np.eye(2) * place**2,
+        (0.1 if sure else hypot(0.1, p.beacon_noise_mps)) ** 2,
     )
 
 
@@ -186,28 +218,43 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
     c, s = cos(sender.heading_rad), sin(sender.heading_rad)
     dx, dy = node.forward_m * c + node.left_m * s, node.forward_m * s - node.left_m * c
     detection = Detection(
-        node.id, (f"v2v:{sender.id}",), None if node.type == "vehicle" else node.type, node.indicator,
-        sender.x_m + dx, sender.y_m + dy,
+        node.id,
+        (f"v2v:{sender.id}",),
+        None if node.type == "vehicle" else node.type,
+        node.indicator,
+        sender.x_m + dx,
+        sender.y_m + dy,
         None if node.heading_deg is None else sender.heading_rad - radians(node.heading_deg),
-        node.speed_mps, None, None if node.braking is UNSET else node.braking,
-    )  # fmt: skip
+        node.speed_mps,
+        None,
+        None if node.braking is UNSET else node.braking,
+    )
     away_m = max(hypot(dx, dy), 0.1)
     seen = "lidar" in node.sensors
     along, across = (LIDAR_NOISE_M,) * 2 if seen else (RADAR_NOISE_M, BEARING_NOISE_RAD * away_m)
     speed = SPEED_NOISE_MPS["radar" in node.sensors]
     if node.sensors == BY_BEACON:
         (along, across), speed = (p.beacon_noise_m,) * 2, p.beacon_noise_mps
-    own_m, own_rad = (0.0, 0.0) if exact or p.perfect_knowledge else (p.beacon_noise_m, p.beacon_noise_rad)
-    along, across = hypot(along, ROUNDED_M, own_m), hypot(across, ROUNDED_M, own_m, own_rad * away_m)
+    own_m, own_rad = (
+        (0.0, 0.0) if exact or p.perfect_knowledge else (p.beacon_noise_m, p.beacon_noise_rad)
+    )
+    along, across = (
+        hypot(along, ROUNDED_M, own_m),
+        hypot(across, ROUNDED_M, own_m, own_rad * away_m),
+    )
     turn = np.array([[dx, -dy], [dy, dx]]) / away_m
     return Report(
-        detection, node if exact else None, turn @ np.diag([along**2, across**2]) @ turn.T,
+        detection,
+        node if exact else None,
+        turn @ np.diag([along**2, across**2]) @ turn.T,
         speed**2,
-    )  # fmt: skip
+    )
 
 
 def _seen_together(case: Heard) -> tuple[Sector, ...]:
-    """Return each sector as the viewer with the most of it in sight sees it, a lower bound of the union."""
+    """Return each sector as the viewer with the most of it in sight sees it,
+    a lower bound of the union.
+    """
     sectors = {sector.sector: sector for sector in case.own.sectors}
     for graph in case.helpers:
         for sector in graph.sectors:

@@ -1,6 +1,8 @@
-"""Registry of scenarios. Each file here has a `SCENARIO`, whose name is the file's with `-` for `_`.
+"""Registry of scenarios. Each file here has a `SCENARIO`,
+whose name is the file's with `-` for `_`.
 
-Other packages add theirs by an entry point of the group `swarmdrive.scenarios`; `env:ID` is an environment.
+Other packages add theirs by an entry point of the group `swarmdrive.scenarios`;
+`env:ID` is an environment.
 """
 
 import copyreg
@@ -29,7 +31,9 @@ def names() -> tuple[str, ...]:
 
 
 def witnessed() -> tuple[str, ...]:
-    """Return the names of the scenarios here whose layouts have a declared number of witnesses, in order."""
+    """Return the names of the scenarios here whose layouts have a declared number of witnesses, in
+    order.
+    """
     return tuple(name for name in sorted(_files()) if "witnesses" in get(name).dials)
 
 
@@ -63,7 +67,9 @@ def argument(scenario: Scenario) -> str:
 
 
 def title(scenario: Scenario) -> str:
-    """Return a scenario for people: its name, the settings that differ from its usual, and whose scenes."""
+    """Return a scenario for people: its name, the settings that differ from its usual,
+    and whose scenes.
+    """
     scenes = _of_suites(scenario)
     suites = [suite for suite, of in SUITES.items() if of == scenes]
     return (
@@ -80,7 +86,9 @@ def _changed(scenario: Scenario) -> set[str]:
 
 def _of_suites(scenario: Scenario) -> dict[str, object]:
     """Return what the scenes of suites differ in; nothing of a scenario that is in none."""
-    return {key: getattr(scenario.parameters, key) for key in SCENES if "witnesses" in scenario.dials}
+    return {
+        key: getattr(scenario.parameters, key) for key in SCENES if "witnesses" in scenario.dials
+    }
 
 
 def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
@@ -93,7 +101,9 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
     key, _, value = text.partition("=")
     shown, known = printable(scenario.name), scenario.dials
     if key not in known:
-        raise unknown(f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true")
+        raise unknown(
+            f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true"
+        )
     usual = getattr(scenario.parameters, key)
     setting = value_of(usual, value)
     if isinstance(setting, str) and not isinstance(usual, str):
@@ -104,7 +114,8 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
 
 def _named(name: str) -> Scenario:
     if name.startswith(environment.PREFIX):
-        from harness.world.environments.world import scenario as of_environment  # imports highway-env
+        # imports highway-env
+        from harness.world.environments.world import scenario as of_environment
 
         return of_environment(name)
     if is_here(name):
@@ -123,10 +134,14 @@ def is_here(name: str) -> bool:
 def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
     """Return a scenario with the parameters that a manifest states.
 
-    Raises UserError if the scenario has other parameters here, or one is of another type or out of bounds.
+    Raises UserError if the scenario has other parameters here,
+    or one is of another type or out of bounds.
     """
     scenario = get(name)
-    here = {field.name: getattr(scenario.parameters, field.name) for field in fields(scenario.parameters)}
+    here = {
+        field.name: getattr(scenario.parameters, field.name)
+        for field in fields(scenario.parameters)
+    }
     where = f"scenario {printable(scenario.name, 80)}"
     if extra := [key for key in parameters if key not in here]:
         raise UserError(
@@ -142,7 +157,8 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
         for key, value in parameters.items()
     }
     return replace(
-        scenario, parameters=convert({**here, **earlier, **values}, type(scenario.parameters), where)
+        scenario,
+        parameters=convert({**here, **earlier, **values}, type(scenario.parameters), where),
     )
 
 

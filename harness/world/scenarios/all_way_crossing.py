@@ -1,11 +1,12 @@
 """Scenario `all-way-crossing`: two to four cars that decide come to a crossing without signs.
 
-The ego comes from the south at 10 m/s. One to three other agents come from other arms, at least one of them
-from a side; each goes straight on, and buildings on the corners hide those from the sides from each other.
-All keep a speed that brings them to the middle at times of one distribution, so those who cross often meet
-unless somebody gives way, and nothing says who has to. In half of the episodes one more car, which is no
-agent, comes from the ego's left or right and yields to nobody: the agents on that road see it, and those on
-the ego's do not. Behind an agent it keeps its distance.
+The ego comes from the south at 10 m/s. One to three other agents come from other arms, at least one
+of them from a side; each goes straight on, and buildings on the corners hide those from the sides
+from each other. All keep a speed that brings them to the middle at times of one distribution, so
+those who cross often meet unless somebody gives way, and nothing says who has to. In half of the
+episodes one more car, which is no agent, comes from the ego's left or right and yields to nobody:
+the agents on that road see it, and those on the ego's do not. Behind an agent it keeps its
+distance.
 
 Without `agent_share` the other agents keep their speed, and the ego has to pass between them.
 
@@ -39,17 +40,22 @@ class Parameters(Shared):
 
     target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0)  # up to 36 km/h
     speed_mps: float = 10.0  # of every agent at the start
-    arrival_s: tuple[float, float] = (3.2, 4.8)  # when an agent that keeps its speed is in the middle
-    both_share: float = 0.4  # probability of agents from the left and the right; else from one of them
+    # when an agent that keeps its speed is in the middle
+    arrival_s: tuple[float, float] = (3.2, 4.8)
+    # probability of agents from the left and the right; else from one of them
+    both_share: float = 0.4
     oncoming_share: float = 0.5  # probability of an agent from ahead
     danger_share: float = 0.5  # probability of a car from a side that is no agent
-    # when it would be in the middle, after a cruising ego; behind an agent on its arm, later if need be
+    # when it would be in the middle, after a cruising ego; behind an agent on its arm, later if
+    # need be
     danger_offset_s: tuple[float, float] = (-0.3, 0.8)
     follow_s: tuple[float, float] = (1.2, 1.8)  # how long after the agent before it, at the soonest
     car_mps: tuple[float, float] = (8.5, 10.0)  # speed of a car that is no agent
     late_share: float = 0.4  # probability of a harmless car from any other arm, long after
-    late_offset_s: tuple[float, float] = (4.5, 6.0)  # when it is in the middle, after a cruising ego
-    corner_m: tuple[float, float] = (7.0, 11.0)  # distance of a building's walls from the centre lines
+    # when it is in the middle, after a cruising ego
+    late_offset_s: tuple[float, float] = (4.5, 6.0)
+    # distance of a building's walls from the centre lines
+    corner_m: tuple[float, float] = (7.0, 11.0)
     cleared_m: float = 2.5  # how far behind the junction's exit an agent's centre has cleared it
 
 
@@ -65,11 +71,17 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     if draws.share("oncoming") < p.oncoming_share:
         there.add("oncoming")
 
-    def car(id_: str, approach: str, speed_mps: float, after_s: float, part: Part = "other") -> Spawn:
+    def car(
+        id_: str, approach: str, speed_mps: float, after_s: float, part: Part = "other"
+    ) -> Spawn:
         """Return a car that is in the middle at a time if it keeps its speed."""
-        return Spawn(id_, "car", part, approach, "straight", middle_m - speed_mps * after_s, speed_mps)
+        return Spawn(
+            id_, "car", part, approach, "straight", middle_m - speed_mps * after_s, speed_mps
+        )
 
-    arrival_s = {approach: draws.between(f"{approach}_arrival", p.arrival_s) for approach in APPROACHES}
+    arrival_s = {
+        approach: draws.between(f"{approach}_arrival", p.arrival_s) for approach in APPROACHES
+    }
     order = sorted(SECTORS, key=lambda approach: draws.share(f"{approach}_id"))
     spawns = [car("v1", "own", p.speed_mps, arrival_s["own"], "ego")]
     spawns += [
@@ -83,7 +95,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     def coming(name: str, approach: str, offset_s: tuple[float, float]) -> Spawn:
         after_s = arrival_s["own"] + draws.between(f"{name}_offset", offset_s)
         if approach in there:
-            after_s = max(after_s, arrival_s[approach] + draws.between(f"{name}_follow", p.follow_s))
+            after_s = max(
+                after_s, arrival_s[approach] + draws.between(f"{name}_follow", p.follow_s)
+            )
         return car(ids[name], approach, draws.between(f"{name}_speed", p.car_mps), after_s)
 
     danger = None
@@ -131,7 +145,10 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=partial(cleared, 0),
     dials=SHARED,
-    words={"task": "go straight over a crossing without signs", "hiding": "buildings on the corners"},
+    words={
+        "task": "go straight over a crossing without signs",
+        "hiding": "buildings on the corners",
+    },
     one_sided=None,  # nobody has right of way, so that times decide and sides do not
     seats=seats,
 )

@@ -1,14 +1,15 @@
-"""Scenario `blind-merge`: the ego comes up a ramp behind a wall and merges into a lane that it cannot see.
+"""Scenario `blind-merge`: the ego comes up a ramp behind a wall and merges into a lane that it
+cannot see.
 
-The ego comes at 14 m/s along a ramp whose lane runs into the right lane of the main road. A noise wall
-between them hides who drives there until shortly before. In most episodes one vehicle is dangerous: it is on
-the right lane, timed to be where the ego comes into it. A car on the left lane at the same time is harmless:
-the lane decides. Three helpers see both: a truck on the left lane, and a car ahead on either lane. Traffic
-keeps its lane and speed and makes room for nobody: it brakes only for who is in its lane, ahead and slower.
-The ego alone decides.
+The ego comes at 14 m/s along a ramp whose lane runs into the right lane of the main road. A noise
+wall between them hides who drives there until shortly before. In most episodes one vehicle is
+dangerous: it is on the right lane, timed to be where the ego comes into it. A car on the left lane
+at the same time is harmless: the lane decides. Three helpers see both: a truck on the left lane,
+and a car ahead on either lane. Traffic keeps its lane and speed and makes room for nobody: it
+brakes only for who is in its lane, ahead and slower. The ego alone decides.
 
-What the ego can see before it is too late (wall, helpers, cars that pass before or come later) is drawn
-without knowing of the danger.
+What the ego can see before it is too late (wall, helpers, cars that pass before or come later) is
+drawn without knowing of the danger.
 """
 
 from dataclasses import dataclass
@@ -27,12 +28,14 @@ from harness.world.state import Building, Kind, Part
 NAME = "blind-merge"
 LANE_WIDTH_M = 4.0
 RAMP_M = 6.5  # from the middle of the right lane to that of the ramp, beside the wall
-CONVERGE_M = 40.0  # along the road, from the ramp's straight to where it has run into the right lane
+# along the road, from the ramp's straight to where it has run into the right lane
+CONVERGE_M = 40.0
 WALL_M = 2.7, 3.5  # from the middle of the right lane to the wall's faces
 BEGIN_M, END_M = -250.0, 250.0  # of the main road, to the east; the ramp has merged at 0
 SECTOR_REACH_M = (15.0, 60.0)  # stretch of the right lane before that point that is looked at
-# Blind seats: cars that have just turned onto the ramp, too slow to reach the ego wherever it stops.
-SEATS_M = (45.0, 55.0), (12.0, 18.0), (12.0, 18.0)  # from the ego to the first, and from one to the next
+# Blind seats: cars that have just turned onto the ramp, too slow to reach the ego wherever it
+# stops. from the ego to the first, and from one to the next
+SEATS_M = (45.0, 55.0), (12.0, 18.0), (12.0, 18.0)
 SEATS_MPS = (3.0, 4.5)
 
 
@@ -53,8 +56,8 @@ class Parameters(Witnessed):
     before_share: float = 0.4  # probability of a car on the right lane that has passed
     # when it is where the ego comes into its lane, after a cruising ego
     before_offset_s: tuple[float, float] = (-3.2, -2.2)
-    # probability of a car on the right lane that comes later than the critical headway of a merge, 3.7 s (HCM
-    # 7, equation 31-50)
+    # probability of a car on the right lane that comes later than the critical headway of a merge,
+    # 3.7 s (HCM 7, equation 31-50)
     late_share: float = 0.4
     late_offset_s: tuple[float, float] = (5.5, 7.5)  # when it is there, after a cruising ego
     # from the wall's end to where the ego's way has run into the right lane
@@ -89,11 +92,17 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """Return the main road and its ramp; the conflict zone is where the ramp has run into the right lane."""
+    """Return the main road and its ramp;
+    the conflict zone is where the ramp has run into the right lane.
+    """
     ego, main = ("ramp", "merge"), ("main", "straight")
     ways = {
         main: ([("a", "b", 1), ("b", "c", 1)], ["right lane behind", "right lane"], 1),
-        ("main left", "straight"): ([("a", "b", 0), ("b", "c", 0)], ["left lane behind", "left lane"], 1),
+        ("main left", "straight"): (
+            [("a", "b", 0), ("b", "c", 0)],
+            ["left lane behind", "left lane"],
+            1,
+        ),
         ego: (
             [("j", "k", 0), ("k", "m", 0), ("m", "b", 0), ("b", "c", 1)],
             ["ramp", "merge", "merge", "right lane"],
@@ -123,12 +132,17 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
     start = draws.between("ego_start", p.ego_start_m)
 
-    def timed(id_: str, kind: Kind, part: Part, approach: str, speed: float, late_s: float) -> Spawn:
+    def timed(
+        id_: str, kind: Kind, part: Part, approach: str, speed: float, late_s: float
+    ) -> Spawn:
         """Return a vehicle that is beside the merge so long after a cruising ego."""
         arc = at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
         return Spawn(id_, kind, part, approach, "straight", arc, speed)
 
-    truck = draws.between("truck_speed", p.truck_mps), draws.between("truck_offset", p.truck_offset_s)
+    truck = (
+        draws.between("truck_speed", p.truck_mps),
+        draws.between("truck_offset", p.truck_offset_s),
+    )
     spawns = [
         (ego := Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps)),
         timed("v2", "truck", "helper", "main left", *truck),
@@ -147,7 +161,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
     def car(name: str) -> Spawn:
         approach, _, offset_s = cars[name]
-        speed, late_s = draws.between(f"{name}_speed", p.main_mps), draws.between(f"{name}_offset", offset_s)
+        speed, late_s = (
+            draws.between(f"{name}_speed", p.main_mps),
+            draws.between(f"{name}_offset", offset_s),
+        )
         return timed(ids[name], "car", "other", approach, speed, late_s)
 
     spawns += [car(name) for name, (_, share, _) in cars.items() if draws.share(name) < share]
@@ -171,6 +188,9 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     dials=WITNESSED,
-    words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
+    words={
+        "task": "merge from a ramp into the right lane of a road",
+        "hiding": "a wall beside the ramp",
+    },
     one_sided="the ramp comes from the right",
 )

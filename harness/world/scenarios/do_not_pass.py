@@ -1,14 +1,15 @@
 """Scenario `do-not-pass`: the ego follows a slow truck that hides the oncoming lane.
 
-The ego follows a slow truck on a two-way road. It may change to the oncoming lane, pass the truck and come
-back. The truck hides that lane: from behind it the ego sees no farther than some forty metres. In part of the
-episodes a car comes there in time to meet an ego that passes at once; else none comes, or one comes long
-after. Three helpers know more: the truck, a car that drives ahead of it, and one that comes behind the ego.
+The ego follows a slow truck on a two-way road. It may change to the oncoming lane, pass the truck
+and come back. The truck hides that lane: from behind it the ego sees no farther than some forty
+metres. In part of the episodes a car comes there in time to meet an ego that passes at once; else
+none comes, or one comes long after. Three helpers know more: the truck, a car that drives ahead of
+it, and one that comes behind the ego.
 
-This is the do-not-pass warning of V2V (DNPW, see-through). Traffic keeps its lane and speed and yields to
-nobody. The ego has cleared the episode when it is back on its lane ahead of the truck, or when what came
-towards it has gone by while it kept its lane behind the truck; so one that waits where nothing comes never
-does.
+This is the do-not-pass warning of V2V (DNPW, see-through). Traffic keeps its lane and speed and
+yields to nobody. The ego has cleared the episode when it is back on its lane ahead of the truck, or
+when what came towards it has gone by while it kept its lane behind the truck; so one that waits
+where nothing comes never does.
 
 What the ego can see (truck, gap, the car behind) is drawn without knowing of the danger.
 """
@@ -31,8 +32,8 @@ LANE_WIDTH_M = 4.0
 BEGIN_M, END_M = -150.0, 350.0  # of the road, to the east
 OWN, BESIDE = "own lane", "oncoming lane"  # the ego's ways
 CAR, TRUCK = SIZES_M["car"][0], SIZES_M["truck"][0]
-# Where witnesses are declared, the third lookout is a second car ahead of the truck, from centre to centre,
-# and the blind seats are behind the ego, which hides what the truck does not.
+# Where witnesses are declared, the third lookout is a second car ahead of the truck, from centre to
+# centre, and the blind seats are behind the ego, which hides what the truck does not.
 SECOND_M = 10.0, 16.0
 SEATS_M = (8.0, 9.5), (7.5, 8.5), (7.5, 8.5)  # from the ego to the first, and from one to the next
 
@@ -49,14 +50,17 @@ class Parameters(Witnessed):
     # where the ego starts, m before the conflict zone, which is where it would be beside the truck
     ego_start_m: tuple[float, float] = (28.0, 32.0)
     ahead_m: float = 6.0  # gap to the truck's front that the ego needs when it is back on its lane
-    behind_m: float = 40.0  # an ego that has let go by what came is no farther behind the truck's rear
-    danger_share: float = 0.6  # probability that a car comes in time to meet an ego that passes at once
+    # an ego that has let go by what came is no farther behind the truck's rear
+    behind_m: float = 40.0
+    # probability that a car comes in time to meet an ego that passes at once
+    danger_share: float = 0.6
     gap_m: tuple[float, float] = (8.0, 11.0)  # from the ego to the truck, bumper to bumper
     oncoming_mps: tuple[float, float] = (12.0, 16.0)  # speed of what comes, dangerous or not
-    danger_s: tuple[float, float] = (4.2, 5.9)  # when a danger would meet an ego that stays where it is
+    # when a danger would meet an ego that stays where it is
+    danger_s: tuple[float, float] = (4.2, 5.9)
     late_share: float = 0.4  # probability of a harmless car that comes later
-    # when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning takes for
-    # safe (Open-V2X)
+    # when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning
+    # takes for safe (Open-V2X)
     late_s: tuple[float, float] = (15.0, 19.0)
     # how far ahead of the truck the helper there is, bumper to bumper
     leader_m: tuple[float, float] = (20.0, 35.0)
@@ -88,7 +92,9 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """Return the lanes as `TwoWayEnv` has them: the left one is there twice, once in each direction."""
+    """Return the lanes as `TwoWayEnv` has them:
+    the left one is there twice, once in each direction.
+    """
     from highway_env.road.lane import LineType
 
     striped, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE

@@ -1,16 +1,17 @@
 """Scenario `hard-brake-ahead`: a car brakes hard beyond the van that the ego follows.
 
-The ego follows a van on the right lane of a motorway at a short headway; the van hides the car before it. In
-most episodes that car brakes until it stands. The van brakes late and hard, and only then does the ego see
-that anything is wrong. A car beside the ego keeps it from swerving: who knows early drops back, changes lane
-behind that car and passes. Three helpers know more than the ego: the van, which sees the car before it, the
-car beside, and one farther ahead on the left lane.
+The ego follows a van on the right lane of a motorway at a short headway; the van hides the car
+before it. In most episodes that car brakes until it stands. The van brakes late and hard, and only
+then does the ego see that anything is wrong. A car beside the ego keeps it from swerving: who knows
+early drops back, changes lane behind that car and passes. Three helpers know more than the ego: the
+van, which sees the car before it, the car beside, and one farther ahead on the left lane.
 
-This is the emergency electronic brake light of V2V (EEBL). Traffic keeps its lane, and its speed unless it
-would run into the vehicle ahead in its lane; its brake lamps show, to whom a camera sees.
+This is the emergency electronic brake light of V2V (EEBL). Traffic keeps its lane, and its speed
+unless it would run into the vehicle ahead in its lane; its brake lamps show, to whom a camera sees.
 
-What the ego can see (van, headway, cars on the left) is drawn without knowing of the danger. So is a car on
-the left lane, far ahead, which slows down in some episodes and concerns nobody on the right.
+What the ego can see (van, headway, cars on the left) is drawn without knowing of the danger. So is
+a car on the left lane, far ahead, which slows down in some episodes and concerns nobody on the
+right.
 """
 
 from dataclasses import dataclass
@@ -31,8 +32,8 @@ LANE_WIDTH_M = 4.0
 BEGIN_M, END_M = -150.0, 350.0  # of the motorway, to the east
 ZONE_M = 18.0  # the conflict zone, where a car that brakes hard comes to stand
 LEFT, RIGHT = "left lane", "right lane"
-# Blind seats: cars behind the ego that have just begun to drive on, too slow to reach it wherever it stops;
-# from centre to centre.
+# Blind seats: cars behind the ego that have just begun to drive on, too slow to reach it wherever
+# it stops; from centre to centre.
 SEATS_M = (42.0, 46.0), (11.0, 14.0), (11.0, 14.0)
 SEATS_MPS = (3.0, 4.5)
 
@@ -44,20 +45,25 @@ class Parameters(Witnessed):
     target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)  # 72 km/h, half of it, and standing
     time_limit_s: float = 14.0
     delay_allowance_s: float = 1.0
-    speed_mps: float = 20.0  # everybody's at the start: motorway traffic that has come close together
-    ego_start_m: tuple[float, float] = (88.0, 92.0)  # where the ego starts, m before the conflict zone
+    # everybody's at the start: motorway traffic that has come close together
+    speed_mps: float = 20.0
+    # where the ego starts, m before the conflict zone
+    ego_start_m: tuple[float, float] = (88.0, 92.0)
     cleared_m: float = 45.0  # where it has passed, m behind the conflict zone
     danger_share: float = 0.65  # probability that the car beyond the van brakes
-    # of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense traffic; at
-    # 1.5 s the van's own lamps come in time, and no message is needed
+    # of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense
+    # traffic; at 1.5 s the van's own lamps come in time, and no message is needed
     headway_s: tuple[float, float] = (0.55, 0.75)
-    # of the van to the car before it: from 1.7 s on the van, which brakes late, does not crash itself
+    # of the van to the car before it: from 1.7 s on the van, which brakes late, does not crash
+    # itself
     lead_headway_s: tuple[float, float] = (1.7, 2.0)
     brakes_at_s: tuple[float, float] = (0.1, 1.4)  # when that car begins to brake
     # how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g)
     brakes_mps2: tuple[float, float] = (6.0, 8.0)
-    beside_m: tuple[float, float] = (-3.0, 4.0)  # how far ahead of the ego's middle the car beside is
-    front_m: tuple[float, float] = (48.0, 60.0)  # how far ahead of the ego the helper on the left lane is
+    # how far ahead of the ego's middle the car beside is
+    beside_m: tuple[float, float] = (-3.0, 4.0)
+    # how far ahead of the ego the helper on the left lane is
+    front_m: tuple[float, float] = (48.0, 60.0)
     slow_share: float = 0.4  # probability that the farthest car on the left lane slows down
     slow_m: tuple[float, float] = (85.0, 100.0)  # how far ahead of the ego that car is
     slows_at_s: tuple[float, float] = (0.5, 2.5)  # when it does
@@ -68,7 +74,9 @@ class Parameters(Witnessed):
 def road() -> Road:
     """Return two lanes to the east."""
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
-    paths = paths_along(network(), {("own", name): ([lane], [name], 0) for name, lane in lanes.items()})
+    paths = paths_along(
+        network(), {("own", name): ([lane], [name], 0) for name, lane in lanes.items()}
+    )
     ahead = ZONE_M + np.linspace(-60.0, 40.0, 11)
     return Road(
         facts={"kind": "motorway of two lanes", "lane_width_m": LANE_WIDTH_M},

@@ -1,14 +1,15 @@
 """Scenario `narrow-passage`: cars from both sides come to an underpass that is too narrow for two.
 
-A street goes under a railway where only one car fits, and both directions share that lane. The ego comes from
-the west at 8 m/s, and one or two agents from the east; another may follow the ego. The first of either side
-would be in the middle at times of one distribution, so they often meet there unless a side waits, and nothing
-says which. Behind the embankment, a side road comes from the ego's right. In half of the episodes a car that
-is no agent comes along it, timed to be where a cruising ego crosses it, and yields to nobody. The embankment
-hides it from the ego; those who come the other way see it.
+A street goes under a railway where only one car fits, and both directions share that lane. The ego
+comes from the west at 8 m/s, and one or two agents from the east; another may follow the ego. The
+first of either side would be in the middle at times of one distribution, so they often meet there
+unless a side waits, and nothing says which. Behind the embankment, a side road comes from the ego's
+right. In half of the episodes a car that is no agent comes along it, timed to be where a cruising
+ego crosses it, and yields to nobody. The embankment hides it from the ego; those who come the other
+way see it.
 
-Without `agent_share` the other agents keep their speed, and the ego has to let them pass or be through before
-they come.
+Without `agent_share` the other agents keep their speed,
+and the ego has to let them pass or be through before they come.
 
 Where agents are, and when they come, is drawn without knowing of the danger.
 """
@@ -61,7 +62,8 @@ class Parameters(Shared):
     danger_offset_s: tuple[float, float] = (-0.4, 0.4)
     side_mps: tuple[float, float] = (6.0, 8.0)  # speed of cars from the side road
     embankment_m: tuple[float, float] = (3.0, 4.0)  # from the middle of the passage to its foot
-    opening_m: tuple[float, float] = (1.6, 2.0)  # from the middle of the lane to the walls of the passage
+    # from the middle of the lane to the walls of the passage
+    opening_m: tuple[float, float] = (1.6, 2.0)
     cleared_m: float = 21.0  # how far behind the middle of the passage an agent has cleared it
 
 
@@ -76,7 +78,9 @@ def network() -> Any:
     corners = np.array([(-END_M, apart_m), (-PASSAGE_M, 0.0), (PASSAGE_M, 0.0), (END_M, apart_m)])
     for name, ahead in (("e", 1), ("w", -1)):
         for n, (begin, end) in enumerate(pairwise(ahead * corners)):
-            net.add_lane(f"{name}{n}", f"{name}{n + 1}", StraightLane(begin, end, LANE_WIDTH_M, lines))
+            net.add_lane(
+                f"{name}{n}", f"{name}{n + 1}", StraightLane(begin, end, LANE_WIDTH_M, lines)
+            )
     side = StraightLane([SIDE_M, SIDE_END_M], [SIDE_M, -SIDE_END_M], LANE_WIDTH_M, lines)
     net.add_lane("south", "north", side)
     return net
@@ -84,7 +88,9 @@ def network() -> Any:
 
 @cache
 def road(from_east: bool = False) -> Road:
-    """Return the street for an ego from either end. Its conflict zone is the middle of the passage."""
+    """Return the street for an ego from either end.
+    Its conflict zone is the middle of the passage.
+    """
     names = FROM_EAST if from_east else {key: key for key in FROM_EAST}
 
     def street(direction: str, whose: str) -> tuple[Sequence[Lane], Sequence[str], int]:
@@ -105,7 +111,11 @@ def road(from_east: bool = False) -> Road:
     back_m = np.linspace(*SECTOR_REACH_M, 11)
     side = crossings(paths, ego)[beside]
     return Road(
-        facts={"kind": "street with a narrow passage", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
+        facts={
+            "kind": "street with a narrow passage",
+            "lane_width_m": LANE_WIDTH_M,
+            "ego": "/".join(ego),
+        },
         paths=paths,
         ego=ego,
         crossings={beside: side, other: meeting},
@@ -122,7 +132,10 @@ def road(from_east: bool = False) -> Road:
 def seats() -> dict[PathKey, Seat]:
     """Return the seats of agents from the west and from the east."""
     from_east = replace(SCENARIO, road=partial(road, True), cleared=partial(cleared, ahead=-1))
-    return {OWN: Seat(SCENARIO, {key: key for key in FROM_EAST}), ONCOMING: Seat(from_east, FROM_EAST)}
+    return {
+        OWN: Seat(SCENARIO, {key: key for key in FROM_EAST}),
+        ONCOMING: Seat(from_east, FROM_EAST),
+    }
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
@@ -142,9 +155,15 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     for way in (OWN, ONCOMING):
         first_s = draws.between(f"{way[0]}_arrival", p.arrival_s)
         second_s = first_s + draws.between(f"{way[0]}_headway", p.headway_s)
-        times_s[way] = [first_s, *([second_s] if draws.share(f"{way[0]}_second") < p.second_share else [])]
+        times_s[way] = [
+            first_s,
+            *([second_s] if draws.share(f"{way[0]}_second") < p.second_share else []),
+        ]
     ego_s, *others_s = times_s[OWN]
-    helpers = [*((OWN, time_s) for time_s in others_s), *((ONCOMING, time_s) for time_s in times_s[ONCOMING])]
+    helpers = [
+        *((OWN, time_s) for time_s in others_s),
+        *((ONCOMING, time_s) for time_s in times_s[ONCOMING]),
+    ]
     order = sorted(range(3), key=lambda n: draws.share(f"{n}_id"))
     spawns = [
         agent("v1", "ego", OWN, ego_s),
@@ -153,13 +172,17 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
     (id_,) = draws.ids(("danger",)).values()
     at, speed = here.crossings[RIGHT], draws.between("danger_speed", p.side_mps)
-    after_s = (at.ego_arc_m - spawns[0].arc_m) / p.speed_mps + draws.between("offset", p.danger_offset_s)
+    after_s = (at.ego_arc_m - spawns[0].arc_m) / p.speed_mps + draws.between(
+        "offset", p.danger_offset_s
+    )
     danger = "right" if draws.share("danger") < p.danger_share else None
     if danger:
         spawns.append(Spawn(id_, "car", "other", *RIGHT, at.other_arc_m - speed * after_s, speed))
     foot, wall = draws.between("embankment", p.embankment_m), draws.between("opening", p.opening_m)
     sides = (wall, EMBANKMENT_M), (-EMBANKMENT_M, -wall)
-    walls = [Building(f"b{n}", -foot, north, foot, south) for n, (north, south) in enumerate(sides, 1)]
+    walls = [
+        Building(f"b{n}", -foot, north, foot, south) for n, (north, south) in enumerate(sides, 1)
+    ]
     return Draft(Layout.arranged(spawns, danger, id_, walls), (), ())
 
 
@@ -177,7 +200,10 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     dials=SHARED,
-    words={"task": "drive through an underpass that is too narrow for two", "hiding": "the embankment"},
+    words={
+        "task": "drive through an underpass that is too narrow for two",
+        "hiding": "the embankment",
+    },
     one_sided="the side road comes from the right",
     seats=seats,
 )

@@ -1,13 +1,15 @@
 """Scenario `occluded-intersection`: the ego crosses where buildings and a truck hide what comes.
 
-The ego comes from the south at 14 m/s and goes straight. Buildings on the four corners hide the crossing
-road, and a truck that comes towards the ego hides what follows it. At most one vehicle is dangerous: timed to
-meet a cruising ego at the conflict point, from the left, from the right, or oncoming and turning left across
-the ego's path right behind the truck. Three helpers have just left the junction on the three other arms and
-see what comes towards it there. Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
+The ego comes from the south at 14 m/s and goes straight. Buildings on the four corners hide the
+crossing road, and a truck that comes towards the ego hides what follows it. At most one vehicle is
+dangerous: timed to meet a cruising ego at the conflict point, from the left, from the right, or
+oncoming and turning left across the ego's path right behind the truck. Three helpers have just left
+the junction on the three other arms and see what comes towards it there. Traffic keeps its lane and
+speed and yields to nobody; the ego alone decides.
 
-What the ego can see before it is too late (buildings, helpers, the truck, a car that passes later) is drawn
-without knowing of the danger. Where the two would touch, the danger gives way: it comes later.
+What the ego can see before it is too late (buildings, helpers, the truck, a car that passes later)
+is drawn without knowing of the danger. Where the two would touch, the danger gives way: it comes
+later.
 """
 
 from dataclasses import dataclass
@@ -24,8 +26,10 @@ from harness.world.state import SIZES_M, Building, Kind
 
 NAME = "occluded-intersection"
 BUILDING_END_M = 70.0  # outer walls, from the centre lines
-ROUTES = {"left": "straight", "right": "straight", "oncoming": "left"}  # of what comes from a sector
-# Where witnesses are declared, the lookouts are still in the junction, m behind its end, to see every arm.
+# of what comes from a sector
+ROUTES = {"left": "straight", "right": "straight", "oncoming": "left"}
+# Where witnesses are declared, the lookouts are still in the junction, m behind its end, to see
+# every arm.
 LOOKOUTS_M = -5.0, -1.0
 # Blind seats: slow cars behind the ego, which they never reach; from centre to centre.
 SEATS_M = (17.0, 20.0), (8.5, 10.0), (8.5, 10.0)
@@ -38,32 +42,36 @@ class Parameters(Witnessed):
     """The scenario's own dials. Pairs are bounds of a uniform draw."""
 
     time_limit_s: float = 10.0  # an ego that has not cleared the intersection by then never will
-    # how much later than the full-view driver an ego may clear the intersection. A needless SLOWER costs
-    # about 0.65 s: one is forgiven, two are not
+    # how much later than the full-view driver an ego may clear the intersection. A needless SLOWER
+    # costs about 0.65 s: one is forgiven, two are not
     delay_allowance_s: float = 1.0
     ego_speed_mps: float = 14.0  # speed at the start
     # distance from the start to the centroid of the conflict zone
     ego_start_m: tuple[float, float] = (61.0, 69.0)
-    cleared_m: float = 2.5  # arc length behind the junction's exit at which the ego's centre has cleared it
+    # arc length behind the junction's exit at which the ego's centre has cleared it
+    cleared_m: float = 2.5
     danger_share: float = 0.75  # probability that an episode holds a danger
     # probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33)
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
-    # when a danger from a side reaches the conflict point, after a cruising ego would; as soon as the truck
-    # has passed, if that is later
+    # when a danger from a side reaches the conflict point, after a cruising ego would; as soon as
+    # the truck has passed, if that is later
     danger_offset_s: tuple[float, float] = (-0.4, 0.9)
-    crossing_speed_mps: tuple[float, float] = (8.5, 12.5)  # speed of a car from a side, dangerous or not
+    # speed of a car from a side, dangerous or not
+    crossing_speed_mps: tuple[float, float] = (8.5, 12.5)
     # when the truck passes where an oncoming danger would meet the ego, after a cruising ego would
     truck_offset_s: tuple[float, float] = (-2.3, -1.9)
     # speed of the truck, and of an oncoming car, dangerous or not
     truck_speed_mps: tuple[float, float] = (7.5, 8.5)
     # from the truck's centre to that of an oncoming danger behind it
     follow_m: tuple[float, float] = (10.5, 13.0)
-    corner_m: tuple[float, float] = (8.0, 15.0)  # distance of a building's walls from the centre lines
+    # distance of a building's walls from the centre lines
+    corner_m: tuple[float, float] = (8.0, 15.0)
     # probability of a harmless car that comes as a danger would, from any sector, but later
     late_share: float = 0.4
     # when that car reaches the conflict point, after a cruising ego would
     late_offset_s: tuple[float, float] = (4.0, 7.0)
-    helper_start_m: tuple[float, float] = (2.0, 8.0)  # how far behind the junction helpers are at the start
+    # how far behind the junction helpers are at the start
+    helper_start_m: tuple[float, float] = (2.0, 8.0)
     helper_speed_mps: tuple[float, float] = (4.0, 7.0)  # speed at which they leave
 
 
@@ -85,7 +93,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     ego_arc = crossings["right", "straight"].ego_arc_m - 1.46 - start
 
     def timed(approach: str, speed: float, late: float) -> float:
-        """Return the arc from which a vehicle is at its conflict point `late` s after a cruising ego."""
+        """Return the arc from which a vehicle is at its conflict point `late` s after a cruising
+        ego.
+        """
         at = crossings[approach, ROUTES[approach]]
         return at.other_arc_m - speed * ((at.ego_arc_m - ego_arc) / p.ego_speed_mps + late)
 
@@ -99,7 +109,13 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         """Return the danger of a sector."""
         route = ROUTES[sector]
         if sector == "oncoming":
-            return "car", sector, route, truck_arc - draws.between("follow", p.follow_m), truck_speed
+            return (
+                "car",
+                sector,
+                route,
+                truck_arc - draws.between("follow", p.follow_m),
+                truck_speed,
+            )
         speed = draws.between("crossing_speed", p.crossing_speed_mps)
         ego_s = (crossings[sector, route].ego_arc_m - ego_arc) / p.ego_speed_mps
         soonest, latest = p.danger_offset_s
@@ -111,14 +127,20 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         traffic["danger"] = coming(danger)
     if draws.share("late") < p.late_share:
         arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
-        speed = draws.between("late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps)
+        speed = draws.between(
+            "late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps
+        )
         arc = timed(arm, speed, draws.between("late_offset", p.late_offset_s))
         traffic["late"] = ("car", arm, ROUTES[arm], arc, speed)
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
-    for n, (approach, exit_name) in enumerate((("right", "left"), ("left", "right"), ("own", "ahead"))):
+    for n, (approach, exit_name) in enumerate(
+        (("right", "left"), ("left", "right"), ("own", "ahead"))
+    ):
         arc = paths[approach, "straight"].ends_m[1]
-        arc += draws.between(f"helper_start_{exit_name}", LOOKOUTS_M if draws.seats else p.helper_start_m)
+        arc += draws.between(
+            f"helper_start_{exit_name}", LOOKOUTS_M if draws.seats else p.helper_start_m
+        )
         if exit_name == "ahead" and not draws.seats:
             arc += 4.0  # stays clear of the ego that follows it out of the junction
         speed = draws.between(f"helper_speed_{exit_name}", p.helper_speed_mps)
@@ -144,8 +166,8 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:
     """Return when a car from a side can be at its conflict point, at the soonest, behind the truck.
 
-    In seconds from the start. Their ways cross at a right angle and both keep their speed, so they touch if
-    both are on the crossing at once.
+    In seconds from the start. Their ways cross at a right angle and both keep their speed,
+    so they touch if both are on the crossing at once.
     """
     at, truck, car = (
         road().crossings[approach, "straight"],
@@ -155,7 +177,9 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
     where = truck.points[0, 0], at.y_m
     truck_s = (truck.project(*where)[0] - truck_arc_m) / truck_mps
     (car_length, car_width), (truck_length, truck_width) = SIZES_M["car"], SIZES_M["truck"]
-    apart_s = (car_length + truck_width) / 2 / speed_mps + (truck_length + car_width) / 2 / truck_mps
+    apart_s = (car_length + truck_width) / 2 / speed_mps + (
+        truck_length + car_width
+    ) / 2 / truck_mps
     return truck_s + apart_s + SPARE_S + (at.other_arc_m - car.project(*where)[0]) / speed_mps
 
 

@@ -1,15 +1,15 @@
 """Scenario `parking-exit`: the ego pulls out between vans into a lane that it cannot see.
 
-The ego rolls at 4 m/s along a kerbside space of a street and pulls out to the left, into the lane beside it.
-A row of vans parked behind it hides who comes along that lane. In most episodes one vehicle is dangerous: it
-comes from behind, timed to be where the ego comes into the lane. Three helpers see it: the last van of the
-row, a car parked on the other side of the street, and a car that has just driven past. Traffic keeps its
-lane and speed and yields to nobody: it brakes only for who is in its lane, ahead and slower. The ego alone
-decides.
+The ego rolls at 4 m/s along a kerbside space of a street and pulls out to the left, into the lane
+beside it. A row of vans parked behind it hides who comes along that lane. In most episodes one
+vehicle is dangerous: it comes from behind, timed to be where the ego comes into the lane. Three
+helpers see it: the last van of the row, a car parked on the other side of the street, and a car
+that has just driven past. Traffic keeps its lane and speed and yields to nobody: it brakes only for
+who is in its lane, ahead and slower. The ego alone decides.
 
-This is the kerbside variant, in which the ego drives forwards; nobody reverses. What the ego can see before
-it is too late (vans, helpers, a car on the lane for the other direction, a car that comes later) is drawn
-without knowing of the danger.
+This is the kerbside variant, in which the ego drives forwards; nobody reverses. What the ego can
+see before it is too late (vans, helpers, a car on the lane for the other direction, a car that
+comes later) is drawn without knowing of the danger.
 """
 
 from dataclasses import dataclass
@@ -43,20 +43,23 @@ class Parameters(Witnessed):
 
     target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)  # up to a driver's pace in a car park
     ego_speed_mps: float = 4.0  # speed at the start
-    ego_start_m: tuple[float, float] = (2.0, 8.0)  # how far before the pull-out's beginning the ego starts
+    # how far before the pull-out's beginning the ego starts
+    ego_start_m: tuple[float, float] = (2.0, 8.0)
     cleared_m: float = 6.0  # where the ego has cleared, m beyond the pull-out's end
     danger_share: float = 0.65  # probability that an episode holds a danger
     # when a danger is where the ego comes into the lane, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.5, 0.3)
-    # speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts cover, 30
-    # km/h and more what a street has
+    # speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts
+    # cover, 30 km/h and more what a street has
     lane_mps: tuple[float, float] = (8.0, 11.0)
-    late_share: float = 0.5  # probability of a harmless car that comes from behind as well, but later
+    # probability of a harmless car that comes from behind as well, but later
+    late_share: float = 0.5
     # when it is where the ego comes into the lane, after a cruising ego
     late_offset_s: tuple[float, float] = (8.0, 10.5)
     oncoming_share: float = 0.5  # probability of a car on the lane for the other direction
     oncoming_m: tuple[float, float] = (30.0, 60.0)  # where it starts, m ahead of the ego
-    behind_m: tuple[float, float] = (0.8, 2.0)  # gap from the ego's rear to the van behind it, at the start
+    # gap from the ego's rear to the van behind it, at the start
+    behind_m: tuple[float, float] = (0.8, 2.0)
     vans_m: tuple[float, float] = (0.8, 1.6)  # gap between two vans of the row
     ahead_m: tuple[float, float] = (2.0, 8.0)  # gap from the pull-out's end to the van ahead
     # where the car that is parked opposite stands, m before the pull-out's end
@@ -68,7 +71,9 @@ class Parameters(Witnessed):
 
 @cache
 def network() -> Any:
-    """Build a lane to the east and one to the west, what is parked beside each, and the ego's way out."""
+    """Build a lane to the east and one to the west, what is parked beside each,
+    and the ego's way out.
+    """
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
@@ -104,7 +109,11 @@ def road() -> Road:
     at = crossings(paths, ego)[behind]
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     return Road(
-        facts={"kind": "street with parked vehicles", "lane_width_m": LANE_WIDTH_M, "ego": "/".join(ego)},
+        facts={
+            "kind": "street with parked vehicles",
+            "lane_width_m": LANE_WIDTH_M,
+            "ego": "/".join(ego),
+        },
         paths=paths,
         ego=ego,
         crossings={behind: at},
@@ -131,10 +140,14 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     ahead = OUT_M + draws.between("ahead", p.ahead_m) + VAN / 2
 
     def standing(id_: str, kind: Kind, part: Part, x_m: float, side: str = "kerb") -> Spawn:
-        return Spawn(id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0)
+        return Spawn(
+            id_, kind, part, side, "parked", x_m - BEGIN_M if side == "kerb" else END_M - x_m, 0.0
+        )
 
     def coming(name: str, bounds: tuple[float, float]) -> Spawn:
-        """Return a car from behind that is where the ego enters the lane so long after a cruising ego."""
+        """Return a car from behind that is where the ego enters the lane so long after a cruising
+        ego.
+        """
         speed = draws.between(f"{name}_speed", p.lane_mps)
         after_s = (at.ego_arc_m - ego) / p.ego_speed_mps + draws.between(f"{name}_offset", bounds)
         arc = at.other_arc_m - speed * after_s
@@ -146,7 +159,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     spawns = [
         Spawn("v1", "car", "ego", "own", "pull-out", ego, p.ego_speed_mps),
         standing("v2", "van", "helper", row[-1]),
-        standing("v3", "car", "helper", OUT_M - draws.between("opposite", p.opposite_m), "opposite"),
+        standing(
+            "v3", "car", "helper", OUT_M - draws.between("opposite", p.opposite_m), "opposite"
+        ),
         Spawn("v4", "car", "helper", "behind", "straight", passed, passed_mps),
         standing(ids["first van"], "van", "other", row[0]),
         standing(ids["second van"], "van", "other", row[1]),

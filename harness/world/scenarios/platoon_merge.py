@@ -1,16 +1,18 @@
-"""Scenario `platoon-merge`: a car merges from a ramp behind a wall into a platoon; all of them are agents.
+"""Scenario `platoon-merge`: a car merges from a ramp behind a wall into a platoon;
+all of them are agents.
 
-The ego comes along the ramp of `blind-merge`, and two or three cars drive on the right lane, a second or so
-apart: too close for the ego to merge between two of them without their help. Each has a seat of its own: it
-may make room, or close a gap. Without `agent_share` they keep their lane and speed, as all other traffic
-does: it brakes only for who is in its lane, ahead and slower.
+The ego comes along the ramp of `blind-merge`, and two or three cars drive on the right lane, a
+second or so apart: too close for the ego to merge between two of them without their help. Each has
+a seat of its own: it may make room, or close a gap. Without `agent_share` they keep their lane and
+speed, as all other traffic does: it brakes only for who is in its lane, ahead and slower.
 
-The row has one place more than cars: before, between or behind them, where a gap seems open. In most episodes
-it is taken by a car that is no agent: it neither sends nor makes room. The wall hides it from the ego, and it
-may be hidden from an agent by the one between them. A car beside that place on the left lane is harmless.
+The row has one place more than cars: before, between or behind them, where a gap seems open. In
+most episodes it is taken by a car that is no agent: it neither sends nor makes room. The wall hides
+it from the ego, and it may be hidden from an agent by the one between them. A car beside that place
+on the left lane is harmless.
 
-When the ego comes to the merge is drawn evenly about that place, so that it is as often before as behind
-each of the others; ids tell nobody's place.
+When the ego comes to the merge is drawn evenly about that place, so that it is as often before as
+behind each of the others; ids tell nobody's place.
 """
 
 from dataclasses import dataclass, replace
@@ -46,7 +48,8 @@ class Parameters(Shared):
     offset_s: tuple[float, float] = (-1.1, 1.1)
     danger_share: float = 0.65  # probability that a car which is no agent takes that place
     left_share: float = 0.5  # probability of a car on the left lane beside that place
-    left_offset_s: tuple[float, float] = (-0.3, 0.3)  # when it is beside the merge, after that place
+    # when it is beside the merge, after that place
+    left_offset_s: tuple[float, float] = (-0.3, 0.3)
     # from the wall's end to where the ramp has run into the right lane
     wall_end_m: tuple[float, float] = (30.0, 42.0)
 
@@ -74,10 +77,15 @@ def main_road() -> Road:
 def seats() -> dict[PathKey, Seat]:
     """Return the seat of the platoon's cars."""
     words = {
-        "task": "keep to the right lane of a road, in a platoon, past a ramp that runs into the lane",
+        "task": "keep to the right lane of a road, in a platoon, "
+        "past a ramp that runs into the lane",
         "hiding": SCENARIO.words["hiding"],
     }
-    return {MAIN: Seat(replace(SCENARIO, road=main_road, words=words), {key: key for key in road().paths})}
+    return {
+        MAIN: Seat(
+            replace(SCENARIO, road=main_road, words=words), {key: key for key in road().paths}
+        )
+    }
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
@@ -128,6 +136,9 @@ SCENARIO = Scenario(
     cleared=blind_merge.cleared,
     dials=SHARED,
     seats=seats,
-    words={"task": "merge from a ramp into the right lane of a road", "hiding": "a wall beside the ramp"},
+    words={
+        "task": "merge from a ramp into the right lane of a road",
+        "hiding": "a wall beside the ramp",
+    },
     one_sided="the ramp comes from the right",
 )

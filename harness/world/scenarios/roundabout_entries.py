@@ -1,17 +1,19 @@
-"""Scenario `roundabout-entries`: cars enter a small roundabout from several arms, each in the next one's way.
+"""Scenario `roundabout-entries`: cars enter a small roundabout from several arms,
+each in the next one's way.
 
-The ego comes from the south, and other agents from the west, from the east, or from both; all go straight on.
-Who has entered goes round past the next arm when the one from there is about to enter: the car from the west
-past the south arm, and the ego past the east arm. Each has a seat of its own. Without `agent_share` they keep
-their way and speed, as all other traffic does: it brakes only for who is in its lane, ahead and slower.
+The ego comes from the south, and other agents from the west, from the east, or from both; all go
+straight on. Who has entered goes round past the next arm when the one from there is about to enter:
+the car from the west past the south arm, and the ego past the east arm. Each has a seat of its own.
+Without `agent_share` they keep their way and speed, as all other traffic does: it brakes only for
+who is in its lane, ahead and slower.
 
-In most episodes one more car is dangerous. It is no agent, has come from the north arm and goes on past the
-south arm, closely behind the car from the west, or, where there is none, when the ego enters. Hedges beside
-every arm and a planted mound in the middle hide it. A car just like it that leaves at the south arm does not
-harm the ego.
+In most episodes one more car is dangerous. It is no agent, has come from the north arm and goes on
+past the south arm, closely behind the car from the west, or, where there is none, when the ego
+enters. Hedges beside every arm and a planted mound in the middle hide it. A car just like it that
+leaves at the south arm does not harm the ego.
 
-When two agents meet is drawn evenly about the moment at which both are at the entry, so neither is first more
-often; ids tell nobody's place.
+When two agents meet is drawn evenly about the moment at which both are at the entry,
+so neither is first more often; ids tell nobody's place.
 """
 
 import math
@@ -32,19 +34,27 @@ from harness.world.state import Building
 
 NAME = "roundabout-entries"
 PLACE = Roundabout(ring_m=12.0, entry_m=10.0, beside_m=3.0)  # 28 m from kerb to kerb
-FROM = (("w", "s"), ("s", "e"), ("w", "s", "e"))  # arms that agents come from, the way cars go round
+# arms that agents come from, the way cars go round
+FROM = (("w", "s"), ("s", "e"), ("w", "s", "e"))
 EGO = "s"
 # The arms from which cars come that pass an agent's entry, and the way of these.
 SECTORS = {"left": ("left", "straight"), "oncoming": ("oncoming", "left")}
 SECTOR_REACH_M = (6.0, 30.0)  # stretch before the point of entry that is looked at
-# The route of a car by where it has come from, and at which arm from there on it leaves. Who leaves at the
-# agent's own arm is named `right` and shows it, since that is what matters there. The first of equally good
-# ways is what a car on the ring is taken for.
+# The route of a car by where it has come from, and at which arm from there on it leaves. Who leaves
+# at the agent's own arm is named `right` and shows it, since that is what matters there. The first
+# of equally good ways is what a car on the ring is taken for.
 ROUTES = {
-    ("own", 2): "straight", ("own", 3): "left", ("left", 2): "straight", ("left", 3): "left",
-    ("right", 2): "straight", ("oncoming", 2): "right", ("oncoming", 3): "left", ("right", 3): "right",
-}  # fmt: skip
-PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}  # who is on the ring goes before who enters
+    ("own", 2): "straight",
+    ("own", 3): "left",
+    ("left", 2): "straight",
+    ("left", 3): "left",
+    ("right", 2): "straight",
+    ("oncoming", 2): "right",
+    ("oncoming", 3): "left",
+    ("right", 3): "right",
+}
+# who is on the ring goes before who enters
+PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}
 
 
 @dataclass(frozen=True)
@@ -72,27 +82,38 @@ class Parameters(Shared):
 
 
 def key_of(begin: str, leaves: int, own: str = EGO) -> PathKey:
-    """Return the name of a way by its first arm and at which one from there it leaves, for an agent."""
+    """Return the name of a way by its first arm and at which one from there it leaves,
+    for an agent.
+    """
     approach = name_of(begin, own)
     return approach, ROUTES[approach, leaves]
 
 
 @cache
 def road(own: str = EGO) -> Road:
-    """Return the roundabout for an agent from an arm. Its conflict zone is where its way joins the ring."""
+    """Return the roundabout for an agent from an arm.
+    Its conflict zone is where its way joins the ring.
+    """
     ego = key_of(own, 2, own)
     arms = {name_of(arm, own): arm for arm in ARMS}
     paths = {}
     for (approach, leaves), route in ROUTES.items():
         end = ARMS[(ARMS.index(arms[approach]) + leaves) % len(ARMS)]
-        paths[approach, route] = PLACE.path(approach, route, arms[approach], end, PRIORITY[approach], own)
+        paths[approach, route] = PLACE.path(
+            approach, route, arms[approach], end, PRIORITY[approach], own
+        )
     meetings = crossings(paths, ego)
     at, mine = meetings["left", "straight"], paths[ego]
-    goal_m = float(mine.arc_m[cleared_from(own)(mine.points[:, None], np.array(ego[0]), None).argmax()])
+    goal_m = float(
+        mine.arc_m[cleared_from(own)(mine.points[:, None], np.array(ego[0]), None).argmax()]
+    )
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     return Road(
         facts={
-            "kind": "roundabout", "lane_width_m": LANE_WIDTH_M, "ring_m": PLACE.ring_m, "ego": "/".join(ego),
+            "kind": "roundabout",
+            "lane_width_m": LANE_WIDTH_M,
+            "ring_m": PLACE.ring_m,
+            "ego": "/".join(ego),
         },
         paths=paths,
         ego=ego,
@@ -104,11 +125,13 @@ def road(own: str = EGO) -> Road:
         },
         network=PLACE.network,
         goal_m=lambda parameters: goal_m,
-    )  # fmt: skip
+    )
 
 
 def cleared_from(own: str) -> Callable[[Floats, Texts, Any], Bools]:
-    """Return whether an agent from an arm has left the ring, past the next entry and who enters there."""
+    """Return whether an agent from an arm has left the ring,
+    past the next entry and who enters there.
+    """
     turned_rad, edge_m = math.pi / 2 * ARMS.index(own), PLACE.ring_m + LANE_WIDTH_M / 2
 
     def cleared(xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
@@ -139,7 +162,9 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 def _draft(draws: Draws, p: Parameters) -> Draft:
     paths, at = road().paths, road().crossings[SECTORS["oncoming"]]
     quarter_s = PLACE.ring_m * math.pi / 2 / p.speed_mps  # from one entry to the next
-    arms = FROM[2] if draws.share("third") < p.third_share else FROM[int(draws.share("which") < 0.5)]
+    arms = (
+        FROM[2] if draws.share("third") < p.third_share else FROM[int(draws.share("which") < 0.5)]
+    )
     ego_s = draws.between("ego", p.ego_s)
     enters_s = {
         "w": ego_s - quarter_s - draws.between("offset w", p.offset_s),
@@ -152,14 +177,21 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     for arm in (EGO, *helpers):
         key = key_of(arm, 2)
         arc = paths[key].ends_m[1] - p.speed_mps * enters_s[arm]
-        spawns.append(Spawn(ids[arm], "car", "ego" if arm == EGO else "helper", *key, arc, p.speed_mps))
+        spawns.append(
+            Spawn(ids[arm], "car", "ego" if arm == EGO else "helper", *key, arc, p.speed_mps)
+        )
     passes_s = ego_s + draws.between("danger_offset", p.danger_offset_s)
     if "w" in arms:
         passes_s = enters_s["w"] + quarter_s + draws.between("headway", p.headway_s)
     (comes,) = draws.ids(("comes",)).values()
     goes_on, turns_off = (
         Spawn(
-            comes, "car", "other", *key_of("n", leaves), at.other_arc_m - p.speed_mps * passes_s, p.speed_mps
+            comes,
+            "car",
+            "other",
+            *key_of("n", leaves),
+            at.other_arc_m - p.speed_mps * passes_s,
+            p.speed_mps,
         )
         for leaves in (3, 2)
     )
@@ -172,10 +204,12 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     half, far = p.hedge_half_m, PLACE.arc_y_m + ARM_M
     ends = {arm: draws.between(f"hedge {arm}", p.hedge_end_m) for arm in ARMS}
     boxes = [
-        (-half, ends["s"], half, far), (ends["e"], -half, far, half),
-        (-half, -far, half, -ends["n"]), (-far, -half, -ends["w"], half),
+        (-half, ends["s"], half, far),
+        (ends["e"], -half, far, half),
+        (-half, -far, half, -ends["n"]),
+        (-far, -half, -ends["w"], half),
         *PLACE.mound(draws.between("mound", p.mound_m)),
-    ]  # fmt: skip
+    ]
     buildings = [Building(f"b{n}", *box) for n, box in enumerate(boxes, 1)]
     return Draft(Layout.arranged(spawns, danger, comes, buildings), (goes_on,), ())
 

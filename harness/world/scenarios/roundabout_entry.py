@@ -1,15 +1,15 @@
 """Scenario `roundabout-entry`: the ego enters a roundabout past a hedge that hides who is on it.
 
-The ego comes from the south at 8 m/s and enters a roundabout of one lane to go straight on. A hedge on the
-splitter island beside it, and a planted mound in the middle, hide who comes round from the left. In most
-episodes one vehicle is dangerous: it has come from the west or the north arm, goes on past the ego's arm, and
-is timed to be where the ego enters. What matters is where it goes: a car just like it that leaves at the
-ego's arm is harmless. Three helpers, one that has just left at the ego's arm, one that has left at the west
-arm and one that has just entered ahead of the ego, see parts of the ring. Traffic keeps its lane and speed
-and yields to nobody; the ego alone decides.
+The ego comes from the south at 8 m/s and enters a roundabout of one lane to go straight on. A hedge
+on the splitter island beside it, and a planted mound in the middle, hide who comes round from the
+left. In most episodes one vehicle is dangerous: it has come from the west or the north arm, goes on
+past the ego's arm, and is timed to be where the ego enters. What matters is where it goes: a car
+just like it that leaves at the ego's arm is harmless. Three helpers, one that has just left at the
+ego's arm, one that has left at the west arm and one that has just entered ahead of the ego, see
+parts of the ring. Traffic keeps its lane and speed and yields to nobody; the ego alone decides.
 
-What the ego can see before it is too late (hedge, mound, helpers, a car that leaves first, a car that comes
-later) is drawn without knowing of the danger.
+What the ego can see before it is too late (hedge, mound, helpers, a car that leaves first, a car
+that comes later) is drawn without knowing of the danger.
 """
 
 from dataclasses import dataclass, replace
@@ -30,8 +30,8 @@ NAME = "roundabout-entry"
 PLACE = Roundabout(ring_m=20.0, entry_m=18.0, beside_m=4.0)
 SECTORS = ("left", "oncoming")  # the arm that a danger has come from
 SECTOR_REACH_M = (8.0, 45.0)  # stretch before the point of entry that is looked at
-# Where witnesses are declared, the third lookout is a second car that leaves at the west arm, this far behind
-# the first.
+# Where witnesses are declared, the third lookout is a second car that leaves at the west arm, this
+# far behind the first.
 SECOND_M = 8.0, 10.0
 # Blind seats: slow cars behind the ego, which they never reach; from centre to centre.
 SEATS_M = (14.0, 18.0), (9.0, 11.0), (9.0, 11.0)
@@ -45,7 +45,8 @@ class Parameters(Witnessed):
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
     # speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386)
     ego_speed_mps: float = 8.0
-    ego_start_m: tuple[float, float] = (33.0, 39.0)  # from the start to where the ego's way joins the ring
+    # from the start to where the ego's way joins the ring
+    ego_start_m: tuple[float, float] = (33.0, 39.0)
     danger_share: float = 0.65  # probability that an episode holds a danger
     sector_shares: tuple[float, float] = (0.5, 0.5)  # probability of left, oncoming, given a danger
     # when a danger passes where the ego enters, after a cruising ego would
@@ -57,13 +58,14 @@ class Parameters(Witnessed):
     before_share: float = 0.4  # probability of a car that leaves there shortly before
     # when that car would pass where the ego enters if it went on
     before_offset_s: tuple[float, float] = (-1.8, -1.3)
-    # probability of a car that comes as a danger would, but later than the critical headway of 4.98 s (HCM 7,
-    # equation 22-1) allows the ego to be in its way
+    # probability of a car that comes as a danger would, but later than the critical headway of 4.98
+    # s (HCM 7, equation 22-1) allows the ego to be in its way
     late_share: float = 0.4
     # when it passes where the ego enters, after a cruising ego would
     late_offset_s: tuple[float, float] = (5.0, 7.0)
     mound_m: tuple[float, float] = (12.0, 15.0)  # radius of the planted part of the island
-    hedge_end_m: tuple[float, float] = (24.0, 32.0)  # from the ring's centre to the end of the hedge
+    # from the ring's centre to the end of the hedge
+    hedge_end_m: tuple[float, float] = (24.0, 32.0)
     hedge_half_m: float = 1.5  # half its width; the splitter island is 4 m wide at its narrowest
     # how far behind the ring's edge the helper that left at the ego's arm starts
     helper_south_m: tuple[float, float] = (16.0, 22.0)
@@ -77,7 +79,8 @@ class Parameters(Witnessed):
 def road() -> Road:
     """Return the roundabout. Its conflict zone is where the ego's way joins the ring."""
     ego = ("own", "straight")
-    # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past it.
+    # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past
+    # it.
     paths = {
         ego: PLACE.path(*ego, "s", "n", 0),
         ("own", "left"): PLACE.path("own", "left", "s", "w", 0),
@@ -90,7 +93,9 @@ def road() -> Road:
     at = meetings["left", "straight"]
     back_m = np.linspace(*SECTOR_REACH_M, 15)
     watched = {
-        sector: paths[sector, "straight"].points_at(meetings[sector, "straight"].other_arc_m - back_m)
+        sector: paths[sector, "straight"].points_at(
+            meetings[sector, "straight"].other_arc_m - back_m
+        )
         for sector in SECTORS
     }
     return Road(
@@ -120,11 +125,18 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     def arm(what: str) -> str:
         return SECTORS[int(draws.share(what) >= p.sector_shares[0])]
 
-    start, ring_mps = draws.between("ego_start", p.ego_start_m), draws.between("ring_speed", p.ring_mps)
+    start, ring_mps = (
+        draws.between("ego_start", p.ego_start_m),
+        draws.between("ring_speed", p.ring_mps),
+    )
 
-    def helper(id_: str, key: PathKey, begin_m: float, what: str, beyond_m: tuple[float, float]) -> Spawn:
+    def helper(
+        id_: str, key: PathKey, begin_m: float, what: str, beyond_m: tuple[float, float]
+    ) -> Spawn:
         arc = begin_m + draws.between(f"helper_{what}", beyond_m)
-        return Spawn(id_, "car", "helper", *key, arc, draws.between(f"helper_{what}_speed", p.helper_mps))
+        return Spawn(
+            id_, "car", "helper", *key, arc, draws.between(f"helper_{what}_speed", p.helper_mps)
+        )
 
     leaves, crosses, enters = ("oncoming", "right"), ("own", "left"), ("own", "straight")
     spawns = [
@@ -140,7 +152,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     def car(name: str, sector: str, route: str, bounds: tuple[float, float]) -> Spawn:
         """Return a car that is, or would be, where the ego enters so long after a cruising ego."""
         late_s = draws.between(f"{name}_offset", bounds)
-        arc = meetings[sector, "straight"].other_arc_m - ring_mps * (start / p.ego_speed_mps + late_s)
+        arc = meetings[sector, "straight"].other_arc_m - ring_mps * (
+            start / p.ego_speed_mps + late_s
+        )
         return Spawn(ids[name], "car", "other", sector, route, arc, ring_mps)
 
     ids = draws.ids(("round", "before", "late"))
@@ -177,6 +191,9 @@ SCENARIO = Scenario(
     layout=layout,
     cleared=cleared,
     dials=WITNESSED,
-    words={"task": "enter a roundabout and go straight on", "hiding": "a hedge and a planted island"},
+    words={
+        "task": "enter a roundabout and go straight on",
+        "hiding": "a hedge and a planted island",
+    },
     one_sided="traffic goes round one way and comes from the left",
 )

@@ -28,7 +28,8 @@ def quiet(done):
     pass
 
 
-# -- ranks, by hand ---------------------------------------------------------------------------------
+# -- ranks, by hand
+# ---------------------------------------------------------------------------------
 
 
 def test_an_auc_is_the_share_of_pairs_in_their_order_and_a_tie_is_half():
@@ -46,21 +47,28 @@ def test_only_points_that_are_alike_are_compared():
 
 def test_no_interval_has_zero_width():
     there = np.array([True, False] * 10)
-    found = Ranks.compare(np.arange(20), np.zeros(20, dtype=int), there.astype(float), there).estimate()
+    found = Ranks.compare(
+        np.arange(20), np.zeros(20, dtype=int), there.astype(float), there
+    ).estimate()
     assert (found.value, found.high) == (1.0, 1.0)
     assert found.low == pytest.approx(10 / (10 + 1.96**2), abs=1e-4)  # Wilson, 10 of 10
 
 
 def test_layouts_are_drawn_whole():
     """Ten moments that are copies of one say no more than it does."""
-    layout, there, score = np.arange(40), np.arange(40) % 2 == 0, np.random.default_rng(0).random(40)
+    layout, there, score = (
+        np.arange(40),
+        np.arange(40) % 2 == 0,
+        np.random.default_rng(0).random(40),
+    )
     once = Ranks.compare(layout, np.zeros(40, dtype=int), score, there).estimate()
     copies = (np.repeat(of, 10) for of in (layout, score, there))
     often = Ranks.compare(next(copies), np.tile(np.arange(10), 40), *copies).estimate()
     assert (often.low, often.high) == pytest.approx((once.low, once.high))
 
 
-# -- the classifier on numbers whose answer is known ------------------------------------------------
+# -- the classifier on numbers whose answer is known
+# ------------------------------------------------
 
 
 @pytest.fixture
@@ -103,33 +111,42 @@ def test_a_number_of_which_one_fold_alone_knows_anything_is_left_out(known):
     from sklearn.model_selection import StratifiedGroupKFold
 
     table, danger = known
-    splits = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(table, danger, np.arange(200))
+    splits = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(
+        table, danger, np.arange(200)
+    )
     learnt, _ = next(iter(splits))
     table[learnt, 2] = np.nan
     auc, _ = judge(moments(table, danger), ("left", "right"))
     assert auc == judge(moments(np.delete(table, 2, axis=1), danger), ("left", "right"))[0]
 
 
-# -- scenarios --------------------------------------------------------------------------------------
+# -- scenarios
+# --------------------------------------------------------------------------------------
 
 
 def telling(seed, parameters):
-    """As the scenario once was: where a danger comes from a side, the truck in sight is farther away."""
+    """As the scenario once was: where a danger comes from a side,
+    the truck in sight is farther away.
+    """
     found = layout(seed, parameters)
     moved = [
-        replace(s, arc_m=s.arc_m - 45.0) if s.kind == "truck" and found.danger else s for s in found.spawns
+        replace(s, arc_m=s.arc_m - 45.0) if s.kind == "truck" and found.danger else s
+        for s in found.spawns
     ]
     return replace(found, spawns=tuple(moved))
 
 
 @pytest.mark.slow
 def test_a_truck_that_is_elsewhere_where_there_is_danger_is_found():
-    dials = Parameters(danger_share=0.5, sector_shares=(0.5, 0.5, 0.0), decisions=2, time_limit_s=2.0)
+    dials = Parameters(
+        danger_share=0.5, sector_shares=(0.5, 0.5, 0.0), decisions=2, time_limit_s=2.0
+    )
     found = audit(replace(SCENARIO, layout=telling, parameters=dials), 40, 0, quiet)
     assert found.tells
     assert found.auc["danger"].value > 0.95
     assert found.auc["danger"].low > 0.75
-    assert list(found.told_by) == ["oncoming: seen_share"]  # what a truck that is farther away hides
+    # what a truck that is farther away hides
+    assert list(found.told_by) == ["oncoming: seen_share"]
 
 
 @pytest.mark.slow
@@ -145,7 +162,10 @@ def test_a_car_that_is_heard_to_be_harmless_is_no_tell(monkeypatch):
     silent, loud = (scenarios.get(f"hard-brake-ahead:radio_share={share}") for share in (0, 1))
     for each in (silent, loud):
         audit(
-            replace(each, parameters=replace(each.parameters, decisions=1, time_limit_s=1.0)), 14, 10, quiet
+            replace(each, parameters=replace(each.parameters, decisions=1, time_limit_s=1.0)),
+            14,
+            10,
+            quiet,
         )
     for name in ("layout", "step", "danger", "names", "numbers"):
         np.testing.assert_array_equal(*(getattr(points, name) for points in judged))
@@ -202,7 +222,9 @@ def test_the_command_says_the_same_to_people_and_to_machines(harness, monkeypatc
 
 @pytest.mark.slow
 def test_the_card_of_a_dataset_says_what_its_audit_found(tmp_path, monkeypatch):
-    dials = Parameters(danger_share=0.5, sector_shares=(1.0, 0.0, 0.0), decisions=1, time_limit_s=1.0)
+    dials = Parameters(
+        danger_share=0.5, sector_shares=(1.0, 0.0, 0.0), decisions=1, time_limit_s=1.0
+    )
     scenario, counted = replace(SCENARIO, parameters=dials), []
     monkeypatch.setattr("harness.dataset.build.LEAST_AUDITED", 20)
     build(scenario, tmp_path / "audited", 20, 0, 1, quiet, more=counted.append)

@@ -1,4 +1,6 @@
-"""An edition of the benchmark: run, packed into one file, and computed again from the answers in it."""
+"""An edition of the benchmark: run, packed into one file,
+and computed again from the answers in it.
+"""
 
 import json
 import os
@@ -65,7 +67,9 @@ def project(harness: Harness, tmp_path: Path, small_path: Path, small: Dataset) 
 
 @pytest.fixture
 def made(project: Harness, once: Once, tmp_path: Path) -> Path:
-    """A file of results of `proxy-faulty`, some of whose answers are repaired and some unreadable."""
+    """A file of results of `proxy-faulty`,
+    some of whose answers are repaired and some unreadable.
+    """
 
     def run(out: Path) -> None:
         code, _, err = project(
@@ -111,7 +115,9 @@ def answers(files: dict[str, bytes], change: Callable[[dict[str, object]], objec
 def better(files: dict[str, bytes]) -> None:
     """State a figure that the answers do not give."""
     lines = files["small/summary.csv"].decode().splitlines(keepends=True)
-    at = next(n for n, line in enumerate(lines) if ",6g,success_rate," in line and "episodes" in line)
+    at = next(
+        n for n, line in enumerate(lines) if ",6g,success_rate," in line and "episodes" in line
+    )
     cells = lines[at].split(",")
     cells[6] = "0.987654"
     lines[at] = ",".join(cells)
@@ -147,7 +153,9 @@ def test_a_file_says_nothing_of_the_machine_and_its_bytes_follow_from_the_runs(
     assert Path("again.zip").read_bytes() == before
 
 
-def test_a_stated_figure_that_the_answers_do_not_give_is_named(project: Harness, made: Path) -> None:
+def test_a_stated_figure_that_the_answers_do_not_give_is_named(
+    project: Harness, made: Path
+) -> None:
     changed(made, better)
     code, out, _ = project("benchmark", "verify", made)
     assert code == 1
@@ -166,7 +174,9 @@ def test_what_a_file_says_its_answers_mean_is_not_believed(project: Harness, mad
     changed(made, lambda files: answers(files, lambda a: brakes(a) if a["role"] == "ego" else None))
     code, out, _ = project("benchmark", "verify", made)
     assert code == 1
-    assert re.search(r"small: 1 differ: \d+ answers of a rule that is here", out), "which gives its own"
+    assert re.search(r"small: 1 differ: \d+ answers of a rule that is here", out), (
+        "which gives its own"
+    )
 
 
 def drop(files: dict[str, bytes]) -> None:
@@ -217,20 +227,35 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "a name above the folder": (renamed("../../escaped"), "runs: none, too many, one twice"),
     "an absolute name": (renamed("/tmp/escaped"), "runs: none, too many, one twice"),
     "a hidden name": (renamed(".hidden"), "runs: none, too many, one twice"),
-    "a file too many": (lambda files: files.update({"small/x.py": b""}), "it has other files than it should"),
-    "a file too few": (lambda files: files.pop("small/episodes.csv"), "it has other files than it should"),  # type: ignore[dict-item]
-    "a bomb": (lambda files: files.update({"small/run.json": b" " * (17 << 20)}), "small/run.json is larger"),
+    "a file too many": (lambda files: files.update({"small/x.py": b""}), 
+        "it has other files "
+        "than it should"),
+    "a file too few": (lambda files: files.pop("small/episodes.csv"), 
+        "it has other files "
+        "than it should"),  # type: ignore[dict-item]
+    "a bomb": (lambda files: files.update({"small/run.json": b" " * (17 << 20)}), 
+        "small/run.json is "
+        "larger"),
     "nothing but blanks": (
-        lambda files: files.update({"small/answers.jsonl": b" " * (16 << 20)}), "would unpack to 16 MB",
+        lambda files: files.update({"small/answers.jsonl": b" " * (16 << 20)}), 
+            "would "
+            "unpack to "
+            "16 MB",
     ),
-    "runs of another edition": (with_contents(runs=["small", "theirs"]), "unknown dataset of mine-1"),
+    "runs of another edition": (with_contents(runs=["small", "theirs"]), 
+        "unknown "
+        "dataset of "
+        "mine-1"),
     "no contents": (lambda files: files.update({CONTENTS: b"{"}), "is no file of results"),
     "another format": (with_contents(format="swarmdrive-results/9"), "its format is not"),
     "another edition": (with_contents(edition="theirs-1"), "unknown edition 'theirs-1'"),
     "an edition that has changed": (with_contents(digest="0" * 64), "has digest"),
     "no run": (lambda files: files.update({"small/run.json": b"{}"}), "has format"),
     "other seeds": (with_run(seeds=[5, 6]), "its seeds: (5, 6), not (0, 1)"),
-    "another prompt": (with_run(prompt={"version": "v9", "sha256": "0" * 64}), "none of its prompts"),
+    "another prompt": (with_run(prompt={"version": "v9", "sha256": "0" * 64}), 
+        "none of "
+        "its "
+        "prompts"),
     "another latency": (with_run(latency_source="card"), "its latency: card, not paper"),
     "an engine that nobody has": (with_model(engine="evil"), "evil"),
     "answers that are missing": (drop, "holds no answer for"),
@@ -247,7 +272,9 @@ HOSTILE: dict[str, tuple[Change, str]] = {
 def test_a_hostile_file_is_refused_in_one_line_and_leaves_nothing(
     project: Harness, made: Path, tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is unpacked lies deep in the test's folder, so that what leaves its own folder is seen."""
+    """What is unpacked lies deep in the test's folder,
+    so that what leaves its own folder is seen.
+    """
     change, message = HOSTILE[what]
     changed(made, change)
     deep = tmp_path / "a/b"
@@ -306,14 +333,20 @@ def test_what_is_no_zip_file_of_ours_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("slow_s", [-0.145, 1e308])
-def test_a_delay_that_no_card_declares_is_not_taken(project: Harness, made: Path, slow_s: float) -> None:
-    changed(made, lambda files: answers(files, lambda a: a.update(prompt_tokens=10**40, slow_s=slow_s)))
+def test_a_delay_that_no_card_declares_is_not_taken(
+    project: Harness, made: Path, slow_s: float
+) -> None:
+    changed(
+        made, lambda files: answers(files, lambda a: a.update(prompt_tokens=10**40, slow_s=slow_s))
+    )
     assert project("benchmark", "verify", made, "--quiet")[0] == 0
 
 
 @pytest.mark.slow
 def test_who_sees_everything_is_known_here_whatever_a_file_says(project: Harness) -> None:
-    code, _, err = project("benchmark", "run", "mine-1", "--model", "full-view", "--quiet", "--out", "f")
+    code, _, err = project(
+        "benchmark", "run", "mine-1", "--model", "full-view", "--quiet", "--out", "f"
+    )
     assert (code, err) == (0, "")
     changed(Path("f.zip"), with_model(privileged=False))
     code, out, _ = project("benchmark", "board", "f.zip", "--json")
@@ -327,7 +360,9 @@ def test_who_sees_everything_is_known_here_whatever_a_file_says(project: Harness
 
 @pytest.mark.slow
 def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> None:
-    code, _, err = project("benchmark", "run", "mine-1", "--model", "uniform", "--quiet", "--out", "u")
+    code, _, err = project(
+        "benchmark", "run", "mine-1", "--model", "uniform", "--quiet", "--out", "u"
+    )
     assert (code, err) == (0, "")
     assert project("benchmark", "verify", "u.zip", "--quiet")[:2] == (0, "")
     changed(Path("u.zip"), lambda files: answers(files, lambda a: a.update(raw="SLOWER")))
@@ -347,8 +382,19 @@ def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> No
 def test_runs_that_are_not_of_the_edition_are_not_packed(
     project: Harness, options: tuple[str, ...], why: str | None
 ) -> None:
-    usual = ("--seeds", "0:2", "--condition", "single-local", "--condition", "6g", "--latency", "paper")
-    code, _, err = project("eval", "--dataset", "small", *usual, *options, "--quiet", "--out", "run")
+    usual = (
+        "--seeds",
+        "0:2",
+        "--condition",
+        "single-local",
+        "--condition",
+        "6g",
+        "--latency",
+        "paper",
+    )
+    code, _, err = project(
+        "eval", "--dataset", "small", *usual, *options, "--quiet", "--out", "run"
+    )
     if why is None:
         assert code == 2, "a driver is no helper"
         return
@@ -430,7 +476,9 @@ def make_golden(name: str, file: Path, folder: Path) -> None:
         evaluating.run(spec, folder / dataset)
         runs.append(read(folder / dataset))
     entry = edition.entry(runs, edition.golden.layouts)
-    contents = results.Contents(format=results.FORMAT, edition=name, digest="", made_by="", runs=tuple(entry))
+    contents = results.Contents(
+        format=results.FORMAT, edition=name, digest="", made_by="", runs=tuple(entry)
+    )
     results.pack(contents, entry, edition.figures, edition.golden_file)
     pin(file, edition.golden_file)
 
@@ -442,7 +490,8 @@ def pin(file: Path, golden: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_figures_are_computed_as_a_shipped_edition_pins_them(name: str, tmp_path: Path) -> None:
-    """The golden file has texts of `proxy-faulty`: strict ones, repaired ones, some that cannot be read.
+    """The golden file has texts of `proxy-faulty`:
+    strict ones, repaired ones, some that cannot be read.
 
     For a new edition `UPDATE_GOLDEN=NAME` makes it. That of a released edition is never made again.
     """
@@ -452,7 +501,9 @@ def test_figures_are_computed_as_a_shipped_edition_pins_them(name: str, tmp_path
 
 
 @pytest.mark.slow
-def test_an_installation_that_computes_a_figure_otherwise_says_so(project: Harness, tmp_path: Path) -> None:
+def test_an_installation_that_computes_a_figure_otherwise_says_so(
+    project: Harness, tmp_path: Path
+) -> None:
     file, golden = Path("editions/mine-1.toml"), Path("editions/mine-1.golden.zip")
     file.write_text(file.read_text() + '[golden]\nsha256 = ""\nlayouts = 2\n')
     golden.touch()
@@ -479,7 +530,12 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
 ) -> None:
     for model in ("uniform", "full-view"):
         by = ("--made-by", "<script>alert(1)</script>\u202e")
-        assert project("benchmark", "run", "mine-1", "--model", model, "--quiet", "--out", model, *by)[0] == 0
+        assert (
+            project("benchmark", "run", "mine-1", "--model", model, "--quiet", "--out", model, *by)[
+                0
+            ]
+            == 0
+        )
     copyfile(made, "twin.zip")
     copyfile(made, "forged.zip")
     changed(Path("forged.zip"), better)
@@ -494,7 +550,9 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     same = [line for line in ranked if line["agents"] == "proxy-faulty · a rule"]
     assert [line["rank"] for line in same] == [1, 1, 1], "nobody is clearly better than itself"
     assert sorted(line["equal"] for line in same) == [False, True, True]
-    assert len({json.dumps(line["success"]) for line in same}) == 1, "the figures are those computed here"
+    assert len({json.dumps(line["success"]) for line in same}) == 1, (
+        "the figures are those computed here"
+    )
     page = Path("board.html").read_text()
     assert "<script>alert" not in page
     assert "⟨U+202E⟩" in page
@@ -511,7 +569,9 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     assert "a board is of one edition" in err
 
 
-def test_a_board_does_not_take_the_place_of_a_file_that_it_ranks(project: Harness, made: Path) -> None:
+def test_a_board_does_not_take_the_place_of_a_file_that_it_ranks(
+    project: Harness, made: Path
+) -> None:
     before = made.read_bytes()
     Path("link.html").symlink_to(made)
     for out in ("entry.zip", "./entry.zip", "link.html"):
@@ -527,7 +587,9 @@ def test_a_board_for_a_folder_is_refused_before_a_file_is_read(project: Harness)
     assert err == "harness: --out editions is a folder; name a file in it\n"
 
 
-def test_a_check_that_is_interrupted_promises_no_folder(project: Harness, made: Path, tmp_path: Path) -> None:
+def test_a_check_that_is_interrupted_promises_no_folder(
+    project: Harness, made: Path, tmp_path: Path
+) -> None:
     """A run says which folder keeps what is done; that of a check is deleted."""
 
     def stop(answers: int) -> None:
@@ -557,7 +619,9 @@ def entry_that_loses(folder: Path, *lost: int, name: str = "v2v-safety-1.0") -> 
 
 @pytest.mark.slow
 def test_a_rank_is_one_more_than_the_entries_that_are_clearly_better(tmp_path: Path) -> None:
-    """Layouts are drawn again here, of both kinds, to say by other means who is clearly better than whom."""
+    """Layouts are drawn again here, of both kinds,
+    to say by other means who is clearly better than whom.
+    """
     lost = {"best": [0, 1], "near": [2, 3, 4], "worse": [*range(30)], "worst": [*range(55)]}
     entries = [entry_that_loses(tmp_path / name, *each) for name, each in reversed(lost.items())]
     ordered = board.lines(entries)
@@ -586,7 +650,9 @@ def test_the_next_edition_tells_apart_what_the_first_does_not(tmp_path: Path) ->
                for who, lost in (("best", ()), ("other", range(1, 11, 2)))]  # fmt: skip
         ordered = board.lines(few)
         ranks[name] = [line.rank for line in ordered]
-        said = "each half of each family has one of its own" in " ".join(board.render(ordered, ()).split())
+        said = "each half of each family has one of its own" in " ".join(
+            board.render(ordered, ()).split()
+        )
         assert said == (name == "v2v-safety-1.0")
     assert ranks == {"v2v-safety-1.0": [1, 1], "v2v-safety-1.1": [1, 2]}
 
@@ -617,7 +683,9 @@ def test_a_try_of_some_layouts_is_counted_first_and_is_no_entry(project: Harness
     assert code == 0
     assert "no model was called" in " ".join(out.split())
     assert not Path("reports").exists()
-    code, out, _ = project("benchmark", "run", "mine-1", "--model", "proxy", "--limit", "1", "--out", "try")
+    code, out, _ = project(
+        "benchmark", "run", "mine-1", "--model", "proxy", "--limit", "1", "--out", "try"
+    )
     assert code == 0
     assert out.endswith("a try of 1 layout of each dataset is no entry: nothing was packed\n")
     assert not Path("try.zip").exists()

@@ -15,7 +15,12 @@ from hypothesis import strategies as st
 
 from harness.core.resources import MARKER
 from harness.dataset.build import build
-from harness.extensions.calibration.calibrations import OF_QUESTION, Calibration, Correction, question_of
+from harness.extensions.calibration.calibrations import (
+    OF_QUESTION,
+    Calibration,
+    Correction,
+    question_of,
+)
 from harness.extensions.calibration.fitting import TEMPERATURES, fit
 from harness.runs.folder import read
 from harness.world import scenarios
@@ -30,7 +35,9 @@ def test_a_prior_and_a_temperature_by_hand() -> None:
     p, prior = np.array([0.6, 0.3, 0.1]), (0.6, 0.2, 0.2)
     assert Correction(1, prior=prior).of(p) == pytest.approx(np.array([2, 3, 1]) / 6)
     assert Correction(1, 0.5, prior).of(p) == pytest.approx(np.array([4, 9, 1]) / 14)
-    assert Correction(1, 2.0).of(np.array([0.64, 0.36, 0.0])) == pytest.approx([0.8 / 1.4, 0.6 / 1.4, 0.0])
+    assert Correction(1, 2.0).of(np.array([0.64, 0.36, 0.0])) == pytest.approx(
+        [0.8 / 1.4, 0.6 / 1.4, 0.0]
+    )
 
 
 def test_answers_that_are_none_stay() -> None:
@@ -70,7 +77,9 @@ def test_a_prior_is_the_mean_answer_and_needs_no_tree() -> None:
 
 
 @pytest.fixture
-def tuned(proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path, unrebuilt: None) -> Path:
+def tuned(
+    proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path, unrebuilt: None
+) -> Path:
     """A project with a calibration of the proxy."""
     (tmp_path / MARKER).touch()
     for level in ("L0", "L1"):
@@ -91,7 +100,9 @@ def evaluated(harness: Typed, dataset: Path, *more: str) -> tuple[int, str, str]
 def test_a_calibration_corrects_every_answer_of_a_condition(
     tuned: Path, small_path: Path, harness: Typed
 ) -> None:
-    """Alone the policy is the ego's corrected answer; the run keeps the file, and a sweep plays it again."""
+    """Alone the policy is the ego's corrected answer;
+    the run keeps the file, and a sweep plays it again.
+    """
     conditions = ("single-local", "single-local:calibration=l1", "6g", "6g:calibration=l0")
     words = [word for name in conditions for word in ("--condition", name)]
     code, _, error = evaluated(harness, small_path, "--out", "run", *words)
@@ -124,7 +135,9 @@ def test_a_calibration_corrects_every_answer_of_a_condition(
         assert swept[value] == pytest.approx(score.value)
     file = tuned / "calibrations/l0.toml"
     file.write_text(file.read_text().replace('"answers" = ', '"answers" = 1'))
-    assert "calibration l0 has changed since" in harness("study", "sweep", "run", "--over", "tau")[2]
+    assert (
+        "calibration l0 has changed since" in harness("study", "sweep", "run", "--over", "tau")[2]
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,21 +186,31 @@ def test_report_layouts_and_a_name_that_is_taken_are_refused(
     tuned: Path, tmp_path: Path, small_path: Path, proxy_run: Path, harness: Typed
 ) -> None:
     build(
-        scenarios.get("occluded-intersection"), tmp_path / "report", 1, 200_000, 1, lambda done: None, False
+        scenarios.get("occluded-intersection"),
+        tmp_path / "report",
+        1,
+        200_000,
+        1,
+        lambda done: None,
+        False,
     )
     code, _, error = evaluated(harness, tmp_path / "report", "--out", "held-out")
     assert code == 0, error
     code, _, error = harness("model", "calibrate", "held-out", "--out", "y.toml")
     assert code == 2
     assert error == (
-        "harness: held-out: calibration is fitted on tune seeds, and these are layout seeds 200000 to 200000 "
+        "harness: held-out: calibration is fitted on tune seeds, and these are layout seeds 200000 "
+        "to 200000 "
         "(report)\n"
     )
     assert not Path("y.toml").exists()
-    taken = harness("model", "calibrate", proxy_run, "--dataset", small_path, "--out", "calibrations/l1.toml")
+    taken = harness(
+        "model", "calibrate", proxy_run, "--dataset", small_path, "--out", "calibrations/l1.toml"
+    )
     assert "is there already" in taken[2]
     assert (
-        "unknown --level" in harness("model", "calibrate", proxy_run, "--level", "l9", "--out", "z.toml")[2]
+        "unknown --level"
+        in harness("model", "calibrate", proxy_run, "--level", "l9", "--out", "z.toml")[2]
     )
 
 
@@ -199,7 +222,9 @@ def test_an_answer_in_a_scene_that_the_dataset_has_not_is_one_line(
     scene = json.loads(line)["scene"]
     with (run / "answers.jsonl").open("a") as file:
         file.write(line.replace(scene, "00009-0-000000000000") + "\n")
-    code, _, error = harness("model", "calibrate", run, "--dataset", small_path, "--out", "mine.toml")
+    code, _, error = harness(
+        "model", "calibrate", run, "--dataset", small_path, "--out", "mine.toml"
+    )
     assert (code, error.count("\n")) == (2, 1)
     assert "has scene '00009-0-000000000000', which its dataset has not" in error
 

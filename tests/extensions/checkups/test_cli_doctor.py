@@ -14,7 +14,10 @@ import pytest
 from harness.backends.cards import load_all
 
 Said = tuple[int, str, str]
-DOCTOR = "import harness.cli as c; sys.argv = ['harness', 'model', 'doctor', *sys.argv[1:]]\ntry: c.main()\n"
+DOCTOR = (
+    "import harness.cli as c; sys.argv = ['harness', 'model', 'doctor', *sys.argv[1:]]\ntry: "
+    "c.main()\n"
+)
 
 
 def apart(before: str, *args: str, after: str = "raise") -> str:
@@ -35,7 +38,9 @@ def test_it_tells_versions_machine_models_and_cache(
     assert told["versions"]["numpy"] == version("numpy")
     assert told["cores"] == len(os.sched_getaffinity(0))
     assert told["memory_gib"] > 0
-    assert [(m["name"], m["engine"]) for m in told["models"]] == [(c.name, c.engine) for c in load_all()]
+    assert [(m["name"], m["engine"]) for m in told["models"]] == [
+        (c.name, c.engine) for c in load_all()
+    ]
     assert told["cache"] == {"file": str(tmp_path / "completions.sqlite"), "bytes": 7}
 
 
@@ -44,17 +49,31 @@ def test_people_read_it_in_eighty_columns(harness: Callable[..., Said]) -> None:
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     heads = [line.split()[0] for line in out.splitlines() if not line.startswith(" ")]
-    assert heads == ["harness", "packages", "machine", "GPU", "meters", "cache", "engines", "models"]
+    assert heads == [
+        "harness",
+        "packages",
+        "machine",
+        "GPU",
+        "meters",
+        "cache",
+        "engines",
+        "models",
+    ]
     assert "openai-example: needs a server at http://127.0.0.1:8080/v1 (not tried)" in out
 
 
 @pytest.mark.slow
 def test_what_is_not_installed_is_named_with_the_command_that_installs_it() -> None:
-    absent = "sys.modules['torch'] = sys.modules['llama_cpp'] = sys.modules['sparrow_decider'] = None"
+    absent = (
+        "sys.modules['torch'] = sys.modules['llama_cpp'] = sys.modules['sparrow_decider'] = None"
+    )
     told = json.loads(apart(absent, "--json"))
     lacks = {m["name"]: (m["missing"], m["remedy"]) for m in told["models"]}
     assert lacks["qwen3-4b"] == ("torch", "pip install 'swarmdrive-harness[transformers]'")
-    assert lacks["swarm-tiny"] == ("llama-cpp-python", "pip install 'swarmdrive-harness[llama-cpp]'")
+    assert lacks["swarm-tiny"] == (
+        "llama-cpp-python",
+        "pip install 'swarmdrive-harness[llama-cpp]'",
+    )
     assert lacks["proxy"] == (None, None)
     assert {engine for engine, lack in told["engines"].items() if lack} == {
         "transformers",
@@ -92,5 +111,7 @@ def test_a_gpu_is_what_nvidia_smi_says_and_one_that_fails_says_nothing(
 
 @pytest.mark.slow
 def test_torch_is_not_loaded_unless_asked() -> None:
-    last = "print('torch' in sys.modules, 'transformers' in sys.modules, 'llama_cpp' in sys.modules)"
+    last = (
+        "print('torch' in sys.modules, 'transformers' in sys.modules, 'llama_cpp' in sys.modules)"
+    )
     assert apart("", after=last).splitlines()[-1] == "False False False"

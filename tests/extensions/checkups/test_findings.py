@@ -34,7 +34,9 @@ AGAIN = 2 * 8  # halves of pairs of scenes that are asked with letters read the 
 
 
 class Model:
-    """Reads out as a rule says: `p` gives the likelihood of SLOWER or YES from the text of a question."""
+    """Reads out as a rule says: `p` gives the likelihood of SLOWER or YES from the text of a
+    question.
+    """
 
     def __init__(self, p: Any) -> None:
         self.p, self.asked = p, 0
@@ -46,8 +48,12 @@ class Model:
         self.asked += 1
         first, *others = request.actions
         p = self.p(request.messages[-1]["content"], bool(request.orders))
-        text = json.dumps({"action_distribution": {first: p, **{a: (1 - p) / len(others) for a in others}}})
-        more: dict[str, Any] = {"letter_share": 0.97, "follows_letter": True} if request.orders else {}
+        text = json.dumps(
+            {"action_distribution": {first: p, **{a: (1 - p) / len(others) for a in others}}}
+        )
+        more: dict[str, Any] = (
+            {"letter_share": 0.97, "follows_letter": True} if request.orders else {}
+        )
         return Completion(request.id, text, 9, 1, "stop", 0.1, 1, label_mass=0.2, **more)
 
 
@@ -65,22 +71,39 @@ def test_a_model_that_brakes_for_a_listed_conflict_reads_the_scene() -> None:
         "conflict": 4, "gap": 0, "danger": 0, "number": 0,
     }  # fmt: skip
     assert found.reads_scene
-    assert (found.n, found.letter_share, found.follows_letter, found.label_mass) == (12, 0.97, 12, 0.2)
+    assert (found.n, found.letter_share, found.follows_letter, found.label_mass) == (
+        12,
+        0.97,
+        12,
+        0.2,
+    )
     assert [s.partition(" follows")[0] for s in found.sentences()] == ["its likeliest action"]
-    assert (found.prompt, found.prompt_sha256, found.answer) == ("v2", AGENT.prompt.sha256, "readout")
+    assert (found.prompt, found.prompt_sha256, found.answer) == (
+        "v2",
+        AGENT.prompt.sha256,
+        "readout",
+    )
 
 
 def test_a_model_that_answers_ever_the_same_does_not_read_the_scene() -> None:
     first, *_ = examined(lambda text, cyclic: 0.5).sentences()
     assert first.startswith("it does not read the scene: a conflict put in or taken out, or a gap")
-    assert "in 0 of 8 pairs; with --letters raw in 0 of 8 (model check, answer readout, prompt v2)" in first
+    assert (
+        "in 0 of 8 pairs; with --letters raw in 0 of 8 (model check, answer readout, prompt v2)"
+        in first
+    )
 
 
 def test_weights_that_learnt_one_order_of_the_letters_are_asked_in_it() -> None:
-    """Over cyclic orders they follow the letter; in the order of the list they brake for a conflict."""
+    """Over cyclic orders they follow the letter;
+    in the order of the list they brake for a conflict.
+    """
     found = examined(lambda text, cyclic: 0.5 if cyclic or "none in sight" in text else 0.8)
     assert not found.reads_scene
-    assert {pair.fact: (pair.moved, pair.n) for pair in found.others} == {"conflict": (4, 4), "gap": (0, 4)}
+    assert {pair.fact: (pair.moved, pair.n) for pair in found.others} == {
+        "conflict": (4, 4),
+        "gap": (0, 4),
+    }
     first, *_ = found.sentences()
     assert first.startswith("with letters read cyclic it does not read the scene: a conflict")
     assert "in 0 of 8 pairs; with --letters raw in 4 of 8 (" in first
@@ -107,7 +130,8 @@ def test_findings_are_kept_by_identity_and_a_damaged_file_is_none() -> None:
     [file] = set(folder.iterdir()) - before
     whole = json.loads(file.read_text())
     unsaid = [
-        {key: value for key, value in whole.items() if key != name} for name in ("prompt_sha256", "answer")
+        {key: value for key, value in whole.items() if key != name}
+        for name in ("prompt_sha256", "answer")
     ]
     for damaged in ("{", *map(json.dumps, unsaid), json.dumps(whole | {"answer": "json"})):
         file.write_text(damaged)
@@ -118,7 +142,9 @@ def test_findings_are_kept_by_identity_and_a_damaged_file_is_none() -> None:
 def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     small: Dataset, tmp_path: Path
 ) -> None:
-    """A run of another answer mode, prompt text or weights is not what was found to read nothing."""
+    """A run of another answer mode,
+    prompt text or weights is not what was found to read nothing.
+    """
     done = made(spec_of(small), tmp_path / "run")
     ran = replace(done.manifest, answer="readout", letters="cyclic")
 
@@ -134,7 +160,9 @@ def test_a_run_that_asked_a_model_as_it_was_checked_says_so_and_no_other(
     assert scene.startswith("proxy: it does not read the scene")
     assert scene.endswith("in 0 of 4 pairs (model check, answer readout, prompt v2).")
     assert letter.startswith("proxy: its likeliest action follows the letter in 12 of 12 questions")
-    helped = replace(ran, helpers=(ran.agent(0),), identity={**ran.identity, "helpers": [ran.identity]})
+    helped = replace(
+        ran, helpers=(ran.agent(0),), identity={**ran.identity, "helpers": [ran.identity]}
+    )
     assert said(helped) == [scene, letter], "once, though two agents are the same model"
     others = (
         replace(ran, answer="json"),

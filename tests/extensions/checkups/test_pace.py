@@ -15,12 +15,17 @@ def of(*seconds: tuple[float, float]) -> list[Pace]:
     [
         (of((0.4, 0.5), (1.6, 0.9)), "a is faster here; --engine chooses."),
         (of((1.6, 0.5), (0.4, 0.9)), "faster here: b for read-outs, a for text; --engine chooses."),
-        (of((1.0, 0.5), (1.1, 0.9)), "faster here: neither for read-outs, a for text; --engine chooses."),
+        (
+            of((1.0, 0.5), (1.1, 0.9)),
+            "faster here: neither for read-outs, a for text; --engine chooses.",
+        ),
         (of((1.0, 1.0), (1.1, 0.9)), "neither is faster here; --engine chooses."),
         (of((3.0, 3.0), (2.9, 2.9), (1.0, 1.0)), "c is faster here; --engine chooses."),
     ],
 )
-def test_only_a_clear_difference_makes_an_engine_the_faster_one(found: list[Pace], says: str) -> None:
+def test_only_a_clear_difference_makes_an_engine_the_faster_one(
+    found: list[Pace], says: str
+) -> None:
     assert advice(found).startswith(says)
 
 

@@ -46,7 +46,8 @@ def unlike(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(tiny, other)
     model = transformers.AutoModelForCausalLM.from_pretrained(tiny)
     with torch.no_grad():
-        model.lm_head.weight.copy_(model.lm_head.weight.roll(7, dims=0))  # each token speaks for another
+        # each token speaks for another
+        model.lm_head.weight.copy_(model.lm_head.weight.roll(7, dims=0))
     model.save_pretrained(other)
     export(other, folder / "tiny.gguf")
     return folder
@@ -59,7 +60,9 @@ def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
     raw = replace(read_out, ego=replace(read_out.ego, letters="raw"))  # as the command asks
     letters = list(requests(raw, scenes_of(data)))[:PROMPTS]
     passes: list[int] = []
-    found = compare(spec.ego.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append)
+    found = compare(
+        spec.ego.card, cards.resolve(str(folder), "llama-cpp"), asked, letters, passes.append
+    )
     assert passes == [1] * PASSES
     assert found.left_out is None
     # Tokens are those of the questions for JSON and of those for a letter.
@@ -70,14 +73,17 @@ def compared(folder: Path, data: Dataset) -> dict[str, Finding]:
 
 def test_the_engines_agree_on_the_same_weights(tiny: Path, small: Dataset) -> None:
     found = compared(tiny, small)
-    # Random weights are often undecided between two tokens: what half the bits keep of their text is chance.
+    # Random weights are often undecided between two tokens: what half the bits keep of their text
+    # is chance.
     chance = found.pop("GGUF: greedy text equal")
     assert chance.holds == (chance.differences == ())
     assert [what for what, finding in found.items() if not finding.holds] == []
     assert found["F32: token ids equal"].measured == 1.0
     assert 0 < found["F32: largest difference of a logit"].measured < 1e-3
     # Half as many bits: farther off, and the figure shows it.
-    exact, halved = (found[f"{kind}: largest difference of a logit"].measured for kind in ("F32", "GGUF"))
+    exact, halved = (
+        found[f"{kind}: largest difference of a logit"].measured for kind in ("F32", "GGUF")
+    )
     assert halved > 10 * exact
 
 
@@ -87,12 +93,23 @@ def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, smal
     assert failed == {"GGUF: greedy text equal", "GGUF: largest difference of a read-out"}
     first = next(iter(requests(spec_of(small, str(unlike)), scenes_of(small))))
     assert found["GGUF: greedy text equal"].differences[0].startswith(f"{first.id}: ")
-    # Against the checkpoint's own export in F32 nothing fails: the file is at fault, not the engine.
+    # Against the checkpoint's own export in F32 nothing fails: the file is at fault, not the
+    # engine.
     assert found["F32: greedy text equal"].holds
 
 
-def test_the_command_says_each_finding_in_a_line_and_exits_with_1(unlike: Path, small_path: Path) -> None:
-    arguments = ["model", "parity", str(unlike), "--dataset", str(small_path), "--prompts", str(PROMPTS)]
+def test_the_command_says_each_finding_in_a_line_and_exits_with_1(
+    unlike: Path, small_path: Path
+) -> None:
+    arguments = [
+        "model",
+        "parity",
+        str(unlike),
+        "--dataset",
+        str(small_path),
+        "--prompts",
+        str(PROMPTS),
+    ]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 1
     lines = said.stdout.splitlines()
@@ -138,8 +155,11 @@ def test_another_architecture_is_compared_but_for_its_export(
         spec = spec_of(small, str(llama), answer=answer)
         raw = replace(spec, ego=replace(spec.ego, card=here, letters="raw"))
         whole = list(requests(raw, scenes_of(small)))[:2]
-        # The system text alone is long in a vocabulary of bytes, and says nothing of an architecture.
-        of[answer] = [replace(request, max_tokens=8, messages=request.messages[1:]) for request in whole]
+        # The system text alone is long in a vocabulary of bytes, and says nothing of an
+        # architecture.
+        of[answer] = [
+            replace(request, max_tokens=8, messages=request.messages[1:]) for request in whole
+        ]
     passes: list[int] = []
     found = compare(here, there, of["json"], of["readout"], passes.append)
     assert sum(passes) == PASSES
@@ -147,17 +167,29 @@ def test_another_architecture_is_compared_but_for_its_export(
     measured = {finding.what: finding.measured for finding in found.findings}
     assert list(measured) == [
         "GGUF: token ids equal", "GGUF: largest difference of a logit", "GGUF: greedy text equal",
-        "GGUF: largest difference of a read-out", "transformers: text equal in reversed batches of 8",
+        "GGUF: largest difference of a read-out", 
+            "transformers: text equal in "
+            "reversed batches of 8",
     ]  # fmt: skip
     assert measured["GGUF: token ids equal"] == 1.0
-    assert 0 < measured["GGUF: largest difference of a logit"] < 0.1  # llama.cpp rounds what it multiplies
+    # llama.cpp rounds what it multiplies
+    assert 0 < measured["GGUF: largest difference of a logit"] < 0.1
 
 
 def test_read_outs_alone_need_no_text_and_what_was_left_out_is_said(
     llama: Path, small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
-    arguments = ["model", "parity", str(llama), "--dataset", str(small_path), "--prompts", "3", "--read-outs"]
+    arguments = [
+        "model",
+        "parity",
+        str(llama),
+        "--dataset",
+        str(small_path),
+        "--prompts",
+        "3",
+        "--read-outs",
+    ]
     said = CliRunner().invoke(app, arguments)
     assert said.exit_code == 0, said.output
     *found, left_out, verdict = said.stdout.splitlines()

@@ -30,7 +30,16 @@ def test_twelve_questions_of_twelve_tune_layouts_each_with_one_conflict() -> Non
 
 @pytest.mark.slow
 def test_a_question_is_as_the_dataset_freezes_it(tmp_path: Path) -> None:
-    built = ["dataset", "build", questions.SCENARIO, "--episodes", "1", "--seed", "1000", "--no-audit"]
+    built = [
+        "dataset",
+        "build",
+        questions.SCENARIO,
+        "--episodes",
+        "1",
+        "--seed",
+        "1000",
+        "--no-audit",
+    ]
     assert CliRunner().invoke(app, [*built, "--out", str(tmp_path / "tune")]).exit_code == 0
     dataset = load.load(tmp_path / "tune")
     first = questions.questions()[0]

@@ -1,4 +1,6 @@
-"""What a model does with a prompt: the fixed questions asked in words, and what the answers are like."""
+"""What a model does with a prompt: the fixed questions asked in words,
+and what the answers are like.
+"""
 
 import json
 from collections.abc import Callable
@@ -33,7 +35,9 @@ class Model:
         return [Completion(r.id, self.text(r), 9, 9, self.finish, 0.1, 1) for r in requests]
 
 
-def tried(text: Callable[[Request], str], agent: Agent = EXAMPLES, finish: Finish = "stop") -> Trial:
+def tried(
+    text: Callable[[Request], str], agent: Agent = EXAMPLES, finish: Finish = "stop"
+) -> Trial:
     model = Model(text, finish)
     trial = try_out(model, agent)  # type: ignore[arg-type]
     assert model.asked == COUNT
@@ -48,8 +52,16 @@ def test_a_model_that_repeats_the_last_example_is_said_to() -> None:
         "12 of 12 answers are word for word the answer of an example",
         "all 12 answers are the same text, whatever is asked",
     ]
-    assert (helper.strict, helper.example_copies, helper.action, helper.action_count) == (12, 0, "IDLE", 12)
-    assert [(pair.fact, pair.n, pair.moved) for pair in trial.pairs] == [("conflict", 4, 0), ("gap", 4, 0)]
+    assert (helper.strict, helper.example_copies, helper.action, helper.action_count) == (
+        12,
+        0,
+        "IDLE",
+        12,
+    )
+    assert [(pair.fact, pair.n, pair.moved) for pair in trial.pairs] == [
+        ("conflict", 4, 0),
+        ("gap", 4, 0),
+    ]
 
 
 def test_a_model_that_reads_the_scene_moves() -> None:
@@ -71,7 +83,9 @@ def test_each_fault_is_counted_and_the_commonest_stands_first() -> None:
         if request.role == "helper":
             return "The road is clear, I think."
         echo = next(halves) % 3 == 0
-        return json.dumps({"action_distribution": dict.fromkeys(request.actions, "p" if echo else 0.9)})
+        return json.dumps(
+            {"action_distribution": dict.fromkeys(request.actions, "p" if echo else 0.9)}
+        )
 
     agent = Agent(cards.resolve("swarm-tiny", None), versions.load("v2"))
     trial = tried(text, agent, "length")
@@ -90,7 +104,10 @@ def test_each_fault_is_counted_and_the_commonest_stands_first() -> None:
 def test_a_question_without_an_answer_is_no_answer() -> None:
     class Broken(Model):
         def complete(self, requests: Any) -> list[Completion]:
-            return [Completion(r.id, "", None, None, "error", None, 1, "out of memory") for r in requests]
+            return [
+                Completion(r.id, "", None, None, "error", None, 1, "out of memory")
+                for r in requests
+            ]
 
     with pytest.raises(Unanswered, match="out of memory: a fixed question got no answer"):
         try_out(Broken(lambda request: ""), EXAMPLES)  # type: ignore[arg-type]

@@ -18,7 +18,9 @@ def typed_eval(data: Path, *more: str) -> tuple[str | Path, ...]:
     return "eval", "--dataset", data, *fixed, *more
 
 
-def test_an_unknown_tracker_and_repeats_are_refused_before_anything(two_path: Path, harness: Typed) -> None:
+def test_an_unknown_tracker_and_repeats_are_refused_before_anything(
+    two_path: Path, harness: Typed
+) -> None:
     code, _, said = harness(*typed_eval(two_path, "--tracker", "mlfow"))
     assert (
         code,
@@ -26,7 +28,15 @@ def test_an_unknown_tracker_and_repeats_are_refused_before_anything(two_path: Pa
     ) == (2, True)
     code, _, said = harness(
         *typed_eval(
-            two_path, "--tracker", "mlflow", "--repeats", "2", "--temperature", "1", "--model", "swarm-tiny"
+            two_path,
+            "--tracker",
+            "mlflow",
+            "--repeats",
+            "2",
+            "--temperature",
+            "1",
+            "--model",
+            "swarm-tiny",
         )
     )
     assert (code, "--tracker mlflow: repeats" in said) == (2, True)
@@ -50,7 +60,8 @@ def test_a_tracker_without_its_package_says_what_to_install(
     code, _, said = harness(*typed_eval(two_path, "--tracker", "mlflow"))
     assert code == 2
     assert (
-        "--tracker mlflow needs mlflow-skinny, which is not installed; run `pip install 'swarmdrive" in said
+        "--tracker mlflow needs mlflow-skinny, which is not installed; run `pip install 'swarmdrive"
+        in said
     )
     monkeypatch.setenv("SWARMDRIVE_TRACKERS", "mlflow")
     code, _, said = harness(*typed_eval(two_path))
@@ -58,7 +69,9 @@ def test_a_tracker_without_its_package_says_what_to_install(
 
 
 def success(run: str) -> float:
-    [score] = [s for s in read(Path(run)).scores if (s.metric, s.interval) == ("success_rate", "episodes")]
+    [score] = [
+        s for s in read(Path(run)).scores if (s.metric, s.interval) == ("success_rate", "episodes")
+    ]
     return score.value
 
 

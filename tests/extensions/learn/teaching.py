@@ -11,7 +11,8 @@ from harness.core.files import canonical_json, sha256_bytes
 from harness.extensions.learn.training import lessons
 from harness.world.scenario import Scenario
 
-SEED = 100_001  # of the first layout; it and the next have a point at the start, and several at a level
+# of the first layout; it and the next have a point at the start, and several at a level
+SEED = 100_001
 PER_LEVEL, MOST_TRIED = 2, 4
 drawing = lessons.decision_points
 

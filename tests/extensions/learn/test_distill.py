@@ -70,7 +70,15 @@ def few(once: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lessons, "decision_points", drawn_by(once))
         return [
-            draw(scenario, versions, CURRICULUM.layouts, CURRICULUM.seed, place / scenario.name, 1, silent)
+            draw(
+                scenario,
+                versions,
+                CURRICULUM.layouts,
+                CURRICULUM.seed,
+                place / scenario.name,
+                1,
+                silent,
+            )
             for scenario, versions in LEARNT.items()
         ]
 
@@ -85,7 +93,8 @@ def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
             edge, child = (of[child, chosen[child]] for of in (forest.edge, forest.child))
         return bool(forest.succeeds(edge, tree))
 
-    # In this layout some can be saved though none of their parents can, by the driver that takes the rest.
+    # In this layout some can be saved though none of their parents can, by the driver that takes
+    # the rest.
     in_tree = {
         name for name, at in forest.place.items()
         if forest.tree[at] == 9 and any(ends_well(at, action) for action in range(len(CROSSING.actions)))
@@ -137,7 +146,8 @@ def student(once: Any) -> Path:
     return once("student", fill)
 
 
-# -- the teacher ------------------------------------------------------------------------------------
+# -- the teacher
+# ------------------------------------------------------------------------------------
 
 
 def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
@@ -150,7 +160,9 @@ def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
 
 
 @pytest.mark.exhaustive
-def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(few: list[Lessons]) -> None:
+def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(
+    few: list[Lessons],
+) -> None:
     """Played again in the simulator, action by action, from the start."""
     for each in few:
         scenario = each.scenario
@@ -163,7 +175,9 @@ def test_an_action_is_safe_where_who_sees_no_more_than_the_ego_still_succeeds(fe
                     world = World.start(scenario, seed)
                     world.act(action)
                     [outcome] = finish([world], ["local-view"])
-                    safe.append(outcome.judged(reference, world.layout.danger, scenario.parameters).success)
+                    safe.append(
+                        outcome.judged(reference, world.layout.danger, scenario.parameters).success
+                    )
                 assert (each.labels[scene.id] > 0).tolist() == safe
 
 
@@ -175,7 +189,8 @@ def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
     assert kl_nats(labels, labels) == 0.0
 
 
-# -- what it learns to say --------------------------------------------------------------------------
+# -- what it learns to say
+# --------------------------------------------------------------------------
 
 
 @given(st.data(), st.booleans())
@@ -184,7 +199,9 @@ def test_every_text_it_learns_says_what_it_should(
 ) -> None:
     for each in few:
         actions = each.scenario.actions
-        weights = data.draw(st.lists(st.floats(0.001, 1), min_size=len(actions), max_size=len(actions)))
+        weights = data.draw(
+            st.lists(st.floats(0.001, 1), min_size=len(actions), max_size=len(actions))
+        )
         intent = np.array(weights) / sum(weights)
         for prompt in each.prompts:
             for graph in each.scenes[2].graphs.values():
@@ -196,7 +213,9 @@ def test_every_text_it_learns_says_what_it_should(
                 if graph.role == "ego" or prompt.helper_answer == "distribution":
                     assert said.intent == pytest.approx(intent, abs=0.0501)
                 else:
-                    assert said.intent[int(np.argmax(intent))] == pytest.approx(intent.max(), abs=0.0501)
+                    assert said.intent[int(np.argmax(intent))] == pytest.approx(
+                        intent.max(), abs=0.0501
+                    )
 
 
 def test_a_helpers_evidence_keeps_to_twelve_words(asked: list[Question]) -> None:
@@ -204,7 +223,9 @@ def test_a_helpers_evidence_keeps_to_twelve_words(asked: list[Question]) -> None
         assert len(message(q.graph, q.label, q.actions)["evidence"].split()) <= 12
 
 
-def test_the_ego_with_messages_reads_what_helpers_sent(few: list[Lessons], asked: list[Question]) -> None:
+def test_the_ego_with_messages_reads_what_helpers_sent(
+    few: list[Lessons], asked: list[Question]
+) -> None:
     intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
     for each in few:
         heard = list(with_messages(each, each.scenes, intents))
@@ -230,7 +251,8 @@ def test_an_excerpt_shows_the_conflicts_alone_and_keeps_the_label(asked: list[Qu
 def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
     few: list[Lessons], asked: list[Question]
 ) -> None:
-    version = prompts.load("v9")  # its question is a block of its own, which a letter takes the place of
+    # its question is a block of its own, which a letter takes the place of
+    version = prompts.load("v9")
     agent = Agent(cards.resolve("swarm-tiny"), version, "readout", letters="raw")
     for q in asked[:4]:
         words = q.scenario.prompt_words
@@ -240,13 +262,19 @@ def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
     intents = {q.key: np.array([0.91, 0.06, 0.03, 0.0, 0.0])[: len(q.actions)] for q in asked}
     for short in excerpts(asked):
         assert short.read_out == in_mode(
-            "readout", short.prompt, short.messages, short.graph, short.actions, short.scenario.prompt_words
+            "readout",
+            short.prompt,
+            short.messages,
+            short.graph,
+            short.actions,
+            short.scenario.prompt_words,
         ), "where a question is no block, the letter follows it"
     told = next(with_messages(few[0], few[0].scenes, intents))
     assert "0.90" in told.read_out[-1]["content"], "the messages are there as well"
 
 
-# -- its optimizer ----------------------------------------------------------------------------------
+# -- its optimizer
+# ----------------------------------------------------------------------------------
 
 
 def test_muon_in_float32_goes_where_pytorchs_goes_in_bfloat16() -> None:
@@ -277,12 +305,19 @@ def test_an_orthogonal_factor_has_singular_values_near_one() -> None:
         assert values.max() < 1.3
 
 
-# -- a run ------------------------------------------------------------------------------------------
+# -- a run
+# ------------------------------------------------------------------------------------------
 
 
 def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
     names = {p.name for p in student.iterdir()}
-    assert names >= {"config.json", "model.safetensors", "tokenizer.json", "student-f16.gguf", "README.md"}
+    assert names >= {
+        "config.json",
+        "model.safetensors",
+        "tokenizer.json",
+        "student-f16.gguf",
+        "README.md",
+    }
     assert ".work" not in names
     facts = json.loads((student / "training.json").read_text())
     assert set(facts["curves"]) == set(STAGES)
@@ -295,7 +330,9 @@ def test_its_loss_falls(student: Path) -> None:
         assert curve[-1][1] < curve[0][1], stage
 
 
-def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(student: Path, asked: list[Question]) -> None:
+def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(
+    student: Path, asked: list[Question]
+) -> None:
     from transformers import AutoTokenizer
 
     tokenizer = AutoTokenizer.from_pretrained(student)
@@ -349,13 +386,20 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         distill(CURRICULUM, replace(PLAN, seed=1), tmp_path / "m", silent, stop, "cpu")
     with pytest.raises(UserError, match=r"was begun with another scenarios, prompts"):
         distill(
-            replace(CURRICULUM, prompts={PASSING: LEARNT[PASSING]}), PLAN, tmp_path / "m", silent, stop, "cpu"
+            replace(CURRICULUM, prompts={PASSING: LEARNT[PASSING]}),
+            PLAN,
+            tmp_path / "m",
+            silent,
+            stop,
+            "cpu",
         )
 
 
 def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
-    with pytest.raises(UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"):
+    with pytest.raises(
+        UserError, match=r"--samples: 1 sequences of the stage messages take too few scenes"
+    ):
         distill(CURRICULUM, plan, tmp_path / "m", silent, silent, "cpu")
 
 
@@ -365,7 +409,8 @@ def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_pat
         (["--samples", "1,2"], "--samples 1,2: give four whole numbers"),
         (["--samples", "a,b,c,d"], "--samples a,b,c,d: give four whole numbers"),
         (["--samples", "64,64,64,15"], "16 or more each"),
-        (["--samples", "64,64,64,7", "--batch", "1"], "8 or more each"),  # four for each of two prompts
+        # four for each of two prompts
+        (["--samples", "64,64,64,7", "--batch", "1"], "8 or more each"),
         (["--batch", "0"], "--batch 0: give 1 or more"),
         (["--samples", "64,64,64,64", "--batch", "100000"], "100000 or more each"),
         (["--threads", "0"], "--threads 0: give 1 or more"),
@@ -373,7 +418,10 @@ def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_pat
         (["--prompt", "v99"], "unknown prompt 'v99'"),
         (["--prompt", "v2", "do-not-pass"], "--prompt v2: none is for do-not-pass; give v4"),
         (["no-such-road"], "unknown scenario 'no-such-road'"),
-        (["--first-seed", "100"], "layout seeds 100 to 339 (tune); a model learns from train seeds alone"),
+        (
+            ["--first-seed", "100"],
+            "layout seeds 100 to 339 (tune); a model learns from train seeds alone",
+        ),
     ],
 )
 def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path) -> None:
@@ -388,7 +436,8 @@ def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
-# -- data that stay apart ---------------------------------------------------------------------------
+# -- data that stay apart
+# ---------------------------------------------------------------------------
 
 
 def test_held_out_layouts_are_in_neither_half_twice(few: list[Lessons]) -> None:
@@ -409,7 +458,9 @@ def test_references_are_worth_what_they_take(few: list[Lessons]) -> None:
         assert found["uniform"] == pytest.approx(np.average(worth.mean(axis=1), weights=weights))
         always = actions.index(constant(each.scenario) or "")
         assert found["constant"] == pytest.approx(np.average(worth[:, always], weights=weights))
-        planned = [actions.index(choose(each.scenario, "local-view", q.graph, None)) for q in questions]
+        planned = [
+            actions.index(choose(each.scenario, "local-view", q.graph, None)) for q in questions
+        ]
         taken = worth[np.arange(len(questions)), planned]
         assert found["local-view"] == pytest.approx(np.average(taken, weights=weights))
 

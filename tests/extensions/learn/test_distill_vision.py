@@ -124,13 +124,18 @@ def test_the_first_stage_asks_whom_the_picture_shows(lessons: Lessons, tmp_path:
     listed = [sights(scene.graphs[v]) for scene in learnt for v in scene.viewers]
     samples = student.samples("excerpts")
     said = [
-        student.tokenizer.decode(s.ids[s.answer_at :].tolist(), skip_special_tokens=False) for s in samples
+        student.tokenizer.decode(s.ids[s.answer_at :].tolist(), skip_special_tokens=False)
+        for s in samples
     ]
     assert all(sample.image is not None for sample in samples)
-    assert [text[3:].removesuffix(END) for text in said] == [text for text in listed for _ in VERSIONS]
+    assert [text[3:].removesuffix(END) for text in said] == [
+        text for text in listed for _ in VERSIONS
+    ]
 
 
-def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_is(asked: list[Question]):
+def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_is(
+    asked: list[Question],
+):
     somebody = 0
     for q in asked:
         assert isinstance(q.image, Sight)
@@ -139,25 +144,39 @@ def test_each_token_of_a_picture_says_how_far_the_nearest_vehicle_in_its_square_
         away_m = {v.id: np.hypot(v.x_m - viewer.x_m, v.y_m - viewer.y_m) for v in state.vehicles}
         shown = cells(q.image).reshape(VISION.height_px // side, VISION.width_px // side)
         for row, column in np.ndindex(shown.shape):
-            square = frame.owners[row * side : (row + 1) * side, column * side : (column + 1) * side]
-            inside = [away_m[frame.ids[n]] for n in np.unique(square) if n >= 0 and frame.ids[n] in away_m]
+            square = frame.owners[
+                row * side : (row + 1) * side, column * side : (column + 1) * side
+            ]
+            inside = [
+                away_m[frame.ids[n]] for n in np.unique(square) if n >= 0 and frame.ids[n] in away_m
+            ]
             assert shown[row, column] == (min(9, 1 + int(min(inside) // 7.0)) if inside else 0)
             somebody += bool(inside)
     assert somebody > 20
 
 
 def test_an_engine_reads_what_the_model_learnt_from(
-    folder: Path, lessons: Lessons, asked: list[Question], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    lessons: Lessons,
+    asked: list[Question],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    """The same tokens, and the same read-outs as training computed from its own patches and positions."""
+    """The same tokens, and the same read-outs as training computed from its own patches and
+    positions.
+    """
     import torch
 
-    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
+    model: Any = open_backend(
+        cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4
+    )
     student = Student([lessons], PLAN, tmp_path, "cpu")
     student.tokenizer = model.chat.tokenizer.hub.backend_tokenizer
     student.letters = [student.tokenizer.token_to_id(x) for x in readout.letters(SCENARIO.actions)]
     # What training reads out; an untaught model also likes the letters with a blank before them.
-    spelt = dict(zip(readout.letters(SCENARIO.actions), [[n] for n in student.letters], strict=True))
+    spelt = dict(
+        zip(readout.letters(SCENARIO.actions), [[n] for n in student.letters], strict=True)
+    )
     monkeypatch.setattr(
         model.chat, "spellings", lambda letters: {letter: spelt[letter] for letter in letters}
     )
@@ -178,7 +197,9 @@ def test_an_engine_reads_what_the_model_learnt_from(
         assert p == pytest.approx([said[a] for a in SCENARIO.actions], abs=2e-5)
 
 
-def test_one_that_begins_as_a_model_of_texts_reads_texts_as_that_does(asked: list[Question], tmp_path: Path):
+def test_one_that_begins_as_a_model_of_texts_reads_texts_as_that_does(
+    asked: list[Question], tmp_path: Path
+):
     import torch
 
     tokenizer = train_tokenizer([m["content"] for q in asked for m in q.messages])
@@ -201,11 +222,17 @@ def test_a_picture_is_answered_as_the_base_answers_the_same_scene_graph_in_words
     tokenizer = train_tokenizer([m["content"] for q in asked for m in q.messages])
     new_model(tokenizer, 1).save_pretrained(tmp_path)
     save_tokenizer(tokenizer, tmp_path)
-    both = replace(lessons, prompts=(prompts.load("v4"), prompts.load("v8")), scenes=lessons.scenes[::9])
+    both = replace(
+        lessons, prompts=(prompts.load("v4"), prompts.load("v8")), scenes=lessons.scenes[::9]
+    )
     student = Student([both], PLAN, tmp_path, "cpu", base=tmp_path)
-    texts, pictures = ([q for q in student.questions if (q.image is None) == of] for of in (True, False))
+    texts, pictures = (
+        [q for q in student.questions if (q.image is None) == of] for of in (True, False)
+    )
     read = student.read(student.reading(texts))  # the base's own, as nothing was learnt since
-    for text, seen, intent, sample in zip(texts, pictures, read, student.reading(pictures), strict=True):
+    for text, seen, intent, sample in zip(
+        texts, pictures, read, student.reading(pictures), strict=True
+    ):
         assert text.key.rpartition("/")[0] == seen.key.rpartition("/")[0]
         assert sample.target == pytest.approx(intent)
     assert all(s.target is q.label for q, s in zip(texts, student.reading(texts), strict=True))
@@ -220,7 +247,9 @@ def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
 
 
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
-    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
+    model: Any = open_backend(
+        cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4
+    )
     for answer in ("json", "constrained", "readout"):
         for completion in model.complete([request(q, answer) for q in asked[:3]]):
             assert completion.error is None
@@ -230,7 +259,9 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
 def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     requests = [request(q) for q in asked[:2]]
-    here = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32").complete(requests)
+    here = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32").complete(
+        requests
+    )
     card = cards.resolve(str(folder), "llama-cpp")
     assert card.projector == "mmproj-seer-f16.gguf"
     there = open_backend(card, device="cpu").complete(requests)
@@ -240,9 +271,16 @@ def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Q
         assert p == pytest.approx(q, abs=0.02)
 
 
-def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(folder: Path, asked: list[Question]):
-    model: Any = open_backend(cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4)
-    one, other = asked[0], next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256)
+def test_the_picture_is_what_two_prompts_that_say_the_same_differ_in(
+    folder: Path, asked: list[Question]
+):
+    model: Any = open_backend(
+        cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4
+    )
+    one, other = (
+        asked[0],
+        next(q for q in asked if q.image and q.image.sha256 != asked[0].image.sha256),
+    )
     vocabulary = len(model.chat.tokenizer.hub)
     p = model.next_log_probs([request(one), replace(request(one), image=other.image)], vocabulary)
     assert np.abs(p[0] - p[1]).max() > 1e-4

@@ -53,7 +53,9 @@ def policy(chat: str) -> tuple[float, ...]:
 
 
 class Model:
-    """The tests' model, which dies for good after some answers, and what a reflecting model writes."""
+    """The tests' model, which dies for good after some answers,
+    and what a reflecting model writes.
+    """
 
     def __init__(self) -> None:
         self.chats: list[str] = []
@@ -91,7 +93,9 @@ def marked(where: Path, pace: str = PACE) -> None:
     shutil.copytree(folder("prompts") / "v3", where / "mine")
     file = where / "mine" / "ego.j2"
     text = file.read_text()
-    file.write_text(text.replace("{% block system -%}", "{% block system -%}\n" + pace + PARTS + "\n", 1))
+    file.write_text(
+        text.replace("{% block system -%}", "{% block system -%}\n" + pace + PARTS + "\n", 1)
+    )
 
 
 @pytest.fixture
@@ -102,9 +106,13 @@ def optimize(harness: Typed, tmp_path: Path, small_path: Path, server: Server) -
     (tmp_path / "models" / "m.toml").write_text(CARD.format(url=server.url))
     marked(tmp_path / "prompts")
 
-    def typed(*args: Any, budget: int = 300, out: str = "new", tune: Any = ("--tune", small_path)) -> Said:
+    def typed(
+        *args: Any, budget: int = 300, out: str = "new", tune: Any = ("--tune", small_path)
+    ) -> Said:
         usual = ("--model", "m", "--prompt", "mine", *tune, "--limit", 3, "--no-cache")
-        return harness("prompt", "optimize", *usual, "--budget", budget, "--out", out, "--quiet", *args)
+        return harness(
+            "prompt", "optimize", *usual, "--budget", budget, "--out", out, "--quiet", *args
+        )
 
     return typed
 
@@ -114,14 +122,19 @@ def history(where: Path, name: str = "new") -> Any:
 
 
 def test_a_mark_is_its_first_alternative_until_another_is_chosen() -> None:
-    text = "a {% either x %}b{% or %}c{%or%}{% endeither %} {%order y%}1{% or %}2{% or %}3{%endorder%}{{ n }}"
+    text = (
+        "a {% either x %}b{% or %}c{%or%}{% endeither %} {%order y%}1{% or %}2{% or "
+        "%}3{%endorder%}{{ n }}"
+    )
     assert resolved(text) == "a b 123{{ n }}"
     assert resolved(text, {"x": 1, "y": 1}) == "a c 132{{ n }}"
     assert resolved(text, {"x": 2, "y": 5}) == "a  321{{ n }}"
     assert counts([text, "{% either x %}{% or %}{% or %}z{% endeither %}"]) == {"x": 3, "y": 6}
     for name in prompts.names():
         for shipped in prompts.load(name).texts.values():
-            assert (resolved(shipped), counts([shipped])) == (shipped, {}), "no released prompt has a mark"
+            assert (resolved(shipped), counts([shipped])) == (shipped, {}), (
+                "no released prompt has a mark"
+            )
 
 
 @pytest.mark.parametrize(
@@ -129,7 +142,8 @@ def test_a_mark_is_its_first_alternative_until_another_is_chosen() -> None:
     [
         ("{% either x %}a{% endeither %}", "one alternative"),
         (
-            "{% either x %}a{% or %}b{% endeither %}{% either x %}a{% or %}b{% or %}c{% endeither %}",
+            "{% either x %}a{% or %}b{% endeither %}{% either x %}a{% or %}b{% or %}c{% endeither "
+            "%}",
             "2 and 3",
         ),
         ("{% order x %}1{% or %}2{% or %}3{% or %}4{% or %}5{% endorder %}", "5 parts"),
@@ -146,7 +160,12 @@ def test_a_mark_that_cannot_be_chosen_from_is_refused(text: str, reason: str) ->
 
 
 @pytest.mark.parametrize(
-    "text", ["{% either x %}" * 50_000, "{% either x %} {% endorder %}" * 50_000, ("{%" + " " * 999) * 1000]
+    "text",
+    [
+        "{% either x %}" * 50_000,
+        "{% either x %} {% endorder %}" * 50_000,
+        ("{%" + " " * 999) * 1000,
+    ],
 )
 def test_a_strangers_marks_take_one_pass(text: str) -> None:
     begun_s = time.process_time()
@@ -195,10 +214,19 @@ def test_what_is_chosen_is_an_ordinary_version(tmp_path: Path, small: Dataset) -
     assert system(other.prompt).startswith("Go. Be quick. Be kind.\n")
     assert other.what == "pace 3 of 3, parts 2 of 2"
     assert other.what in other.prompt.changed
-    for name in ("helper_answer", "token_budget", "max_answer_tokens", "max_objects", "reasons_first"):
+    for name in (
+        "helper_answer",
+        "token_budget",
+        "max_answer_tokens",
+        "max_objects",
+        "reasons_first",
+    ):
         assert getattr(other.prompt, name) == getattr(base, name)
     assert rewritten(base, systems(base)).key == plain.key
-    assert system(rewritten(base, {"ego": "Hi \\1 {{ words.task }}"}).prompt) == f"Hi \\1 {words['task']}"
+    assert (
+        system(rewritten(base, {"ego": "Hi \\1 {{ words.task }}"}).prompt)
+        == f"Hi \\1 {words['task']}"
+    )
 
 
 def test_example_sets_are_a_choice(tmp_path: Path) -> None:
@@ -220,7 +248,9 @@ def test_example_sets_are_a_choice(tmp_path: Path) -> None:
 
 
 def outcome(dataset: Dataset, does: Callable[[bool], str]) -> tuple[float, float]:
-    """Balanced success of a rule that knows whether a conflict is listed, and the worth of what it states."""
+    """Balanced success of a rule that knows whether a conflict is listed,
+    and the worth of what it states.
+    """
     success, worths = [], []
     for episode in dataset.episodes:
         forest = dataset.of_episodes({episode}).forest
@@ -234,7 +264,9 @@ def outcome(dataset: Dataset, does: Callable[[bool], str]) -> tuple[float, float
             edge, at = int(forest.edge[at, action]), int(forest.child[at, action])
         success.append(float(forest.succeeds(np.array([edge]), np.array([0]))[0]))
         worths.append(float(np.mean(worth)))
-    weight = np.where(dataset.dangerous, 0.5 / dataset.dangerous.sum(), 0.5 / (~dataset.dangerous).sum())
+    weight = np.where(
+        dataset.dangerous, 0.5 / dataset.dangerous.sum(), 0.5 / (~dataset.dangerous).sum()
+    )
     return float(weight @ success), float(weight @ worths)
 
 
@@ -260,7 +292,9 @@ def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     best = max(scores, key=scores.__getitem__)
     assert best != "first alternatives"
     assert record["chosen"] == best, "the order of parts changes nothing, so the first one stays"
-    assert record["questions"] == sum(row["questions"] for row in record["tried"]) <= record["budget"]
+    assert (
+        record["questions"] == sum(row["questions"] for row in record["tried"]) <= record["budget"]
+    )
     new = prompts.load("new", tmp_path / "prompts")
     assert new.sha256 == record["sha256"]
     assert not space(new)
@@ -305,7 +339,9 @@ def test_a_stopped_search_goes_on_and_comes_to_the_same(
 
 
 @pytest.mark.slow
-def test_a_suite_is_certified_family_by_family(optimize: Typed, tmp_path: Path, small_path: Path) -> None:
+def test_a_suite_is_certified_family_by_family(
+    optimize: Typed, tmp_path: Path, small_path: Path
+) -> None:
     names = [REPORT, "occluded-intersection-v3"]
     suite = f'[two]\ndescription = "two"\ndatasets = {json.dumps(names)}\n'
     (tmp_path / "datasets").mkdir()
@@ -339,7 +375,9 @@ def test_no_report_layout_is_read_before_a_winner_stands(optimize: Typed, tmp_pa
     code, _, wrong = optimize("--dataset", path)
     assert code == 0, wrong
     assert "no report layout was read" in (tmp_path / "reports" / "new" / "index.html").read_text()
-    assert not (tmp_path / "prompts" / "new").exists(), "the base is the best, so there is no new version"
+    assert not (tmp_path / "prompts" / "new").exists(), (
+        "the base is the best, so there is no new version"
+    )
     file.write_text(text)
     code, _, wrong = optimize("--dataset", path, out="other")
     assert (code, "layouts.zip" in wrong) == (2, True), "the winner's certificate reads them"
@@ -371,7 +409,9 @@ def test_the_budget_is_never_exceeded(optimize: Typed, model: Model, tmp_path: P
     assert record["questions"] <= 30
 
 
-def test_an_alternative_that_does_not_render_is_named(optimize: Typed, model: Model, tmp_path: Path) -> None:
+def test_an_alternative_that_does_not_render_is_named(
+    optimize: Typed, model: Model, tmp_path: Path
+) -> None:
     file = tmp_path / "prompts" / "mine" / "ego.j2"
     file.write_text(file.read_text().replace("Look.", "{{ nobody.knows }}"))
     code, _, wrong = optimize()
@@ -383,7 +423,18 @@ def test_an_alternative_that_does_not_render_is_named(optimize: Typed, model: Mo
 def test_a_dry_run_asks_nothing_and_writes_nothing(
     harness: Typed, optimize: Typed, model: Model, tmp_path: Path, small_path: Path
 ) -> None:
-    usual = ("--model", "m", "--prompt", "mine", "--tune", small_path, "--budget", 99, "--out", "new")
+    usual = (
+        "--model",
+        "m",
+        "--prompt",
+        "mine",
+        "--tune",
+        small_path,
+        "--budget",
+        99,
+        "--out",
+        "new",
+    )
     code, out_text, _ = harness("prompt", "optimize", *usual, "--dry-run", "--json")
     record = json.loads(out_text)
     assert code == 0
@@ -427,7 +478,9 @@ def test_feedback_is_exact_and_counterfactual(small: Dataset) -> None:
             decision = played(small, episode, step, (0.1, 0.2, 0.7))
             worth = by_hand(small, episode, decision.dataset.forest.place[decision.scene.id])
             text = of_decision(decision)
-            assert text.startswith("It stated SLOWER 0.10, IDLE 0.20, FASTER 0.70, and did FASTER. ")
+            assert text.startswith(
+                "It stated SLOWER 0.10, IDLE 0.20, FASTER 0.70, and did FASTER. "
+            )
             if not max(worth):
                 assert "No action could save the episode any more." in text
                 continue
@@ -457,8 +510,8 @@ def test_feedback_says_what_no_message_held(small: Dataset) -> None:
     class Named:
         raw, message = "", {"evidence": f"{name} from left, gap +0.2 s"}
 
-    assert "it was in no message" in of_decision(quiet._replace(heard=(Heard(),)))  # type: ignore[arg-type]
-    assert "a message named it" in of_decision(quiet._replace(heard=(Heard(), Named())))  # type: ignore[arg-type]
+    assert ("it was in no message") in of_decision(quiet._replace(heard=(Heard(),)))  # type: ignore[arg-type]
+    assert ("a message named it") in of_decision(quiet._replace(heard=(Heard(), Named())))  # type: ignore[arg-type]
 
 
 def test_feedback_on_a_course_is_on_its_worst_decision(small: Dataset) -> None:

@@ -1,4 +1,6 @@
-"""`harness run export --sft`: a run's questions, the answers that its trees ask for, and training on them."""
+"""`harness run export --sft`: a run's questions, the answers that its trees ask for,
+and training on them.
+"""
 
 import json
 from collections.abc import Callable
@@ -60,7 +62,9 @@ def test_every_question_of_a_point_that_can_be_won_has_the_answer_of_its_tree(
     rows = {row["scene"]: row for row in rows_of(run)}
     answers = {(a.scene, a.key): a for a in answers_of(run)}
     actions = read(run).actions
-    assert [(at["scene"], at["viewer"]) for at in lines] == [at for at in answers if rows[at[0]]["value"]]
+    assert [(at["scene"], at["viewer"]) for at in lines] == [
+        at for at in answers if rows[at[0]]["value"]
+    ]
     assert {answers[at["scene"], at["viewer"]].role for at in lines} == {"ego", "helper", "merge"}
     for line in lines:
         row, asked = rows[line["scene"]], answers[line["scene"], line["viewer"]]
@@ -69,21 +73,29 @@ def test_every_question_of_a_point_that_can_be_won_has_the_answer_of_its_tree(
         else:
             assert digest(line["prompt"]) == asked.prompt_sha256, "what the run asked, word by word"
         [said] = line["completion"]
-        parsed = parse(said["content"], role="helper" if asked.role == "helper" else "ego", actions=actions)
+        parsed = parse(
+            said["content"], role="helper" if asked.role == "helper" else "ego", actions=actions
+        )
         assert (said["role"], parsed.status) == ("assistant", Status.STRICT)
         ends_s = {a: row[f"delay_s_{a}"] if row[f"safe_{a}"] else float("inf") for a in actions}
         assert (line["actions"], line["probabilities"]) == ([*actions], label(ends_s).tolist())
         assert line["values"] == [float(row[f"safe_{a}"]) for a in actions]
         assert max(abs(parsed.intent - label(ends_s))) <= 0.05
-        assert all(p == 0 for a, p in zip(actions, parsed.intent, strict=True) if not row[f"safe_{a}"])
-    assert {(line["layout_seed"], line["purpose"]) for line in lines} <= {(100 + n, "tune") for n in range(4)}
+        assert all(
+            p == 0 for a, p in zip(actions, parsed.intent, strict=True) if not row[f"safe_{a}"]
+        )
+    assert {(line["layout_seed"], line["purpose"]) for line in lines} <= {
+        (100 + n, "tune") for n in range(4)
+    }
 
 
 def test_a_read_out_is_answered_by_the_letter_of_the_best_action(run: Path) -> None:
     configure(run, answer="readout")
     rows = {row["scene"]: row for row in rows_of(run)}
     for pair in pairs(read(run)):
-        assert pair["prompt"][-1]["content"].endswith("\nAnswer with one letter: A SLOWER, B IDLE, C FASTER.")
+        assert pair["prompt"][-1]["content"].endswith(
+            "\nAnswer with one letter: A SLOWER, B IDLE, C FASTER."
+        )
         action = {"A": "SLOWER", "B": "IDLE", "C": "FASTER"}[pair["completion"][0]["content"]]
         assert rows[pair["scene"]][f"safe_{action}"]
 
@@ -91,7 +103,9 @@ def test_a_read_out_is_answered_by_the_letter_of_the_best_action(run: Path) -> N
 def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs(run: Path) -> None:
     model = json.loads((run / "run.json").read_text())["model"]
     prompt = {"version": "v1", "sha256": prompts.load("v1").sha256}
-    configure(run, helpers=[{"model": model, "prompt": prompt, "answer": "readout", "thinking": False}])
+    configure(
+        run, helpers=[{"model": model, "prompt": prompt, "answer": "readout", "thinking": False}]
+    )
     for pair in pairs(read(run)):
         system, user = (message["content"] for message in pair["prompt"])
         helps = pair["viewer"] in ("v2", "v3")
@@ -100,12 +114,17 @@ def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs
         assert (len(pair["completion"][0]["content"]) == 1) == helps
 
 
-def test_layouts_that_numbers_are_of_become_no_training_data_silently(run: Path, harness: Harness) -> None:
+def test_layouts_that_numbers_are_of_become_no_training_data_silently(
+    run: Path, harness: Harness
+) -> None:
     change(run, episode=lambda row: row.update(layout_seed=row["layout_seed"] + 199_897))
     assert "--dpo pairs.jsonl: " in harness("run", "export", run, "--dpo", "pairs.jsonl")[2]
     code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "has layout seeds 199997 to 200000 (train and report), and a model that learns from them" in err
+    assert (
+        "has layout seeds 199997 to 200000 (train and report), and a model that learns from them"
+        in err
+    )
     assert err.endswith("or give --report-seeds-too\n")
     assert not Path("pairs.jsonl").exists()
     assert lines_of(run, harness, "--report-seeds-too")
@@ -128,7 +147,9 @@ def test_report_layouts_that_a_run_calls_others_become_no_training_data(
 @pytest.mark.parametrize(
     ("key", "said"), [("prompt", "prompt v3 with sha256 1111"), ("world", "is not the one that")]
 )
-def test_what_is_not_here_as_it_was_is_one_line(key: str, said: str, run: Path, harness: Harness) -> None:
+def test_what_is_not_here_as_it_was_is_one_line(
+    key: str, said: str, run: Path, harness: Harness
+) -> None:
     stated = json.loads((run / "run.json").read_text())[key]
     configure(run, **{key: {**stated, "sha256": "1" * 64}})
     code, out, err = harness("run", "export", run, "--sft", "pairs.jsonl")
@@ -149,7 +170,11 @@ def test_a_run_whose_prompts_showed_pictures_is_one_line(run: Path, harness: Har
 @pytest.mark.parametrize(
     ("name", "changed", "said"),
     [
-        ("decision", {"scene": "x"}, "decisions.parquet has scene 'x', which its dataset has not; make"),
+        (
+            "decision",
+            {"scene": "x"},
+            "decisions.parquet has scene 'x', which its dataset has not; make",
+        ),
         ("answer", {"scene": "x"}, "answers.jsonl has scene 'x', which its dataset has not; make"),
         ("answer", {"viewer": "v9"}, "answers.jsonl has an answer of 'v9' in 00000-"),
     ],
@@ -174,8 +199,12 @@ def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> 
 
 
 @pytest.mark.slow
-def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(run: Path, harness: Harness) -> None:
-    """Half on a lost action is worth .5 less; an unreadable answer is worth nothing; no answer is none."""
+def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(
+    run: Path, harness: Harness
+) -> None:
+    """Half on a lost action is worth .5 less; an unreadable answer is worth nothing;
+    no answer is none.
+    """
 
     def worse(row: Row) -> None:
         kind = sum(map(ord, row["scene"] + row["viewer"])) % 3
@@ -202,12 +231,16 @@ def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(run: Path, h
                 if worth <= most:
                     expected.add((answer.scene, answer.key, answer.raw, worth))
         assert expected == {
-            (at["scene"], at["viewer"], at["rejected"][0]["content"], at["value_rejected"]) for at in lines
+            (at["scene"], at["viewer"], at["rejected"][0]["content"], at["value_rejected"])
+            for at in lines
         }
         assert ({at[2] for at in expected} == {"half", "brake!"}) == (margin <= 0.5)
         for line in lines:
             asked = by_tree[line["scene"], line["viewer"]]
-            assert (line["prompt"], line["chosen"]) == ([*map(dict, asked["prompt"])], asked["completion"])
+            assert (line["prompt"], line["chosen"]) == (
+                [*map(dict, asked["prompt"])],
+                asked["completion"],
+            )
 
 
 def test_a_rejected_letter_is_the_likeliest(run: Path) -> None:
@@ -233,13 +266,17 @@ def test_a_model_learns_from_the_pairs(run: Path, harness: Harness, tmp_path: Pa
     optimiser = torch.optim.AdamW(model.parameters(), lr=1e-3)
 
     def loss_of(line: dict[str, Any]) -> Any:
-        asked = tokenizer.apply_chat_template(line["prompt"], tokenize=False, add_generation_prompt=True)
+        asked = tokenizer.apply_chat_template(
+            line["prompt"], tokenize=False, add_generation_prompt=True
+        )
         whole = tokenizer.apply_chat_template(line["prompt"] + line["completion"], tokenize=False)
         assert whole.startswith(asked)
         ids, start = (tokenizer(text, return_tensors="pt").input_ids for text in (whole, asked))
         labels = ids.clone()
         labels[:, : start.shape[1]] = -100
-        assert tokenizer.decode(ids[0, start.shape[1] :]).startswith(line["completion"][0]["content"])
+        assert tokenizer.decode(ids[0, start.shape[1] :]).startswith(
+            line["completion"][0]["content"]
+        )
         return model(input_ids=ids, labels=labels).loss
 
     before = [loss_of(line).item() for line in lines]
@@ -306,10 +343,22 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
             ("--junit", "a.xml", "--report-seeds-too"),
             "--report-seeds-too only goes with --sft and --dpo; give one, or leave it out",
         ),
-        (("--csv", "--margin", "0.5"), "--margin 0.5: it goes with --dpo, and is above 0 and at most 1"),
-        (("--sft", "a.jsonl", "--margin", "0.5"), "--margin 0.5: it goes with --dpo, and is above 0"),
-        (("--dpo", "a.jsonl", "--margin", "0"), "--margin 0: it goes with --dpo, and is above 0 and at most"),
-        (("--dpo", "a.jsonl", "--margin", "nan"), "--margin nan: it goes with --dpo, and is above 0"),
+        (
+            ("--csv", "--margin", "0.5"),
+            "--margin 0.5: it goes with --dpo, and is above 0 and at most 1",
+        ),
+        (
+            ("--sft", "a.jsonl", "--margin", "0.5"),
+            "--margin 0.5: it goes with --dpo, and is above 0",
+        ),
+        (
+            ("--dpo", "a.jsonl", "--margin", "0"),
+            "--margin 0: it goes with --dpo, and is above 0 and at most",
+        ),
+        (
+            ("--dpo", "a.jsonl", "--margin", "nan"),
+            "--margin nan: it goes with --dpo, and is above 0",
+        ),
         (
             ("--csv", "--dataset", "there"),
             "--dataset only goes with --inspect, --sft and --dpo; leave it out",

@@ -65,7 +65,10 @@ def test_the_command_draws_them_from_train_layouts(project: Path, harness: Harne
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("v2", "--scenario", scenarios.DEFAULT), "prompt v2 is released; copy it to a new version"),
+        (
+            ("v2", "--scenario", scenarios.DEFAULT),
+            "prompt v2 is released; copy it to a new version",
+        ),
         (("mine", "--scenario", "nowhere"), "unknown scenario 'nowhere'"),
         (("mine", "--scenario", scenarios.DEFAULT, "--count", "0"), "--count 0"),
         (

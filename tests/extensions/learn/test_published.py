@@ -42,7 +42,9 @@ pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import to
 
 BASE = cards.resolve("swarm-tiny", "transformers")
 PLAN = Plan(
-    {"excerpts": 0, "alone": 12, "messages": 0, "answers": 6}, batch=2, adapt=Adapt(rank=4, rate=2e-2)
+    {"excerpts": 0, "alone": 12, "messages": 0, "answers": 6},
+    batch=2,
+    adapt=Adapt(rank=4, rate=2e-2),
 )
 CROSSING, PASSING = former.SCENARIO, former.scenes("do-not-pass")
 LEARNT = dict.fromkeys((CROSSING, PASSING), (prompts.load("v9"),))  # three actions, and five
@@ -78,7 +80,10 @@ def taught(once: Any) -> Path:
 
 
 def asked(n: int) -> Request:
-    messages = ({"role": "system", "content": "You drive."}, {"role": "user", "content": f"Speed 1{n} m/s"})
+    messages = (
+        {"role": "system", "content": "You drive."},
+        {"role": "user", "content": f"Speed 1{n} m/s"},
+    )
     return Request(str(n), "ego", messages, ("SLOWER", "IDLE", "FASTER"), 12)
 
 
@@ -89,7 +94,8 @@ def open_backend(card: Card, **options: Any) -> Any:
 QUESTIONS = [asked(n) for n in range(3)]
 
 
-# -- an adapter -------------------------------------------------------------------------------------
+# -- an adapter
+# -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -132,7 +138,9 @@ def test_an_adapter_is_one_model_on_every_engine(llama: Card, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
-def test_an_adapter_of_another_model_is_refused_in_one_line(engine: str, llama: Card, tmp_path: Path) -> None:
+def test_an_adapter_of_another_model_is_refused_in_one_line(
+    engine: str, llama: Card, tmp_path: Path
+) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     adapter(llama, tmp_path / "worn")
     other = replace(cards.resolve("swarm-tiny", engine), adapter=str(tmp_path / "worn"))
@@ -147,7 +155,9 @@ def test_an_adapter_of_a_broken_base_is_refused_in_one_line(llama: Card, tmp_pat
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     adapter(llama, tmp_path / "worn")
     (tmp_path / "tiny.gguf").write_bytes(b"GGUF?")
-    with pytest.raises(UserError, match=r"tiny\.gguf does not load: .*; copy or download the file again"):
+    with pytest.raises(
+        UserError, match=r"tiny\.gguf does not load: .*; copy or download the file again"
+    ):
         open_backend(cards.resolve(str(tmp_path / "worn"), "llama-cpp"), device="cpu")
 
 
@@ -165,7 +175,10 @@ def test_an_adapter_of_a_broken_base_is_refused_in_one_line(llama: Card, tmp_pat
             "is an adapter of 'replay:.', which is no model with weights",
         ),
         ({"base_model_name_or_path": "no-such"}, "unknown model 'no-such'"),
-        ({"base_model_name_or_path": "SELF"}, "is an adapter of an adapter; give one of a whole model"),
+        (
+            {"base_model_name_or_path": "SELF"},
+            "is an adapter of an adapter; give one of a whole model",
+        ),
     ],
 )
 def test_what_is_no_plain_adapter_is_refused_in_one_line(
@@ -211,13 +224,16 @@ def test_an_adapter_that_would_spoil_its_model_is_refused(
 def test_a_card_without_its_adapter_lacks_weights() -> None:
     card = replace(BASE, adapter="no-such-folder")
     assert missing(card) == "weights"
-    with pytest.raises(UserError, match=r"no adapter in .*no-such-folder .*put its folder beside the card"):
+    with pytest.raises(
+        UserError, match=r"no adapter in .*no-such-folder .*put its folder beside the card"
+    ):
         open_backend(card, device="cpu")
     assert "adapter" not in BASE.record()
     assert card.record()["adapter"] == "no-such-folder"
 
 
-# -- a training -------------------------------------------------------------------------------------
+# -- a training
+# -------------------------------------------------------------------------------------
 
 
 def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
@@ -263,11 +279,14 @@ def test_a_killed_teaching_goes_on_to_the_same_adapter(
     assert (out / name).read_bytes() == (taught / name).read_bytes()
 
 
-# -- what is learnt ----------------------------------------------------------------------------------
+# -- what is learnt
+# ----------------------------------------------------------------------------------
 
 
 def test_a_decisions_gradient_is_the_exact_policy_gradient() -> None:
-    """By hand: SLOWER and FASTER succeed, so V = 0.5, and the loss falls as p rises by p (v - V)."""
+    """By hand: SLOWER and FASTER succeed, so V = 0.5,
+    and the loss falls as p rises by p (v - V).
+    """
     p, labels = torch.tensor([[0.2, 0.5, 0.3]]), torch.tensor([[0.6, 0.0, 0.4]])
     logits = torch.log(p).requires_grad_()
     loss = fitting(logits, labels, "values")
@@ -317,7 +336,10 @@ def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
     facts = distill(CURRICULUM, plan, tmp_path / "pupil", silent, silent, "cpu")
     assert facts["curves"]["messages"][-1][3] > facts["curves"]["alone"][0][3]
     assert len(facts["curves"]["messages"]) == 2
-    assert "- Objective: `values`, the probability of actions" in (tmp_path / "pupil/README.md").read_text()
+    assert (
+        "- Objective: `values`, the probability of actions"
+        in (tmp_path / "pupil/README.md").read_text()
+    )
 
 
 def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> None:
@@ -327,7 +349,9 @@ def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> Non
 
 def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     plan = replace(
-        PLAN, samples={**PLAN.samples, "alone": 16, "answers": 0}, adapt=Adapt(None, 1e-3, "bfloat16")
+        PLAN,
+        samples={**PLAN.samples, "alone": 16, "answers": 0},
+        adapt=Adapt(None, 1e-3, "bfloat16"),
     )
     distill(CURRICULUM, plan, tmp_path / "whole", silent, silent, "cpu")
     assert not (tmp_path / "whole" / adapters.CONFIG).exists()
@@ -350,15 +374,31 @@ def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
             "--base proxy: it runs on proxy alone and has no weights that can be taught; give",
         ),
         (["--base", "sparrow-robot", "--lora"], "it runs on sparrow alone and has no weights"),
-        (["--base", "swarm-tiny-vl", "--prompt", "v9"], "takes pictures; give a plain model of texts"),
-        (["--base", "swarm-tiny", "--prompt", "v8"], "is taught texts alone; leave image prompts out"),
+        (
+            ["--base", "swarm-tiny-vl", "--prompt", "v9"],
+            "takes pictures; give a plain model of texts",
+        ),
+        (
+            ["--base", "swarm-tiny", "--prompt", "v8"],
+            "is taught texts alone; leave image prompts out",
+        ),
         (["--objective", "value"], "unknown --objective 'value'; did you mean 'values'?"),
         (["--samples", "0,0,0,0"], "or 0 to leave a stage out"),
     ],
 )
 def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path) -> None:
-    arguments = ["model", "distill", "occluded-intersection", "--layouts", "2", "--out", str(tmp_path / "m")]
+    arguments = [
+        "model",
+        "distill",
+        "occluded-intersection",
+        "--layouts",
+        "2",
+        "--out",
+        str(tmp_path / "m"),
+    ]
     with pytest.raises(UserError) as told:
-        CliRunner().invoke(app, [*arguments, *options], standalone_mode=False, catch_exceptions=False)
+        CliRunner().invoke(
+            app, [*arguments, *options], standalone_mode=False, catch_exceptions=False
+        )
     assert said in str(told.value)
     assert not (tmp_path / "m").exists()

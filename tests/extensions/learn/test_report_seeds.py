@@ -16,7 +16,9 @@ from harness.extensions.learn.rewards.layouts import stored
 def test_no_prompt_is_searched_there(relabelled: Path) -> None:
     with pytest.raises(UserError, match="is not what layout seed"):
         given([str(relabelled)], [load(find("occluded-intersection-v2"), 1).manifest])
-    with pytest.raises(UserError, match=r"it has a layout of relabelled, where the winner is certified"):
+    with pytest.raises(
+        UserError, match=r"it has a layout of relabelled, where the winner is certified"
+    ):
         given([str(relabelled)], [load(relabelled).manifest])
 
 

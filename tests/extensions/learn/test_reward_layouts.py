@@ -1,4 +1,6 @@
-"""Which layouts may be learnt from: by their seeds, however they are given and whatever they are called."""
+"""Which layouts may be learnt from: by their seeds,
+however they are given and whatever they are called.
+"""
 
 import re
 import shutil
@@ -31,7 +33,11 @@ def test_what_is_no_range_of_seeds_is_one_line(options: dict[str, Any], said: st
 
 @pytest.mark.parametrize(
     ("seed", "said"),
-    [(-1, "layout seed -1: give 0 to"), (2**31, "2147483648: give 0 to"), ("x", "x: give a whole number")],
+    [
+        (-1, "layout seed -1: give 0 to"),
+        (2**31, "2147483648: give 0 to"),
+        ("x", "x: give a whole number"),
+    ],
 )
 def test_what_is_no_layout_is_one_line(seed: Any, said: str) -> None:
     driven = harness.environment("occluded-intersection", driven=True, reward="success")
@@ -52,5 +58,7 @@ def test_report_layouts_are_refused_whatever_their_manifest_calls_them(tmp_path:
 
 def test_a_scenario_of_several_agents_is_refused() -> None:
     scenario = scenarios.get("all-way-crossing:agent_share=1")
-    with pytest.raises(UserError, match="agent_share is 1, and an environment to learn in has one ego"):
+    with pytest.raises(
+        UserError, match="agent_share is 1, and an environment to learn in has one ego"
+    ):
         Roads(scenario, (100,))

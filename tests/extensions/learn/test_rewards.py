@@ -1,4 +1,6 @@
-"""`harness.environment`: exact rewards on trees and in the simulator, on layouts that may be learnt from."""
+"""`harness.environment`: exact rewards on trees and in the simulator,
+on layouts that may be learnt from.
+"""
 
 import json
 from collections import Counter
@@ -30,7 +32,9 @@ def make(small_path: Path) -> Make:
 
 
 def after(data: Dataset, point: int, action: int, driver: str) -> bool:
-    """Whether an episode succeeds after an action if a driver takes the rest, walked edge by edge."""
+    """Whether an episode succeeds after an action if a driver takes the rest,
+    walked edge by edge.
+    """
     forest = data.forest
     edge, point = forest.edge[point, action], forest.child[point, action]
     while point >= 0:
@@ -85,7 +89,8 @@ def test_a_batch_is_one_at_a_time_and_ids_are_places(small: Dataset) -> None:
 @pytest.mark.filterwarnings("ignore:.*not within the observation space")
 @pytest.mark.filterwarnings("ignore:.*spec")
 @pytest.mark.parametrize(
-    "options", [{}, {"observation": "arrays"}, {"distributions": True, "viewer": "any", "reward": "success"}]
+    "options",
+    [{}, {"observation": "arrays"}, {"distributions": True, "viewer": "any", "reward": "success"}],
 )
 def test_gymnasium_finds_nothing_wrong(options: dict[str, Any], make: Make) -> None:
     from gymnasium.utils.env_checker import check_env
@@ -99,11 +104,15 @@ def test_several_go_side_by_side(make: Make) -> None:
     seen, info = several.reset(seed=1)
     assert seen["numbers"].shape == seen["known"].shape == (2, len(several.envs[0].numbers))
     _, rewards, *_ = several.step([0, 2])
-    assert rewards.tolist() == [values[action] - max(values) for action, values in enumerate(info["values"])]
+    assert rewards.tolist() == [
+        values[action] - max(values) for action, values in enumerate(info["values"])
+    ]
 
 
 @pytest.mark.parametrize("driver", ["cruise", "full-view"])
-def test_whoever_drives_as_a_driver_ends_as_it_does(driver: str, make: Make, small: Dataset) -> None:
+def test_whoever_drives_as_a_driver_ends_as_it_does(
+    driver: str, make: Make, small: Dataset
+) -> None:
     env, forest = make(then=driver), small.forest
     for tree, seed in enumerate(small.seeds):
         _, info = env.reset(options={"layout_seed": seed})
@@ -115,7 +124,9 @@ def test_whoever_drives_as_a_driver_ends_as_it_does(driver: str, make: Make, sma
             worth, best = info["values"][action], info["values"].max()
             _, reward, over, cut, info = env.step(action)
             assert (reward, cut) == (worth - best, False)
-            assert worth == forest.driver_success(driver)[tree], "its own worth stays the same to the end"
+            assert worth == forest.driver_success(driver)[tree], (
+                "its own worth stays the same to the end"
+            )
         assert info["success"] == forest.driver_success(driver)[tree]
         assert set(visited) <= {forest.ids[n] for n in forest.visited(forest.drivers[driver])}
 
@@ -141,7 +152,9 @@ def test_an_episode_earns_its_success_less_whether_it_was_possible(
     env, forest = make(), small.forest
     always = {"always SLOWER": 0, "always FASTER": 2}
     for tree, seed in enumerate(small.seeds):
-        _, info = env.reset(seed=policy if isinstance(policy, int) else 0, options={"layout_seed": seed})
+        _, info = env.reset(
+            seed=policy if isinstance(policy, int) else 0, options={"layout_seed": seed}
+        )
         earned, over = 0.0, False
         while not over:
             if isinstance(policy, int):
@@ -165,7 +178,9 @@ def test_success_is_paid_once_at_the_end(make: Make, small: Dataset) -> None:
             rewards.append(reward)
         assert rewards[:-1] == [0] * (len(rewards) - 1)
         assert (
-            rewards[-1] == info["success"] == small.forest.value[small.forest.root[small.seeds.index(seed)]]
+            rewards[-1]
+            == info["success"]
+            == small.forest.value[small.forest.root[small.seeds.index(seed)]]
         )
         paid.append(rewards[-1])
     assert 1 in paid
@@ -173,7 +188,9 @@ def test_success_is_paid_once_at_the_end(make: Make, small: Dataset) -> None:
 
 @pytest.mark.slow
 def test_driving_is_the_walk_through_the_tree(make: Make, small: Dataset) -> None:
-    """The same actions lead to the same states, are worth the same and end the same, with no tree built."""
+    """The same actions lead to the same states, are worth the same and end the same,
+    with no tree built.
+    """
     seed = small.seeds[1]
     walked = make(then="local-view")
     driven = package.environment(former.NAME, seeds=seed, layouts=1, driven=True, then="local-view")
@@ -232,23 +249,34 @@ def test_arrays_are_of_the_viewers_own_graph(make: Make, small: Dataset) -> None
         ({"layouts": 0}, "layouts 0: give a seed from 0 on, and 1 layout or more"),
         ({"workers": 0}, "--workers 0: give 1 to 256 processes"),
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
-        ({"dataset": "occluded-intersection-v2"}, "numbers are reported of layout seeds from 200000 on"),
+        (
+            {"dataset": "occluded-intersection-v2"},
+            "numbers are reported of layout seeds from 200000 on",
+        ),
         ({"dataset": "prompts"}, "prompts is no dataset (no manifest.json); build one with"),
         ({"dataset": "nowhere"}, "unknown dataset 'nowhere'"),
         ({"dataset": "SMALL", "driven": True}, "leave out scenario and driven"),
         ({"dataset": "SMALL", "then": "nobody"}, "unknown then 'nobody'"),
         ({"dataset": "SMALL", "prompt": "v0"}, "unknown prompt 'v0'"),
-        ({"dataset": "SMALL", "prompt": "v7"}, "prompt v7 shows pictures, and here are texts alone"),
+        (
+            {"dataset": "SMALL", "prompt": "v7"},
+            "prompt v7 shows pictures, and here are texts alone",
+        ),
         ({"dataset": "SMALL", "answer": "song"}, "unknown answer 'song'"),
         ({"dataset": "SMALL", "viewer": "v99"}, "unknown viewer of scene"),
         ({"dataset": "SMALL", "observation": "smell"}, "unknown observation 'smell'"),
         ({"dataset": "SMALL", "reward": "fame"}, "unknown reward 'fame'"),
-        ({"driven": True}, 'reward="regret" needs values; give then="local-view", or reward="success"'),
+        (
+            {"driven": True},
+            'reward="regret" needs values; give then="local-view", or reward="success"',
+        ),
         ({"driven": True, "then": "best"}, "unknown then 'best'"),
     ],
 )
 def test_bad_input_is_one_line(options: dict[str, Any], said: str, small_path: Path) -> None:
-    given: dict[str, Any] = {key: small_path if value == "SMALL" else value for key, value in options.items()}
+    given: dict[str, Any] = {
+        key: small_path if value == "SMALL" else value for key, value in options.items()
+    }
     with pytest.raises(UserError) as error:
         package.environment(**given).values  # noqa: B018 # read when they are first asked for
     assert said in str(error.value)
@@ -256,14 +284,17 @@ def test_bad_input_is_one_line(options: dict[str, Any], said: str, small_path: P
 
 
 @pytest.mark.parametrize(
-    "action", [3, -1, 1.0, "IDLE", [0.5, 0.5], [0, 0, 0], [1, -1, 1], [1, np.nan, 1], [1, np.inf, 1], None]
+    "action",
+    [3, -1, 1.0, "IDLE", [0.5, 0.5], [0, 0, 0], [1, -1, 1], [1, np.nan, 1], [1, np.inf, 1], None],
 )
 def test_what_is_no_action_is_one_line_and_moves_nobody(action: Any, make: Make) -> None:
     env = make()
     with pytest.raises(UserError, match="no episode is under way; call reset"):
         env.step(1)
     _, info = env.reset(seed=1)
-    with pytest.raises(UserError, match="give an index, 0 to 2 for SLOWER, IDLE, FASTER, or 3 probabilities"):
+    with pytest.raises(
+        UserError, match="give an index, 0 to 2 for SLOWER, IDLE, FASTER, or 3 probabilities"
+    ):
         env.step(action)
     assert env.trip.scene.id == info["scene"]
 
@@ -272,13 +303,17 @@ def test_a_layout_of_report_seeds_is_not_begun(make: Make) -> None:
     driven = package.environment("occluded-intersection", driven=True, reward="success")
     with pytest.raises(UserError, match="layout seed 200003: numbers are reported of"):
         driven.reset(options={"layout_seed": 200_003})
-    with pytest.raises(UserError, match="layout seed 200003 has no tree here; give one of 100 to 103"):
+    with pytest.raises(
+        UserError, match="layout seed 200003 has no tree here; give one of 100 to 103"
+    ):
         make().reset(options={"layout_seed": 200_003})
     with pytest.raises(UserError, match="rows\\(\\) of driven episodes are not known in advance"):
         driven.rows()
 
 
-def test_rows_are_the_questions_of_points_where_it_matters_what_is_done(make: Make, small: Dataset) -> None:
+def test_rows_are_the_questions_of_points_where_it_matters_what_is_done(
+    make: Make, small: Dataset
+) -> None:
     env = make(viewer="any")
     rows, values = env.rows(per_level=2), env.values
     assert rows == env.rows(per_level=2)
@@ -288,7 +323,10 @@ def test_rows_are_the_questions_of_points_where_it_matters_what_is_done(make: Ma
     }
     for row in rows:
         assert row["values"] == values([row["scene"]])[0].tolist() not in ([0, 0, 0], [1, 1, 1])
-        assert (row["purpose"], row["danger"]) == ("tune", bool(small.dangerous[row["layout_seed"] - 100]))
+        assert (row["purpose"], row["danger"]) == (
+            "tune",
+            bool(small.dangerous[row["layout_seed"] - 100]),
+        )
         scene = small.scene(row["scene"])
         assert row["prompt"] == env.ask.chat(scene.graphs[row["viewer"]])
         assert row["role"] == scene.graphs[row["viewer"]].role
@@ -299,7 +337,9 @@ def test_rows_are_the_questions_of_points_where_it_matters_what_is_done(make: Ma
 def test_every_level_has_as_many_rows_and_both_kinds_of_layouts_weigh_alike(
     per_level: int, make: Make, small: Dataset
 ) -> None:
-    """Of the four layouts as many have a danger as `dangerous` says; the rarer ones have more rows each."""
+    """Of the four layouts as many have a danger as `dangerous` says;
+    the rarer ones have more rows each.
+    """
     rows = make().rows(per_level=per_level)
     levels = Counter((row["layout_seed"], row["scene"].split("-")[1]) for row in rows)
     dangerous = dict(zip(small.seeds, small.dangerous.tolist(), strict=True))
@@ -309,12 +349,16 @@ def test_every_level_has_as_many_rows_and_both_kinds_of_layouts_weigh_alike(
         assert count == max(1, round(per_level * len(dangerous) / 2 / sizes[dangerous[seed]]))
     scenes = Counter(row["scene"] for row in rows)
     for (seed, level), count in levels.items():
-        there = [n for name, n in scenes.items() if name.split("-")[:2] == [f"{seed - 100:05d}", level]]
+        there = [
+            n for name, n in scenes.items() if name.split("-")[:2] == [f"{seed - 100:05d}", level]
+        ]
         assert sum(there) == count
         assert max(there) - min(there) <= 1, "none is repeated before all are there"
 
 
-def test_references_are_what_a_constant_and_those_without_a_model_earn(make: Make, small: Dataset) -> None:
+def test_references_are_what_a_constant_and_those_without_a_model_earn(
+    make: Make, small: Dataset
+) -> None:
     env = make()
     rows, references = env.rows(), env.references()
     assert list(references) == ["constant", "uniform", "open-loop", "local-view", "full-view"]
@@ -325,7 +369,10 @@ def test_references_are_what_a_constant_and_those_without_a_model_earn(make: Mak
     assert references["constant"] == {
         "advantage": 0.0,
         "success": np.mean(
-            [forest.constant_success("IDLE")[kind].mean() for kind in (small.dangerous, ~small.dangerous)]
+            [
+                forest.constant_success("IDLE")[kind].mean()
+                for kind in (small.dangerous, ~small.dangerous)
+            ]
         ),
     }
     assert references["uniform"]["advantage"] == pytest.approx((table.mean(axis=1) - less).mean())
@@ -344,7 +391,10 @@ def test_a_constant_that_nobody_measured_is_the_best_of_the_trees(
     forest = small.forest
     balanced = [
         np.mean(
-            [forest.constant_success(action)[kind].mean() for kind in (small.dangerous, ~small.dangerous)]
+            [
+                forest.constant_success(action)[kind].mean()
+                for kind in (small.dangerous, ~small.dangerous)
+            ]
         )
         for action in forest.actions
     ]
@@ -356,7 +406,9 @@ def columns(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def stated(*p: float) -> str:
-    return json.dumps({"action_distribution": dict(zip(("SLOWER", "IDLE", "FASTER"), p, strict=True))})
+    return json.dumps(
+        {"action_distribution": dict(zip(("SLOWER", "IDLE", "FASTER"), p, strict=True))}
+    )
 
 
 def test_an_answer_earns_what_its_likeliest_action_is_worth_less_the_constants(make: Make) -> None:
@@ -370,7 +422,9 @@ def test_an_answer_earns_what_its_likeliest_action_is_worth_less_the_constants(m
     of_constant = {"IDLE": [0, 0, 0, -1, -0.5, -1, -1], "SLOWER": [1, 1, 1, 0, 0.5, 0, 0]}
     for action, earned in of_constant.items():
         given = columns([row | {"constant": env.actions.index(action)}] * len(said))
-        assert env.advantage([row["prompt"]] * len(said), said, **given, trainer_state=None) == earned
+        assert (
+            env.advantage([row["prompt"]] * len(said), said, **given, trainer_state=None) == earned
+        )
 
 
 def test_what_a_distribution_states_is_worth_its_mean(make: Make) -> None:
@@ -384,7 +438,9 @@ def test_what_a_distribution_states_is_worth_its_mean(make: Make) -> None:
 def test_a_letter_is_worth_its_action(make: Make) -> None:
     env = make(answer="readout")
     row = next(row for row in env.rows() if row["values"] == [0, 1, 1])
-    assert row["prompt"][-1]["content"].endswith("Answer with one letter: A SLOWER, B IDLE, C FASTER.")
+    assert row["prompt"][-1]["content"].endswith(
+        "Answer with one letter: A SLOWER, B IDLE, C FASTER."
+    )
     said = ["A", "B", " C\n", "B: it is clear", "BRAKE", "D", "b", ""]
     assert env.advantage([], said, **columns([row] * 8)) == [-1, 0, 0, 0, -1, -1, -1, -1]
     call = {"role": "assistant", "content": None, "tool_calls": [{"name": "brake"}]}
@@ -392,5 +448,7 @@ def test_a_letter_is_worth_its_action(make: Make) -> None:
     assert env.advantage([], without_text, **columns([row] * 5)) == [-1] * 5
     of_others = [[call, {"role": role, "content": "B"}] for role in ("tool", "user")]
     assert env.advantage([], of_others, **columns([row] * 2)) == [-1, -1]
-    in_parts = [{"content": [{"type": "text", "text": said[1][:9]}, {"type": "text", "text": said[1][9:]}]}]
+    in_parts = [
+        {"content": [{"type": "text", "text": said[1][:9]}, {"type": "text", "text": said[1][9:]}]}
+    ]
     assert env.advantage([], [in_parts], **columns([row])) == [0]

@@ -51,7 +51,9 @@ def taskset(small_path: Path) -> Any:
     from verifiers.v1.utils.loaders import load_taskset, taskset_config_type
 
     config = taskset_config_type("swarmdrive-trees")
-    return load_taskset(config(id="swarmdrive-trees", dataset=str(small_path), viewer="any", per_level=2))
+    return load_taskset(
+        config(id="swarmdrive-trees", dataset=str(small_path), viewer="any", per_level=2)
+    )
 
 
 def trace_of(task: Any, text: str) -> Any:
@@ -76,7 +78,11 @@ def test_verifiers_scores_a_trace_as_the_trees_do(taskset: Any, small_path: Path
         if row["role"] == "helper":
             continue
         for text, worth, readable in (
-            (STATED.format(0.5, 0.25, 0.25), row["values"][0] - row["values"][row["constant"]], 1.0),
+            (
+                STATED.format(0.5, 0.25, 0.25),
+                row["values"][0] - row["values"][row["constant"]],
+                1.0,
+            ),
             ("no idea", -row["values"][row["constant"]], 0.0),
         ):
             trace = trace_of(task, text)

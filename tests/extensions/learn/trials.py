@@ -5,7 +5,9 @@ from studied import Trial
 TUNE = "--tune data --limit 2"
 TRIALS = {
     "optimize": Trial(
-        "prompt optimize --model swarm-tiny --prompt mine --no-cache", f"{TUNE} --budget 300 --workers 1",
+        "prompt optimize --model "
+        "swarm-tiny --prompt mine "
+        "--no-cache", f"{TUNE} --budget 300 --workers 1",
         f"{TUNE} --budget 200 --workers 1", "--out new: a prompt of that name is there already",
         {
             f"{TUNE} --budget 9 --out new --model proxy": "reads the scene and no prompt",

@@ -109,7 +109,10 @@ def things_move(run, picture, said):
 def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(short, tmp_path, monkeypatch, capsys):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     film = tmp_path / "episode.mp4"
-    assert typed(monkeypatch, capsys, "run", "video", short, 0, "--out", film)[:2] == (0, f"wrote {film}\n")
+    assert typed(monkeypatch, capsys, "run", "video", short, 0, "--out", film)[:2] == (
+        0,
+        f"wrote {film}\n",
+    )
     assert film.read_bytes()[4:8] == b"ftyp"
     expected = 0.1 * len(list(stills(find(short, 0, None, None)))) + 2.4  # the last still stays
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
@@ -130,11 +133,17 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     for name, says in (
         ("x.avi", "end it in .gif or .mp4"),
         ("folder.gif", "is a folder; name a file in it"),
-        ("x.mp4", ".mp4 needs imageio-ffmpeg, which is not installed; run `pip install 'swarmdrive-harness["),
+        (
+            "x.mp4",
+            ".mp4 needs imageio-ffmpeg, which is not installed; run `pip install "
+            "'swarmdrive-harness[",
+        ),
     ):
         if name == "x.mp4":
             monkeypatch.setattr(extras, "find_spec", lambda name: None)
-        code, said, error = typed(monkeypatch, capsys, "run", "video", out, 0, "--out", tmp_path / name)
+        code, said, error = typed(
+            monkeypatch, capsys, "run", "video", out, 0, "--out", tmp_path / name
+        )
         assert (code, said, error.count("\n")) == (2, "", 1)
         assert says in error
     assert [p.name for p in tmp_path.iterdir()] == ["folder.gif"]
@@ -144,16 +153,23 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     # How each is drawn to its end is tested apart.
-    monkeypatch.setattr("harness.extensions.media.video.stills", lambda played: islice(stills(played), 2))
+    monkeypatch.setattr(
+        "harness.extensions.media.video.stills", lambda played: islice(stills(played), 2)
+    )
     words = ("--model", "cruise", "--condition", "single-local", "--seeds", "0,1", "--workers", 1)
     layouts = ("--episodes", 4, "--first-seed", FROM_LEFT - 1)
     out = tmp_path / "run"
-    code, said, _ = typed(monkeypatch, capsys, *DRIVE, *words, *layouts, "--save-video", 1, "--out", out)
+    code, said, _ = typed(
+        monkeypatch, capsys, *DRIVE, *words, *layouts, "--save-video", 1, "--out", out
+    )
     table = pd.read_csv(out / "episodes.csv")
     first = table[~table.success].episode.min()
     name = f"{first:05d}-seed0.mp4"
     assert code == 0
-    assert said.splitlines()[-2:] == [f"wrote {out / 'videos'}: {name}", f"wrote {out / 'report.html'}"]
+    assert said.splitlines()[-2:] == [
+        f"wrote {out / 'videos'}: {name}",
+        f"wrote {out / 'report.html'}",
+    ]
     assert [p.name for p in (out / "videos").iterdir()] == [name]
 
 
@@ -166,24 +182,33 @@ def test_what_is_not_there_is_told_in_one_line(out, tmp_path):
     ):
         with pytest.raises(UserError, match=says):
             find(*arguments)
-    with pytest.raises(UserError, match=r"was made by `harness eval`; give a folder made by `harness drive`"):
+    with pytest.raises(
+        UserError, match=r"was made by `harness eval`; give a folder made by `harness drive`"
+    ):
         find(made_up(tmp_path / "frozen"), 0, None, None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()])
+@pytest.mark.parametrize(
+    "commit", [path.name for path in RECORDS.glob("*") if (path / "drive").is_dir()]
+)
 def test_an_old_episode_played_again_ends_as_it_did(commit):
     """Its record lacks the parameters that came later."""
     there = folder.read(RECORDS / commit / "drive")
     *_, last = stills(find(there.path, 0, "single-local", 0))
-    [row] = [e for e in there.episodes if (e.episode, e.condition, e.seed) == (0, "single-local", 0)]
+    [row] = [
+        e for e in there.episodes if (e.episode, e.condition, e.seed) == (0, "single-local", 0)
+    ]
     assert last.outcome.startswith(f"{row.failure or 'cleared'} at {row.time_s:.1f} s")
 
 
 @pytest.mark.slow
 def test_an_episode_of_agents_played_again_ends_as_it_did(tmp_path):
     spec = live_spec_of(
-        prompt="v4", points=(named_point("single-local"),), seeds=(0,), latency="ego=1.3,helper=1.3,fusion=0"
+        prompt="v4",
+        points=(named_point("single-local"),),
+        seeds=(0,),
+        latency="ego=1.3,helper=1.3,fusion=0",
     )
     source = LiveSource(50_000, 2, "all-way-crossing:agent_share=1")
     there = folder.read(run(replace(spec, source=source), tmp_path / "run").out)
@@ -211,7 +236,9 @@ def test_a_run_of_frozen_scenes_is_no_film(commit, harness):
 
 
 def test_more_videos_than_episodes_are_refused(harness, tmp_path):
-    code, out, error = harness("drive", "--episodes", 3, "--save-video", 4, "--out", tmp_path / "run")
+    code, out, error = harness(
+        "drive", "--episodes", 3, "--save-video", 4, "--out", tmp_path / "run"
+    )
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert "--save-video 4 is out of range; give 0 to 3" in error
     assert not (tmp_path / "run").exists()
@@ -219,7 +246,9 @@ def test_more_videos_than_episodes_are_refused(harness, tmp_path):
 
 def test_without_what_draws_them_no_videos_are_promised(harness, tmp_path, monkeypatch):
     monkeypatch.setattr("harness.cli.drive.VIDEOS", {})
-    code, out, error = harness("drive", "--episodes", 3, "--save-video", 1, "--out", tmp_path / "run")
+    code, out, error = harness(
+        "drive", "--episodes", 3, "--save-video", 1, "--out", tmp_path / "run"
+    )
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert "--save-video: no extension that is installed draws videos" in error
     assert not (tmp_path / "run").exists()

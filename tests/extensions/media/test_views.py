@@ -13,7 +13,9 @@ places = st.lists(st.tuples(*[st.floats(-150, 150)] * 2), min_size=1, max_size=6
 
 
 def drive(stills, speed):
-    """An ego that drives so many metres a still to the east, and who is asked in every other part."""
+    """An ego that drives so many metres a still to the east,
+    and who is asked in every other part.
+    """
     asked = [np.array([[40.0, 50.0]]) if n // 20 % 2 else np.empty((0, 2)) for n in range(stills)]
     return [np.vstack([[-60.0 + speed * n, 0.0], more]) for n, more in enumerate(asked)]
 

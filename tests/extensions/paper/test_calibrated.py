@@ -1,4 +1,6 @@
-"""The calibrated proxy: its story played by hand, and what must hold of it whatever its parameters."""
+"""The calibrated proxy: its story played by hand,
+and what must hold of it whatever its parameters.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -32,7 +34,9 @@ from harness.studies.play import WalkResult
 SURE = OperatingPoint.of("6g", "6g", loss=0.0)  # nothing is lost
 
 
-def walked(source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0) -> WalkResult:
+def walked(
+    source: Calibrated, point: OperatingPoint, vehicles: int = 4, seed: int = 0
+) -> WalkResult:
     [[made]] = source.walked([Setting("", point, vehicles)], [seed])
     return made
 
@@ -72,7 +76,9 @@ def test_of_a_kinds_rows_one_draw_lies_in_each_equal_part(kinds: list[int], seed
 
 @pytest.mark.slow
 def test_stratified_draws_are_uniform_and_columns_independent() -> None:
-    """A row's own draws, over 4 000 generators: any row of a small kind has every value alike often."""
+    """A row's own draws, over 4 000 generators:
+    any row of a small kind has every value alike often.
+    """
     kinds = np.array([0, 1, 0, 1, 0])
     first, second = (
         np.array([stratified(np.random.default_rng([column, seed]), kinds) for seed in range(4000)])
@@ -96,7 +102,9 @@ def test_every_seed_has_every_kind_of_episode_in_its_share() -> None:
 
 @pytest.mark.slow
 def test_luck_is_spread_over_those_whom_it_decides() -> None:
-    """Of 32 whom only the first helper saves, .6 x .6 hear it at 40 % loss: 11.5, and never 7 or 16."""
+    """Of 32 whom only the first helper saves, .6 x .6 hear it at 40 % loss:
+    11.5, and never 7 or 16.
+    """
     source = Calibrated(300)
     heard = []
     for seed in range(40):
@@ -149,7 +157,9 @@ def test_what_nobody_reads_rightly_no_message_saves():
 
 def test_on_a_serial_channel_the_third_reply_is_late():
     """145 + 3 x 25 ms: whoever depends on the third helper is not saved."""
-    third = Calibrated(100, Parameters(left_share=0.0, right_share=0.0, guess_right=0.0, know_right=1.0))
+    third = Calibrated(
+        100, Parameters(left_share=0.0, right_share=0.0, guess_right=0.0, know_right=1.0)
+    )
     serial = POINTS["v2x"].changed(loss=0.0)
     assert not success(third, serial).any()
     assert success(third, serial.changed(window_s=0.25)).all()

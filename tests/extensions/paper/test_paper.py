@@ -46,7 +46,9 @@ def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None
 
 @pytest.mark.slow
 def test_the_ledger_is_inside_its_aims(found: pd.DataFrame) -> None:
-    """One row misses (benchmarks/measured/studies.md): at 40 % loss more is heard than in the paper."""
+    """One row misses (benchmarks/measured/studies.md):
+    at 40 % loss more is heard than in the paper.
+    """
     assert set(found[found.verdict == "misses"].id) <= {"B12"}
     ran = found[found.kind != "cited"]
     noise = ran.metric.map({"success": 1.0}).fillna(0.0)
@@ -93,7 +95,9 @@ def test_five_seeds_that_round_alike_are_not_taken_for_exact() -> None:
 
 @pytest.mark.slow
 def test_seeds_are_the_studys_own() -> None:
-    one, again, other = (run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,)))
+    one, again, other = (
+        run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,))
+    )
     assert one.data["ledger"].equals(again.data["ledger"])
     assert not one.data["ledger"].equals(other.data["ledger"])
     assert "100.0 [–, –] %" in " ".join(other.about)
@@ -102,9 +106,13 @@ def test_seeds_are_the_studys_own() -> None:
 
 @pytest.mark.slow
 def test_what_equation_2_does_is_measured(study: Path) -> None:
-    """The witness has 1/6 of 1/6 + 1/25 + 2/20, more than half; of equal weights it has a quarter."""
+    """The witness has 1/6 of 1/6 + 1/25 + 2/20, more than half;
+    of equal weights it has a quarter.
+    """
     rows = pd.read_csv(study / "conditions.csv", dtype={"value": float})
-    rows = rows[(rows.panel == "min_distance_m") & (rows.metric == "success_rate")].set_index("value")
+    rows = rows[(rows.panel == "min_distance_m") & (rows.metric == "success_rate")].set_index(
+        "value"
+    )
     with_it, without = rows["mean"][1.0], rows["mean"][1000.0]
     assert with_it > 0.9
     assert without < 0.8
@@ -130,7 +138,9 @@ def test_the_papers_values_are_drawn_in_every_panel(study: Path) -> None:
 
 @pytest.mark.slow
 def test_grid_points_that_are_the_same_point_give_the_same_number(found: pd.DataFrame) -> None:
-    """N = 4 with density-coupled loss, 6.6 %, is tau at its lowest, where all helpers load the channel."""
+    """N = 4 with density-coupled loss, 6.6 %, is tau at its lowest,
+    where all helpers load the channel.
+    """
     size = found[(found.id == "B4")].ours.item()
     low = found[(found.id == "B15")].ours.iloc[0]
     assert size == pytest.approx(low)
@@ -152,7 +162,8 @@ def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> Non
 @pytest.mark.slow
 def test_episodes_add_up_to_the_conditions(study: Path) -> None:
     episodes, conditions = (
-        pd.read_csv(study / f"{name}.csv", dtype={"value": float}) for name in ("episodes", "conditions")
+        pd.read_csv(study / f"{name}.csv", dtype={"value": float})
+        for name in ("episodes", "conditions")
     )
     core = episodes[episodes.panel == "core"]
     for condition, rows in core.groupby("condition"):

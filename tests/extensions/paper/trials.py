@@ -14,7 +14,9 @@ TRIALS = {
     ),
     "closed-loop": Trial(
         "study closed-loop --model proxy --workers 1", "--episodes 2 --seeds 0",
-        "--episodes 2 --seeds 0 --prompt v1", "was begun with --prompt v2, and not with --prompt v1",
+        "--episodes 2 --seeds 0 --prompt v1", 
+            "was begun with --prompt v2, "
+            "and not with --prompt v1",
         {"--scenario nowhere": "nowhere", "--prompt v0": "v0"},
         "driven in closed loop on the layouts of",
     ),

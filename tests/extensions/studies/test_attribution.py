@@ -1,4 +1,6 @@
-"""`harness study attribute`: what answers and decisions become without one object, or one message."""
+"""`harness study attribute`: what answers and decisions become without one object,
+or one message.
+"""
 
 import json
 import shutil
@@ -52,7 +54,9 @@ class Judging:
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         self.asked += [request.id for request in requests]
-        return [Completion(r.id, says(self.p(r), r.role), None, None, "stop", None, 1) for r in requests]
+        return [
+            Completion(r.id, says(self.p(r), r.role), None, None, "stop", None, 1) for r in requests
+        ]
 
     def p(self, request: Request) -> tuple[float, ...]:
         if "+" in request.id:
@@ -150,14 +154,20 @@ def test_each_listed_object_moves_what_a_viewer_says_of_conflicts(
                     seen = node.id in {n.id for n in graphs["v1"].nodes}
                     kind = f"{'seen' if seen else 'hidden'} conflict vehicle"
                 expected[scene, viewer, node.id] = (kind, 0.5 if alone else 0.0)
-    assert {(e.scene, e.viewer, e.item): (e.kind, pytest.approx(e.shift)) for e in objects} == expected
+    assert {
+        (e.scene, e.viewer, e.item): (e.kind, pytest.approx(e.shift)) for e in objects
+    } == expected
     turned = [e for e in objects if e.shift]
     assert turned
-    assert {(e.action, e.instead, round(e.change or 0, 9)) for e in turned} == {("SLOWER", "IDLE", -0.5)}
+    assert {(e.action, e.instead, round(e.change or 0, 9)) for e in turned} == {
+        ("SLOWER", "IDLE", -0.5)
+    }
     kinds = {row.kind: row for row in rows(found) if row.role == "helper"}
     hidden = [e for e in objects if e.kind == "hidden conflict vehicle"]
     assert kinds["hidden conflict vehicle"].shift.n == len(hidden)
-    assert kinds["hidden conflict vehicle"].shift.value == pytest.approx(np.mean([e.shift for e in hidden]))
+    assert kinds["hidden conflict vehicle"].shift.value == pytest.approx(
+        np.mean([e.shift for e in hidden])
+    )
     assert kinds["other object"].flips.value == kinds["other object"].shift.value == 0.0
 
 
@@ -198,7 +208,9 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
 
 
 @pytest.mark.slow
-def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path], judging: Judging) -> None:
+def test_helpers_that_were_never_asked_are_asked_first(
+    made: Callable[..., Path], judging: Judging
+) -> None:
     point = named_point("v2x:max_helpers=1")
     everybody = attribute(ReplayedRun(made(point)), point.name, 6, 0)
     path = made(point, ask="used")
@@ -216,7 +228,9 @@ def test_helpers_that_were_never_asked_are_asked_first(made: Callable[..., Path]
 
 @pytest.mark.slow
 def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
-    """It is the mean of now and of what it remembers, so half of what moves now moves it after step 0."""
+    """It is the mean of now and of what it remembers,
+    so half of what moves now moves it after step 0.
+    """
     plain, smooth = SIXG, named_point("6g:loss=0,consensus=smooth")
     path = made(plain, smooth)
     found = attribute(ReplayedRun(path), smooth.name, 14, 0)
@@ -232,7 +246,9 @@ def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
 
 
 @pytest.mark.slow
-def test_a_fusion_call_is_made_again_without_the_message(made: Callable[..., Path], judging: Judging) -> None:
+def test_a_fusion_call_is_made_again_without_the_message(
+    made: Callable[..., Path], judging: Judging
+) -> None:
     """With v3's message it says SLOWER, else FASTER; with nobody's, the ego's own IDLE."""
     fusion = named_point("6g:loss=0,consensus=ego-prompt")
     path = made(fusion)
@@ -265,7 +281,9 @@ def test_the_draw_is_no_choice_and_a_larger_one_has_the_smaller(made: Callable[.
 
 
 @pytest.mark.slow
-def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], judging: Judging) -> None:
+def test_a_killed_one_goes_on_and_asks_nothing_twice(
+    made: Callable[..., Path], judging: Judging
+) -> None:
     class Killed(Stop):
         pass
 
@@ -279,9 +297,9 @@ def test_a_killed_one_goes_on_and_asks_nothing_twice(made: Callable[..., Path], 
     assert len(before) == 64
     found = attribute(ReplayedRun(path), SIXG.name, 14, 0)
     assert len(judging.asked) == len(set(judging.asked)) > 100
-    assert {f"{e.scene}~without-{e.item}/{e.viewer}" for e in found.left_out if e.role != "fusion"} == set(
-        judging.asked
-    )
+    assert {
+        f"{e.scene}~without-{e.item}/{e.viewer}" for e in found.left_out if e.role != "fusion"
+    } == set(judging.asked)
 
 
 @pytest.mark.slow
@@ -300,7 +318,9 @@ def test_an_answer_that_fails_is_counted_and_moves_nothing(
     assert said.startswith("What moves answers most is not clear: ")
     assert "overlap: message of a helper with" in said
     sure = Row("ego", "car", Estimate(0.9, 0.8, 0.95, 9, 0), *[Estimate(0.5, 0.2, 0.8, 9, 0)] * 2)
-    assert headline([*rows(found), sure]).startswith("The car in the ego's prompt moves answers most: ")
+    assert headline([*rows(found), sure]).startswith(
+        "The car in the ego's prompt moves answers most: "
+    )
 
 
 @pytest.mark.slow
@@ -312,7 +332,9 @@ def test_the_decisions_view_has_what_was_left_out_there_alone(made: Callable[...
     attribution.write(found, path)
     shown = Decisions(gather([path]))
     details = dict(zip(shown.ids, (d["runs"][0] for d in unpacked(shown)), strict=True))
-    assert {scene for scene, d in details.items() if "left_out" in d} == {e.scene for e in found.left_out}
+    assert {scene for scene, d in details.items() if "left_out" in d} == {
+        e.scene for e in found.left_out
+    }
     for scene, detail in details.items():
         here = detail.get("left_out", [])
         assert len(here) == sum(e.scene == scene for e in found.left_out)
@@ -334,8 +356,12 @@ def test_a_driver_is_asked_for_the_ego_alone(small: Dataset, tmp_path: Path) -> 
 def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Path) -> None:
     points = (named_point("single-local"),)
     proxy = run(spec_of(small, points=points, seeds=(0,)), tmp_path / "proxy").out
-    replayed = run(spec_of(small, f"replay:{proxy}", points=points, seeds=(0,)), tmp_path / "replay").out
-    with pytest.raises(UserError, match="no answers to other questions; give the run that it replays"):
+    replayed = run(
+        spec_of(small, f"replay:{proxy}", points=points, seeds=(0,)), tmp_path / "replay"
+    ).out
+    with pytest.raises(
+        UserError, match="no answers to other questions; give the run that it replays"
+    ):
         attribute(ReplayedRun(replayed), "single-local", 5, 0)
     truth = run(spec_of(small, "full-view", points=points, seeds=(0,)), tmp_path / "truth").out
     with pytest.raises(UserError, match="full-view reads the truth and no prompt"):
@@ -345,7 +371,9 @@ def test_what_cannot_be_asked_otherwise_is_refused(small: Dataset, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_no_object_can_be_left_out_of_a_picture(small: Dataset, tmp_path: Path, judging: Judging) -> None:
+def test_no_object_can_be_left_out_of_a_picture(
+    small: Dataset, tmp_path: Path, judging: Judging
+) -> None:
     points, card = (named_point("single-local"),), cards.load("swarm-tiny-vl")
     spec = spec_of(small, "swarm-tiny", "v4", points=points, seeds=(0,), latency="paper")
     ego = Agent(card, prompt("v7"))
@@ -375,17 +403,22 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     assert kept
     assert told["decision_points"] == kept.decision_points == 10
     assert sum(row["shift"]["n"] for row in told["rows"]) == len(kept.left_out)
-    assert harness("study", "attribute", "run", "--sample", "10", "--condition", control.name, "--quiet")[
-        :2
-    ] == (0, "")
+    assert harness(
+        "study", "attribute", "run", "--sample", "10", "--condition", control.name, "--quiet"
+    )[:2] == (0, "")
     assert harness("report", "run")[0] == 0
     page = Path("run/report.html").read_text()
     kept = of_run(folder.read(tmp_path / "run"))
     assert kept
-    assert f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind" in page
+    assert (
+        f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind"
+        in page
+    )
 
 
-def test_a_broken_file_is_one_line(harness: Callable[..., Said], small: Dataset, tmp_path: Path) -> None:
+def test_a_broken_file_is_one_line(
+    harness: Callable[..., Said], small: Dataset, tmp_path: Path
+) -> None:
     run(spec_of(small, points=(SIXG,), seeds=(0,)), tmp_path / "run")
     (tmp_path / "run/attribution.json").write_text("{")
     code, _, err = harness("report", "run")

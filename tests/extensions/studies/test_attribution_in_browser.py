@@ -22,7 +22,9 @@ pytestmark = pytest.mark.exhaustive
 
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory):
-    path = run(spec_of(small, points=points(["6g"], ["blind"])), tmp_path_factory.mktemp("moved") / "run").out
+    path = run(
+        spec_of(small, points=points(["6g"], ["blind"])), tmp_path_factory.mktemp("moved") / "run"
+    ).out
     write(attribute(ReplayedRun(path), "6g", 12, 0), path)
     return write_report(gather([path]), path / "report.html", full=True)
 
@@ -30,13 +32,17 @@ def made(small, tmp_path_factory):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_bars_stand_under_answers_and_decisions_of_the_sample_alone(opened, made, scheme):
     found = of_run(folder.read(made.parent))
-    most = max((each for each in found.left_out if each.role == "fusion"), key=lambda each: each.shift)
+    most = max(
+        (each for each in found.left_out if each.role == "fusion"), key=lambda each: each.shift
+    )
     page = opened(made, f"#scene={most.scene}&condition=6g&seed={most.seed}", scheme=scheme)
     here = [each for each in found.left_out if each.scene == most.scene]
     assert page.locator(".track").count() == len(here)
     for each in here:
         changed = f"{abs(each.change):.2f} {each.action}"
-        row = page.locator(".moved span", has_text=f"without {each.item}: ").filter(has_text=changed)
+        row = page.locator(".moved span", has_text=f"without {each.item}: ").filter(
+            has_text=changed
+        )
         assert row.count() >= 1
     shown = page.locator(".track").first
     assert float(shown.get_attribute("title").split()[-1]) == round(most.shift, 2)

@@ -20,7 +20,8 @@ from harness.extensions.studies.fidelity.study import disagreements, fidelity
 
 Said = tuple[int, str, str]
 MODELS = ("proxy", "cruise", "brake", "local-view")
-LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0", "--workers", "1")  # those of `small`
+# those of `small`
+LAYOUTS = ("--episodes", "4", "--first-seed", "100", "--seeds", "0", "--workers", "1")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,15 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fidelity")
     for model in MODELS:
         evaluate(spec_of(small, model, seeds=(0,)), folder / f"eval-{model}")
-        drive = (*DRIVE, "--model", model, *LAYOUTS, "--quiet", "--out", str(folder / f"drive-{model}"))
+        drive = (
+            *DRIVE,
+            "--model",
+            model,
+            *LAYOUTS,
+            "--quiet",
+            "--out",
+            str(folder / f"drive-{model}"),
+        )
         get_command(app)(drive, standalone_mode=False)
     return folder
 
@@ -53,12 +62,16 @@ def test_episodes_are_paired_by_layout_condition_and_seed(runs: list[Path]) -> N
     assert len(found.episodes) == 4 * 3 * 4
     row: Any
     for row in found.table.itertuples():
-        frozen, closed = (success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive"))
+        frozen, closed = (
+            success(Path(f"{kind}-{row.model}"), row.condition) for kind in ("eval", "drive")
+        )
         assert row.frozen == pytest.approx(frozen.mean())
         assert row.closed == pytest.approx(closed.mean())
         assert row.difference == pytest.approx((frozen - closed).mean())
         assert row.n == 4
-    assert found.ranked == 5, "no condition makes a difference to a driver, nor the link here to the proxy"
+    assert found.ranked == 5, (
+        "no condition makes a difference to a driver, nor the link here to the proxy"
+    )
     assert -1 <= found.rank <= 1
     other = found.episodes.success_frozen != found.episodes.success_closed
     assert disagreements(found.episodes)["count"].sum() == other.sum()
@@ -80,18 +93,25 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
     assert (code, err) == (0, "")
     assert "rank correlation of 5 models and conditions" in out
     assert "Largest difference, frozen minus closed" in out
-    assert "json · " not in out + Path("told/index.html").read_text(), "the ego's agent answers for helpers"
-    few = harness("study", "fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few")[1]
+    assert "json · " not in out + Path("told/index.html").read_text(), (
+        "the ego's agent answers for helpers"
+    )
+    few = harness(
+        "study", "fidelity", *(run for run in runs if "proxy" in str(run)), "--out", "few"
+    )[1]
     assert "Spearman" not in few
     assert re.search(
-        r"No rank correlation: \d different models and conditions are too few; at least 5 are needed\.",
+        r"No rank correlation: \d different models and conditions are too few; at least 5 are "
+        r"needed\.",
         " ".join(few.split()),
     )
     assert "too few" in Path("few/index.html").read_text()
 
 
 @pytest.mark.slow
-def test_what_cannot_be_compared_is_one_line(runs: list[Path], harness: Callable[..., Said]) -> None:
+def test_what_cannot_be_compared_is_one_line(
+    runs: list[Path], harness: Callable[..., Said]
+) -> None:
     for folders, said in (
         (runs[:1], "no run on live episodes"),
         (runs[1:2], "no run on frozen scenes"),

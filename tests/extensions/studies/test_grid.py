@@ -68,22 +68,29 @@ def test_an_agent_is_asked_once_in_a_role_about_a_decision_point(
 
 
 @pytest.mark.slow
-def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(small: Dataset, tmp_path: Path) -> None:
+def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(
+    small: Dataset, tmp_path: Path
+) -> None:
     whole, again = played(small, tmp_path / "grid"), list[int]()
     played(small, tmp_path / "grid", again.append)
     assert again == []
     shutil.rmtree(tmp_path / "grid/cells/2-2")
     last = played(small, tmp_path / "grid")
-    assert [c.estimate(SUCCESS, "6g") for c in last.cells] == [c.estimate(SUCCESS, "6g") for c in whole.cells]
+    assert [c.estimate(SUCCESS, "6g") for c in last.cells] == [
+        c.estimate(SUCCESS, "6g") for c in whole.cells
+    ]
     others = [agent("proxy", "v1"), agent("proxy-faulty")]
     with pytest.raises(UserError, match="prompt"):
         run_cells(spec_of(small), others, others, tmp_path / "grid", Watched(), None)
 
 
-# -- effects, played by hand --------------------------------------------------------------------------------
+# -- effects, played by hand
+# --------------------------------------------------------------------------------
 
 
-def made_up(success: Mapping[tuple[str, str], Sequence[float]], dangerous: Sequence[int] = ()) -> Grid:
+def made_up(
+    success: Mapping[tuple[str, str], Sequence[float]], dangerous: Sequence[int] = ()
+) -> Grid:
     """Cells by prompt of ego and helpers: success of each episode under 6g, one seed."""
     n = len(next(iter(success.values())))
     told = {
@@ -152,14 +159,17 @@ def test_the_half_that_matters_is_named() -> None:
     assert halves.helpers.value > 0.9
     assert halves.apart.high < 0
     [said] = headline(made_up(of))
-    assert said.startswith("Under 6g, the choice of the helpers matters more: the choice among 2 egos")
+    assert said.startswith(
+        "Under 6g, the choice of the helpers matters more: the choice among 2 egos"
+    )
 
 
 def test_cells_that_do_not_differ_have_no_half_that_matters() -> None:
     of = {(ego, helper): [1.0, 0.0, 1.0] for ego in ("v1", "v2") for helper in ("v1", "v2")}
     [said] = headline(made_up(of))
     assert said == (
-        "Under 6g, success of the 4 combinations is 66.7 to 66.7 %; 0 of 3 effects are more than chance "
+        "Under 6g, success of the 4 combinations is 66.7 to 66.7 %; 0 of 3 effects are more than "
+        "chance "
         "explains (n = 3)."
     )
 
@@ -170,7 +180,9 @@ def test_cells_that_differ_in_one_episode_alone_say_nothing_of_halves() -> None:
 
 
 def test_the_front_is_what_none_beats_without_taking_longer() -> None:
-    grid = made_up({("v1", "v1"): [1, 0], ("v1", "v2"): [1, 1], ("v2", "v1"): [0, 0], ("v2", "v2"): [1, 1]})
+    grid = made_up(
+        {("v1", "v1"): [1, 0], ("v1", "v2"): [1, 1], ("v2", "v1"): [0, 0], ("v2", "v2"): [1, 1]}
+    )
     for cell, ms in zip(grid.cells, (100, 200, 150, 300), strict=True):
         cell.values[LATENCY][:] = ms
     names = [(c.ego.prompt.version, c.helper.prompt.version) for c in front(grid, "6g")]
@@ -192,12 +204,16 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
     for name in ("heat-map", "pareto"):
         assert (out / f"{name}.svg").stat().st_size > 1000
     assert "proxy-faulty · v2 · json" in page
-    assert page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
+    assert (
+        page.count("<a href=") == page.count('<a href="cells/1-2/report.html">cells/1-2</a>') == 3
+    )
 
 
 def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
     figures = pytest.importorskip("harness.studies.figures.points", reason="needs the report extra")
-    steps = [figures.Steps("", [x], [x], name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))]
+    steps = [
+        figures.Steps("", [x], [x], name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))
+    ]
     figure = figures.fronts([("", "latency of a decision, ms", steps)], "success")
     figure.draw_without_rendering()
     [axes] = figure.axes
@@ -211,16 +227,42 @@ def test_letters_are_those_of_the_agents_that_read_out(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
-    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "single-local")
-    asked = ("study", "grid", "--model", "swarm-tiny", "--answer", "json,readout", "--helper-answer", "json")
-    code, _, err = harness(*asked, "--letters", "cyclic", *few, "--out", str(tmp_path / "grid"), "--quiet")
+    few = (
+        "--dataset",
+        str(small_path),
+        "--limit",
+        "1",
+        "--seeds",
+        "0:1",
+        "--condition",
+        "single-local",
+    )
+    asked = (
+        "study",
+        "grid",
+        "--model",
+        "swarm-tiny",
+        "--answer",
+        "json,readout",
+        "--helper-answer",
+        "json",
+    )
+    code, _, err = harness(
+        *asked, "--letters", "cyclic", *few, "--out", str(tmp_path / "grid"), "--quiet"
+    )
     assert code == 0, err
-    stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
-    assert {(of["answer"], of.get("letters")) for of in stated} == {("json", "raw"), ("readout", "cyclic")}
+    stated = [
+        json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))
+    ]
+    assert {(of["answer"], of.get("letters")) for of in stated} == {
+        ("json", "raw"),
+        ("readout", "cyclic"),
+    }
     code, _, err = harness("study", "grid", "--prompt", "v1,v2", "--letters", "cyclic", *few)
     assert code == 2
     assert err == (
-        "harness: --letters cyclic: proxy answers in json; leave it out, or give a language model and "
+        "harness: --letters cyclic: proxy answers in json; leave it out, or give a language model "
+        "and "
         "--answer readout\n"
     )
 
@@ -229,9 +271,33 @@ def test_letters_are_those_of_the_agents_that_read_out(
 def test_a_grid_takes_every_setting_of_an_evaluation(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path
 ) -> None:
-    few = ("--dataset", str(small_path), "--limit", "1", "--seeds", "0:1", "--condition", "single-local")
-    both = ("study", "grid", "--model", "proxy", "--prompt", "v2", "--helper-model", "proxy,proxy-faulty")
-    code, _, err = harness(*both, *few, "--sums", "divide", "--tag", "sums", "--out", str(tmp_path / "grid"))
+    few = (
+        "--dataset",
+        str(small_path),
+        "--limit",
+        "1",
+        "--seeds",
+        "0:1",
+        "--condition",
+        "single-local",
+    )
+    both = (
+        "study",
+        "grid",
+        "--model",
+        "proxy",
+        "--prompt",
+        "v2",
+        "--helper-model",
+        "proxy,proxy-faulty",
+    )
+    code, _, err = harness(
+        *both, *few, "--sums", "divide", "--tag", "sums", "--out", str(tmp_path / "grid")
+    )
     assert code == 0, err
-    stated = [json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))]
-    assert [(run["sums"], run["tags"], run["ask"]) for run in stated] == [("divide", ["sums"], "all")] * 2
+    stated = [
+        json.loads(file.read_text()) for file in sorted((tmp_path / "grid").rglob("run.json"))
+    ]
+    assert [(run["sums"], run["tags"], run["ask"]) for run in stated] == [
+        ("divide", ["sums"], "all")
+    ] * 2

@@ -1,4 +1,6 @@
-"""Twins: what each changes and what it leaves, that a check finds what it is for, and the command."""
+"""Twins: what each changes and what it leaves, that a check finds what it is for,
+and the command.
+"""
 
 import json
 import re
@@ -61,7 +63,9 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
 
 
 def spec_for(dataset: Dataset, model: str = "proxy", **options: Any) -> Spec:
-    return spec_of(dataset, model, dataset.scenario.prompt, **{"points": (), "seeds": (0,), **options})
+    return spec_of(
+        dataset, model, dataset.scenario.prompt, **{"points": (), "seeds": (0,), **options}
+    )
 
 
 def scenes_in(dataset: Dataset) -> list[Scene]:
@@ -242,7 +246,9 @@ def test_units_change_in_values_and_in_words(crossing: Dataset) -> None:
 def test_units_leave_a_prompt_alone_whose_own_numbers_have_some(crossing: Dataset) -> None:
     spec = spec_for(crossing, "swarm-tiny")
     texts_of = spec.ego.prompt.texts
-    text = texts_of["ego"].replace("Collisions are worst", "Within 12 m brake. Collisions are worst")
+    text = texts_of["ego"].replace(
+        "Collisions are worst", "Within 12 m brake. Collisions are worst"
+    )
     spec = with_ego(spec, prompt=replace(spec.ego.prompt, texts={**texts_of, "ego": text}))
     old, new = texts(spec, "units", scenes_in(crossing)[0], "v1")
     assert old == new
@@ -262,8 +268,10 @@ def test_order_turns_the_lines_of_objects_round_within_their_table() -> None:
     [
         ('sum 1: {"distribution":{"SLOWER":p,"IDLE":p}}', 'sum 1: {"distribution":{"IDLE":p,"SLOWER":p}}'),
         (
-            '{"evidence": "a, b", "risk": "low" or "high", "maneuver": one of IDLE, FASTER, "sure": 0-1} ok',
-            '{"sure": 0-1, "maneuver": one of IDLE, FASTER, "risk": "low" or "high", "evidence": "a, b"} ok',
+            '{"evidence": "a, b", "risk": "low" or "high", "maneuver": one of IDLE, FASTER, '
+            '"sure": 0-1} ok',
+            '{"sure": 0-1, "maneuver": one of IDLE, FASTER, "risk": "low" or "high", "evidence": '
+            '"a, b"} ok',
         ),
         ("no JSON {here}", "no JSON {here}"),
         ('{"open": {"never": closed', '{"open": {"never": closed'),
@@ -295,7 +303,8 @@ def test_every_prompt_that_ships_has_twins_of_its_text(crossing: Dataset, versio
     model = "swarm-tiny-vl" if versions.load(version).image else "swarm-tiny"
     spec = spec_of(crossing, model, version, points=(), seeds=(0,))
     scene = scenes_in(crossing)[1]
-    in_metres = spec.ego.prompt.examples is not None  # whose numbers stay, so that no unit may change
+    # whose numbers stay, so that no unit may change
+    in_metres = spec.ego.prompt.examples is not None
     ego = spec.ego.prompt.texts["ego"]
     listing = ("order", "far-vehicle") if "in objects" in ego else ()
     shows_json = '":' in ego or spec.ego.prompt.examples is not None
@@ -324,7 +333,11 @@ def test_who_reads_the_scene_holds_in_every_twin_that_says_the_same(
     rows = asked(spec_for(family, model), tmp_path / "out", *SAME)
     assert {row.twin.name for row in rows} >= {"ids", "order", "far-vehicle"}
     for row in rows:
-        assert (row.invariance_rate.value, row.tv_distance.value, row.failed_rate.value) == (1, 0, 0)
+        assert (row.invariance_rate.value, row.tv_distance.value, row.failed_rate.value) == (
+            1,
+            0,
+            0,
+        )
 
 
 class Reader:
@@ -335,8 +348,12 @@ class Reader:
 
     def complete(self, asked: Sequence[Request]) -> list[Completion]:
         self.count += len(asked)
-        texts = [says(self.rule(r), "ego" if r.answer == "readout" else r.role, r.actions) for r in asked]
-        return [Completion(r.id, t, 9, 9, "stop", None, 1) for r, t in zip(asked, texts, strict=True)]
+        texts = [
+            says(self.rule(r), "ego" if r.answer == "readout" else r.role, r.actions) for r in asked
+        ]
+        return [
+            Completion(r.id, t, 9, 9, "stop", None, 1) for r, t in zip(asked, texts, strict=True)
+        ]
 
     def identity(self) -> dict[str, Any]:
         return {"engine": "by a rule"}
@@ -359,17 +376,24 @@ def test_a_read_out_of_words_holds_and_one_of_letters_does_not(
     assert "Answer with one letter: A FASTER, B SLOWER, C IDLE." in row.broken[0].messages[1]
 
 
-@pytest.mark.parametrize(("mode", "names"), [("json", None), ("readout", ("letters", "ids", "rounding"))])
+@pytest.mark.parametrize(
+    ("mode", "names"), [("json", None), ("readout", ("letters", "ids", "rounding"))]
+)
 def test_what_always_gives_the_same_answer_holds_what_is_said_of_it(
     crossing: Dataset, tmp_path: Path, answering: Callable[[Any], None], mode: str,
     names: tuple[str, ...] | None,
 ) -> None:  # fmt: skip
     spec = spec_for(crossing, "swarm-tiny", answer=mode)
     answering(Reader(lambda r: [0.1, *[0.0] * (len(r.actions) - 2), 0.9]))
-    of, study = names or tuple(name for name in TWINS if name != "letters"), Questions(spec, tuple(TWINS), 0)
+    of, study = (
+        names or tuple(name for name in TWINS if name != "letters"),
+        Questions(spec, tuple(TWINS), 0),
+    )
     rows = asked(spec, tmp_path / "out", *of)
     for row in rows:
-        assert row.invariance_rate.value == twins_page.constant_holds(study, row.twin), row.twin.name
+        assert row.invariance_rate.value == twins_page.constant_holds(study, row.twin), (
+            row.twin.name
+        )
     said = twins_page.same_answer(study, rows)
     assert ("letters, of which it holds 0 %" in said) == (mode == "readout")
 
@@ -383,7 +407,9 @@ def test_who_believes_the_first_message_is_found_by_their_order(
         return [0.0, 0.0, 1.0] if first == ["v2"] else [1.0, 0.0, 0.0] if first else [0.2, 0.5, 0.3]
 
     answering(Reader(rule))
-    rows = asked(spec_for(crossing, "swarm-tiny"), tmp_path / "out", "message-order", "message-twice")
+    rows = asked(
+        spec_for(crossing, "swarm-tiny"), tmp_path / "out", "message-order", "message-twice"
+    )
     assert by_name(rows, "fusion") == {"message-order": 0.0, "message-twice": 1.0}
 
 
@@ -421,7 +447,18 @@ def test_what_a_helper_did_not_answer_is_left_out_and_counted(
 def pair(episode: int, p: Any, q: Any, name: str = "ids") -> Pair:
     holds, apart = scoring.held(TWINS[name], p, q), scoring.distance(p, q)
     return Pair(
-        name, "ego", episode, f"0000{episode}-0", "v1", p, q, apart, holds, ("", ""), ("", ""), ("", "")
+        name,
+        "ego",
+        episode,
+        f"0000{episode}-0",
+        "v1",
+        p,
+        q,
+        apart,
+        holds,
+        ("", ""),
+        ("", ""),
+        ("", ""),
     )
 
 
@@ -517,7 +554,9 @@ def test_the_command_prints_writes_and_gates(
     assert "proxy-faulty reads the scene graph and not the text" in out
     written = json.loads((tmp_path / "faulty" / "twins.json").read_text())
     assert written["decision_points"] == 18
-    pairs = [json.loads(line) for line in (tmp_path / "faulty" / "pairs.jsonl").read_text().splitlines()]
+    pairs = [
+        json.loads(line) for line in (tmp_path / "faulty" / "pairs.jsonl").read_text().splitlines()
+    ]
     for row in written["rows"]:
         of = [p for p in pairs if (p["twin"], p["role"]) == (row["twin"], row["role"])]
         assert row["invariance_rate"]["value"] == pytest.approx(np.mean([p["holds"] for p in of]))
@@ -532,7 +571,9 @@ def test_the_command_prints_writes_and_gates(
 
 
 @pytest.mark.slow
-def test_workers_change_nothing(harness: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+def test_workers_change_nothing(
+    harness: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
     for workers in ("1", "2"):
         harness("study", "twins", "--sample", "2", "--workers", workers, "--out", workers, "--json")
     for name in ("twins.json", "pairs.jsonl", "index.html"):

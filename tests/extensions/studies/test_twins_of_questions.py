@@ -1,4 +1,6 @@
-"""Twins of questions with examples, with a picture, and for a decision model; and which twin is named."""
+"""Twins of questions with examples, with a picture, and for a decision model;
+and which twin is named.
+"""
 
 from dataclasses import replace
 from pathlib import Path

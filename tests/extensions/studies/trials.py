@@ -9,7 +9,9 @@ TRIALS = {
         {
             "--prompt v2": "1 combinations: give 2 to 256, such as --model a,b",
             "--prompt v2,v2": "--prompt v2,v2: give different names, such as a,b",
-            "--prompt v1,v2 --letters cyclic": "--letters cyclic: proxy answers in json; leave it out",
+            "--prompt v1,v2 --letters cyclic": 
+                "--letters cyclic: proxy "
+                "answers in json; leave it out",
         },
         "the same for all combinations", ends=False,
     ),

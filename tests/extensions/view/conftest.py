@@ -21,7 +21,9 @@ def made(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
         evaluate(spec_of(small, model, points=points, tag=(f"tag of {name}",)), folder / name)
     write_report(gather([folder / "first"]), folder / "first/report.html")
     (folder / "first/sweep-tau").mkdir()
-    (folder / "first/sweep-tau/sweep.json").write_text('{"sources": [{"name": "proxy · v2 · json"}]}')
+    (folder / "first/sweep-tau/sweep.json").write_text(
+        '{"sources": [{"name": "proxy · v2 · json"}]}'
+    )
     for name in ("sweep.svg", "sweep.png", "more.png", "sweep.pdf", "sweep.csv"):
         (folder / "first/sweep-tau" / name).write_text(f"<svg>{name}</svg>")
     return folder

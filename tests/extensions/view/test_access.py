@@ -36,11 +36,16 @@ def test_without_the_token_nothing_is_read(page: str, given: str, stranger: Test
 @pytest.mark.slow
 def test_the_printed_address_gives_a_cookie_and_leaves_the_token_out(stranger: TestClient) -> None:
     answer = stranger.get(f"/run?path=second&token={TOKEN}", follow_redirects=False)
-    assert (answer.status_code, answer.headers["location"]) == (303, "http://127.0.0.1:7654/run?path=second")
+    assert (answer.status_code, answer.headers["location"]) == (
+        303,
+        "http://127.0.0.1:7654/run?path=second",
+    )
     assert answer.headers["set-cookie"] == f"{cookie(7654)}={TOKEN}; HttpOnly; Path=/; SameSite=lax"
     assert stranger.get("/run?path=second").status_code == 200
     assert stranger.get("/?token=wrong").status_code == 403, "although the cookie is right"
-    away = stranger.get(f"http://127.0.0.1:7654//evil.example/?token={TOKEN}", follow_redirects=False)
+    away = stranger.get(
+        f"http://127.0.0.1:7654//evil.example/?token={TOKEN}", follow_redirects=False
+    )
     assert away.headers["location"].startswith("http://127.0.0.1:7654//")
 
 
@@ -73,7 +78,11 @@ def test_other_sites_get_nothing_although_the_browser_has_the_cookie(
         {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1:7654"},
         {"Sec-Fetch-Site": "none", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
         # A link in a run's page, which lies in a sandbox, opens another one.
-        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
+        {
+            "Sec-Fetch-Site": "cross-site",
+            "Sec-Fetch-Mode": "navigate",
+            "Sec-Fetch-Dest": "document",
+        },
     ],
 )
 def test_its_own_pages_and_links_are_answered(headers: dict[str, str], reader: TestClient) -> None:
@@ -84,5 +93,7 @@ def test_two_viewers_on_two_ports_keep_their_cookies_apart(reports: Path, tmp_pa
     other = shutil.copytree(reports / "second", tmp_path / "others/second").parent
     cookies = {cookie(7654): TOKEN, cookie(7655): "another"}
     for folder, port, token in ((reports, 7654, TOKEN), (other, 7655, "another")):
-        client = TestClient(app(folder, token), base_url=f"http://127.0.0.1:{port}", cookies=cookies)
+        client = TestClient(
+            app(folder, token), base_url=f"http://127.0.0.1:{port}", cookies=cookies
+        )
         assert client.get("/").status_code == 200

@@ -36,9 +36,13 @@ def of(version: str, day: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three runs on a dataset, written in another order than made; one on another; one that was driven."""
+    """Three runs on a dataset, written in another order than made; one on another;
+    one that was driven.
+    """
     folder = tmp_path_factory.mktemp("history") / "reports"
-    made_up(folder / "third", episode=fail(0, 1, 2), points=(POINTS["6g"], POINTS["v2x"]), **of("v4", 3))
+    made_up(
+        folder / "third", episode=fail(0, 1, 2), points=(POINTS["6g"], POINTS["v2x"]), **of("v4", 3)
+    )
     made_up(folder / "first", **of("v2", 1))
     made_up(folder / "second", episode=fail(0), **of("v3", 2))
     other = made_up(folder / "other", episode=fail(0, 1), **of("v2", 4))
@@ -55,12 +59,16 @@ def reports(made: Path, tmp_path: Path) -> Path:
     return Path(copytree(made, tmp_path / "reports"))
 
 
-def test_a_metric_by_date_of_the_condition_that_most_runs_have(reports: Path, harness: Harness) -> None:
+def test_a_metric_by_date_of_the_condition_that_most_runs_have(
+    reports: Path, harness: Harness
+) -> None:
     code, out, err = harness("run", "history", "--json")
     assert (code, err) == (0, "")
     groups = json.loads(out, parse_constant=pytest.fail)
     assert [(g["scenes"], g["condition"]) for g in groups] == [
-        ("made-up from layout seed 0", "6g"), ("an-other 111111111111", "6g"), ("made-up 000000000000", "6g"),
+        (
+            "made-up from "
+            "layout seed 0", "6g"), ("an-other 111111111111", "6g"), ("made-up 000000000000", "6g"),
     ]  # fmt: skip
     runs = groups[-1]["runs"]
     assert [(r["run"], r["prompt"], r["value"], r["n"]) for r in runs] == [
@@ -81,7 +89,9 @@ def test_the_table_fits_and_says_what_does_not_compare(reports: Path, harness: H
         ["made-up", "·", "v3", "·", "json", "75.0", "[30.1,", "95.4]", "n", "4"],
         ["made-up", "·", "v4", "·", "json", "25.0", "[4.6,", "69.9]", "n", "4"],
     ]
-    assert out.endswith("runs on different scenes do not compare, so each group has its own table\n")
+    assert out.endswith(
+        "runs on different scenes do not compare, so each group has its own table\n"
+    )
 
 
 def test_another_metric_condition_and_dataset(reports: Path, harness: Harness) -> None:

@@ -39,7 +39,9 @@ def raw(port: int, head: str) -> bytes:
 def served(reports: Path) -> Iterator[tuple["subprocess.Popen[str]", str]]:
     """The real command, and what it says first."""
     command = [sys.executable, "-m", "harness", "view", str(reports), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout
         try:
             yield process, process.stdout.readline()
@@ -52,7 +54,9 @@ def test_the_command_serves_on_loopback_alone_until_it_is_interrupted(
     served: tuple["subprocess.Popen[str]", str],
 ) -> None:
     process, line = served
-    found = re.fullmatch(r"(http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})) shows them until Ctrl-C\n", line)
+    found = re.fullmatch(
+        r"(http://127\.0\.0\.1:(\d+)/\?token=([\w-]{43})) shows them until Ctrl-C\n", line
+    )
     assert found, line
     port, owner = int(found[2]), f"Cookie: {cookie(int(found[2]))}={found[3]}\r\n"
     page = httpx.get(found[1], timeout=60, follow_redirects=True)
@@ -97,10 +101,16 @@ def listeners(port: int) -> list[str]:
     [
         (["--port", "-1"], "--port -1 is out of range; give 0 to 65535"),
         (["--port", "65536"], "--port 65536 is out of range; give 0 to 65535"),
-        (["nowhere"], "nowhere is no folder; give one that holds runs, or make a run with `harness eval`"),
+        (
+            ["nowhere"],
+            "nowhere is no folder; give one that holds runs, or make a run with `harness eval`",
+        ),
         (["--host", "0.0.0.0"], "No such option: --host"),
         (["--export", "reports"], "--export reports is there already; give a new folder"),
-        (["--export", "site"], "reports has no run that can be shown; make one with `harness eval`"),
+        (
+            ["--export", "site"],
+            "reports has no run that can be shown; make one with `harness eval`",
+        ),
         (["--export", "site", "--open"], "--export and --open: give one of them"),
     ],
 )
@@ -118,15 +128,23 @@ def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_thi
     (reports / "second/report.html").write_text(f"<body>{tmp_path} is not for others")
     code, out, err = harness("view", str(reports), "--export", str(tmp_path / "site"))
     assert (code, out) == (0, f"wrote {tmp_path / 'site/index.html'}\n")
-    assert "left out first/sweep-tau: a sweep without a page that this version wrote; make it again" in err
+    assert (
+        "left out first/sweep-tau: a sweep without a page that this version wrote; make it again"
+        in err
+    )
     site = {
         str(file.relative_to(tmp_path / "site")): file.read_text()
         for file in (tmp_path / "site").rglob("*.html")
     }
     assert set(site) == {"index.html", "first/report.html", "second/report.html"}
-    assert re.findall('<a href="([^"]+)"', site["index.html"]) == ["second/report.html", "first/report.html"]
+    assert re.findall('<a href="([^"]+)"', site["index.html"]) == [
+        "second/report.html",
+        "first/report.html",
+    ]
     assert all(
-        '<a href="../index.html">← All runs</a>' in site[name] for name in site if name != "index.html"
+        '<a href="../index.html">← All runs</a>' in site[name]
+        for name in site
+        if name != "index.html"
     )
     run = read(reports / "first")
     lead = lead_of(run)
@@ -213,6 +231,7 @@ def test_it_opens_the_browser_when_asked_to(
     asks_to_open.append(True)
     code, out, err = harness("view", "--port", "0", "--open")
     assert (code, err) == (0, "")
-    # The address of a page, whose folder no other user can read: all users see a browser's arguments.
+    # The address of a page, whose folder no other user can read: all users see a browser's
+    # arguments.
     assert f'content="0; url={out.split()[0]}"' in opened[0]
     assert modes == [0o700]

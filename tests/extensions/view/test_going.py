@@ -21,7 +21,8 @@ from harness.report.library import digest
 from harness.runs.unfinished import Extent, extent
 
 BEGUN = (
-    '{"created": "2026-01-03T12:00:00+00:00", "tags": [], "settings": {"model": {"name": "m"}, "answer": '
+    '{"created": "2026-01-03T12:00:00+00:00", "tags": [], "settings": {"model": {"name": "m"}, '
+    '"answer": '
     '"json", "prompt": {"version": "v2"}, "world": {"kind": "frozen", "episodes": 3}}}'
 )
 Look = tuple[Extent, str, dict[str, Any]]
@@ -29,14 +30,20 @@ Look = tuple[Extent, str, dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def seen(made: Path, small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Look]:
-    """What is seen of a real run at each answer and after it: its extent, the list, what changes in it."""
+    """What is seen of a real run at each answer and after it:
+    its extent, the list, what changes in it.
+    """
     reports = Path(shutil.copytree(made, tmp_path_factory.mktemp("going") / "reports"))
     client = visitor(reports)
-    spec = spec_of(small, points=(POINTS["single-local"], POINTS["6g"]), tag=("slow",), batch_size=1)
+    spec = spec_of(
+        small, points=(POINTS["single-local"], POINTS["6g"]), tag=("slow",), batch_size=1
+    )
     looks = []
 
     def look(done: int) -> None:
-        looks.append((extent(reports / "now"), client.get("/").text, client.get("/progress").json()))
+        looks.append(
+            (extent(reports / "now"), client.get("/").text, client.get("/progress").json())
+        )
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "TREES_AT_ONCE", 2)
@@ -53,14 +60,18 @@ def test_the_list_says_how_far_a_run_is_while_it_goes_on(seen: list[Look]) -> No
     assert all(each.going and each.due == 4 for each in extents)
     assert {each.done for each in extents} >= {0, 2}
     assert [each.done for each in extents] == sorted(each.done for each in extents)
-    assert max(each.answers for each in extents) > 1, "answers are counted before their episodes end"
+    assert max(each.answers for each in extents) > 1, (
+        "answers are counted before their episodes end"
+    )
     for each, page, then in looks:
         text = then["unfinished"]["now"]
         assert text.startswith(f"going on now: {each.done} of 4 episodes")
         assert f'unfinished</strong> <small data-run="now">{text}</small>' in page
         assert then["going"]
     assert (now["going"], now["unfinished"]) == (False, {})
-    assert now["listed"] != looks[-1][2]["listed"] == looks[0][2]["listed"], "it changes once a run ends"
+    assert now["listed"] != looks[-1][2]["listed"] == looks[0][2]["listed"], (
+        "it changes once a run ends"
+    )
 
 
 @pytest.mark.slow
@@ -95,11 +106,17 @@ def test_a_stopped_run_keeps_its_count_and_a_shard_has_none_to_reach(reports: Pa
     (work / "episodes-000001-000002/episodes.csv").write_text("")
     (work / "episodes-000010-000019.jsonl").write_text('{"id": 1}\n{"id": 2}\n{"torn')
     (work / "config.json").write_text('{"shard": "1/2", "settings": {"world": {"episodes": 40}}}')
-    assert extent(reports / "begun") == Extent(going=False, done=3, due=None, early=False, answers=2)
+    assert extent(reports / "begun") == Extent(
+        going=False, done=3, due=None, early=False, answers=2
+    )
 
 
-@pytest.mark.parametrize("config", ["", "[]", '{"settings": 1}', '{"settings": {"world": {"episodes": []}}}'])
-def test_what_is_broken_or_a_link_counts_as_not_done(config: str, reports: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "config", ["", "[]", '{"settings": 1}', '{"settings": {"world": {"episodes": []}}}']
+)
+def test_what_is_broken_or_a_link_counts_as_not_done(
+    config: str, reports: Path, tmp_path: Path
+) -> None:
     work = reports / "begun/.work"
     (work / "episodes-000000-000001").mkdir(parents=True)
     (work / "config.json").write_text(config)
@@ -107,16 +124,22 @@ def test_what_is_broken_or_a_link_counts_as_not_done(config: str, reports: Path,
     os.symlink(tmp_path / "secret/rows", work / "answers.jsonl")
     os.symlink(tmp_path / "secret/rows", work / "episodes-000000-000001/episodes.csv")
     os.mkfifo(work / "lock")
-    assert extent(reports / "begun") == Extent(going=False, done=0, due=None, early=False, answers=0)
+    assert extent(reports / "begun") == Extent(
+        going=False, done=0, due=None, early=False, answers=0
+    )
     shutil.move(work, tmp_path / "elsewhere")
     work.symlink_to(tmp_path / "elsewhere")
-    assert extent(reports / "begun") == Extent(going=False, done=0, due=None, early=False, answers=0)
+    assert extent(reports / "begun") == Extent(
+        going=False, done=0, due=None, early=False, answers=0
+    )
 
 
 def test_a_run_that_may_stop_early_has_that_many_at_most(reports: Path) -> None:
     work = reports / "begun/.work"
     work.mkdir(parents=True)
-    (work / "config.json").write_text('{"settings": {"world": {"episodes": 40, "looks": {"width": 0.1}}}}')
+    (work / "config.json").write_text(
+        '{"settings": {"world": {"episodes": 40, "looks": {"width": 0.1}}}}'
+    )
     assert extent(reports / "begun") == Extent(going=False, done=0, due=40, early=True, answers=0)
 
 
@@ -126,7 +149,9 @@ def test_episodes_that_are_driven_are_counted_as_they_end(
 ) -> None:
     monkeypatch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
     seen, spec = [], live_spec_of("cruise", 3, points=(POINTS["6g"],), batch_size=1)
-    evaluation.evaluate(spec, reports / "now", lambda done: seen.append(extent(reports / "now").done))
+    evaluation.evaluate(
+        spec, reports / "now", lambda done: seen.append(extent(reports / "now").done)
+    )
     assert seen == [1, 2, 3]
 
 

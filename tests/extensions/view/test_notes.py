@@ -37,7 +37,9 @@ def scene(reports: Path) -> str:
 def test_a_note_stays_with_its_run_and_stands_on_its_page(
     client: TestClient, reports: Path, scene: str
 ) -> None:
-    written = client.post("/notes", data=form(scene, " it brakes <b>late</b>\r\nhere "), headers=HERE)
+    written = client.post(
+        "/notes", data=form(scene, " it brakes <b>late</b>\r\nhere "), headers=HERE
+    )
     assert (written.status_code, written.url.path) == (200, "/notes")
     assert "it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in written.text
     [note] = notes(reports / "first")
@@ -46,7 +48,9 @@ def test_a_note_stays_with_its_run_and_stands_on_its_page(
     page = render(gather([reports / "first"]))
     assert f">{scene}</a>: it brakes &lt;b&gt;late&lt;/b&gt;\nhere</p>" in page
     assert "Noted on" not in render(gather([reports / "second"]))
-    assert f'name="before" value="{note.date}"' in client.get(f"/notes?path=first&scene={scene}").text
+    assert (
+        f'name="before" value="{note.date}"' in client.get(f"/notes?path=first&scene={scene}").text
+    )
     client.post("/notes", data=form(scene, "once more", before=note.date), headers=HERE)
     [note] = notes(reports / "first")
     assert note.text == "once more"
@@ -104,7 +108,9 @@ def test_without_the_token_no_note_is_written(
 
 def test_a_browser_says_which_site_sends_the_form(client: TestClient) -> None:
     answer = client.get("/notes?path=first")
-    assert answer.headers["referrer-policy"] == "same-origin", "without it a browser sends `Origin: null`"
+    assert answer.headers["referrer-policy"] == "same-origin", (
+        "without it a browser sends `Origin: null`"
+    )
     assert "form-action 'self'" in answer.headers["content-security-policy"]
 
 
@@ -142,7 +148,9 @@ def test_a_run_has_so_many_notes_and_no_more(client: TestClient, reports: Path, 
     full = [{"scene": f"s{n:04d}", "text": "x", "date": ""} for n in range(MOST)]
     (reports / "first/notes.json").write_text(json.dumps(full))
     assert said(client.post("/notes", data=form(scene, "x"), headers=HERE)).startswith("a note has")
-    assert "Noted on" not in render(gather([reports / "first"])), "they are on no decision point of the run"
+    assert "Noted on" not in render(gather([reports / "first"])), (
+        "they are on no decision point of the run"
+    )
 
 
 def test_a_link_in_the_place_of_notes_is_neither_read_nor_written_through(
@@ -168,7 +176,9 @@ def test_broken_notes_are_one_line(text: str, client: TestClient, reports: Path)
 def posted(receive: Callable[[], Awaitable[Any]]) -> Request:
     """A note that is being sent."""
     headers = [(b"origin", b"x")]
-    return Request({"type": "http", "method": "POST", "path": "/notes", "headers": headers}, receive)
+    return Request(
+        {"type": "http", "method": "POST", "path": "/notes", "headers": headers}, receive
+    )
 
 
 def test_a_browser_that_leaves_while_it_sends_a_note_is_no_bug(reports: Path) -> None:
@@ -183,7 +193,9 @@ def test_a_browser_that_leaves_while_it_sends_a_note_is_no_bug(reports: Path) ->
     assert not (reports / "first/notes.json").exists()
 
 
-def test_a_note_that_never_comes_is_not_waited_for(reports: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_note_that_never_comes_is_not_waited_for(
+    reports: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def receive() -> dict[str, object]:
         await asyncio.sleep(60)
         return {}

@@ -1,4 +1,6 @@
-"""What `harness view` keeps to itself: files outside its folder, hidden ones, and all of it from others."""
+"""What `harness view` keeps to itself:
+files outside its folder, hidden ones, and all of it from others.
+"""
 
 import os
 import shutil
@@ -43,7 +45,9 @@ def hiding(reports: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def kept_hiding(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As `hiding`, for tests that change nothing of it; with pictures that are none of the study's."""
+    """As `hiding`, for tests that change nothing of it;
+    with pictures that are none of the study's.
+    """
     kept = hide(laid_out(made, tmp_path_factory.mktemp("hiding")))
     study = kept / "first/sweep-tau"
     (study / "lent.svg").symlink_to(kept.parent / "secret/sweep.svg")
@@ -158,7 +162,9 @@ def test_links_that_lead_out_are_not_followed(client: TestClient, reports: Path)
     assert "This folder has no page and no picture to show" in client.get("/run?path=paper").text
 
 
-def test_links_within_are_followed_but_not_to_what_is_hidden(client: TestClient, hiding: Path) -> None:
+def test_links_within_are_followed_but_not_to_what_is_hidden(
+    client: TestClient, hiding: Path
+) -> None:
     (hiding / "latest").symlink_to(hiding / "first")
     (hiding / "shown").symlink_to(hiding / ".hidden")
     assert client.get("/run?path=latest").status_code == 200
@@ -169,7 +175,14 @@ def test_links_within_are_followed_but_not_to_what_is_hidden(client: TestClient,
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example", "evil.example:7654", "127.0.0.1.evil.example", "", "[::1]:7654", "0.0.0.0:7654"],
+    [
+        "evil.example",
+        "evil.example:7654",
+        "127.0.0.1.evil.example",
+        "",
+        "[::1]:7654",
+        "0.0.0.0:7654",
+    ],
 )
 def test_only_this_machines_own_names_are_answered(host: str, reader: TestClient) -> None:
     answer = reader.get("/", headers={"host": host})
@@ -181,7 +194,9 @@ def test_both_names_of_this_machine_are_answered(host: str, reader: TestClient) 
     assert reader.get("/", headers={"host": host}).status_code == 200
 
 
-@pytest.mark.parametrize("page", ["/", "/run?path=first", "/picture", "/compare", "/report", "/progress"])
+@pytest.mark.parametrize(
+    "page", ["/", "/run?path=first", "/picture", "/compare", "/report", "/progress"]
+)
 def test_nothing_can_be_sent_to_it(page: str, reader: TestClient) -> None:
     for method in ("POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"):
         assert reader.request(method, page).status_code == 405
@@ -194,7 +209,9 @@ def test_nothing_can_be_sent_to_it(page: str, reader: TestClient) -> None:
     [("/", 200), ("/progress", 200), ("/style.css", 200), ("/run?path=first/sweep-tau", 200),
      ("/run?path=nowhere", 404), ("/nowhere", 404), ("/compare", 400)],
 )  # fmt: skip
-def test_every_page_of_the_list_has_the_strict_policy(page: str, status: int, reader: TestClient) -> None:
+def test_every_page_of_the_list_has_the_strict_policy(
+    page: str, status: int, reader: TestClient
+) -> None:
     answers = [reader.get(page)]
     assert answers[0].status_code == status
     answers += [reader.post(page), reader.get(page, headers={"host": "evil.example"})]
@@ -219,7 +236,11 @@ def test_what_a_run_holds_is_shown_in_a_sandbox(page: str, reader: TestClient) -
     assert "default-src 'none'" in policy
     [sandbox] = [rule for rule in policy if rule.startswith("sandbox")]
     assert "allow-same-origin" not in sandbox
-    assert ("allow-scripts" in sandbox) is ("script-src 'unsafe-inline'" in policy) is ("picture" not in page)
+    assert (
+        ("allow-scripts" in sandbox)
+        is ("script-src 'unsafe-inline'" in policy)
+        is ("picture" not in page)
+    )
     assert answer.headers["cross-origin-opener-policy"] == "unsafe-none", (
         "browsers show nothing else sandboxed"
     )

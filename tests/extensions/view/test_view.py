@@ -21,7 +21,9 @@ from harness.extensions.view.app import View
 from harness.runs.folder import read
 
 
-def test_the_list_tells_finished_unfinished_and_broken_runs_apart(client: TestClient, reports: Path) -> None:
+def test_the_list_tells_finished_unfinished_and_broken_runs_apart(
+    client: TestClient, reports: Path
+) -> None:
     manifest = json.loads((reports / "second/run.json").read_text())
     (reports / "killed/.work").mkdir(parents=True)
     begun = {"created": manifest["created"], "settings": manifest, "tags": ["half"]}
@@ -34,7 +36,10 @@ def test_the_list_tells_finished_unfinished_and_broken_runs_apart(client: TestCl
     assert picked == {"first", "second"}
     assert opened == {"first", "second", "first%2Fsweep-tau"}
     rows = {name: row for row in re.findall("<tr class.*?</tr>", page, re.S) for name in names(row)}
-    assert all(word in rows["first"] for word in ("tag of first", "proxy", "v2", "json", "2026-01-01", " %"))
+    assert all(
+        word in rows["first"]
+        for word in ("tag of first", "proxy", "v2", "json", "2026-01-01", " %")
+    )
     shown = 'unfinished</strong> <small data-run="killed">stopped: 0 of '
     assert shown in rows["killed"]
     assert "the same command continues it" in rows["killed"]
@@ -77,7 +82,9 @@ def test_a_click_on_a_head_turns_the_order_around_and_keeps_the_filter(client: T
 
 
 @pytest.mark.slow
-def test_a_run_opens_with_its_report_unless_that_is_older(client: TestClient, reports: Path) -> None:
+def test_a_run_opens_with_its_report_unless_that_is_older(
+    client: TestClient, reports: Path
+) -> None:
     report = reports / "first/report.html"
     shown = pages.with_way_back(report.read_text(), [("Notes", "/notes?path=first")])
     assert client.get("/run?path=first").text == shown
@@ -90,7 +97,9 @@ def test_a_run_opens_with_its_report_unless_that_is_older(client: TestClient, re
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("address", ["/run?path=first", "/run?path=second", "/report?path=first&path=second"])
+@pytest.mark.parametrize(
+    "address", ["/run?path=first", "/run?path=second", "/report?path=first&path=second"]
+)
 def test_one_decision_opens_with_what_its_page_leaves_out(
     address: str, client: TestClient, reports: Path
 ) -> None:
@@ -101,7 +110,9 @@ def test_one_decision_opens_with_what_its_page_leaves_out(
     assert re.sub(links, "", client.get(address).text) == without
     detail = json.loads(packed(whole, "opened"))[scene]
     assert list(detail["cameras"]) == list(detail["world"]["viewers"])
-    assert all(detail["prompts"][a["prompt"]] for run in detail["runs"] if run for a in run["answers"])
+    assert all(
+        detail["prompts"][a["prompt"]] for run in detail["runs"] if run for a in run["answers"]
+    )
     refused = client.get(f"{address}&scene=none")
     assert (refused.status_code, "no run here has a decision none" in refused.text) == (400, True)
 
@@ -109,7 +120,9 @@ def test_one_decision_opens_with_what_its_page_leaves_out(
 def test_a_study_opens_with_its_page_or_its_pictures(client: TestClient, reports: Path) -> None:
     page = client.get("/run?path=first/sweep-tau").text
     pictures = re.findall(r'<img src="(/picture[^"]+)"', page)
-    assert [link.rpartition("=")[2] for link in pictures] == ["more.png", "sweep.svg"], "one of each figure"
+    assert [link.rpartition("=")[2] for link in pictures] == ["more.png", "sweep.svg"], (
+        "one of each figure"
+    )
     found = client.get(pictures[1].replace("&amp;", "&"))
     assert (found.text, found.headers["content-type"]) == ("<svg>sweep.svg</svg>", "image/svg+xml")
     (reports / "paper").mkdir()
@@ -127,9 +140,13 @@ def test_two_runs_are_compared_and_the_older_is_a(client: TestClient) -> None:
 
 
 @pytest.mark.slow
-def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(client: TestClient) -> None:
+def test_a_comparison_leads_to_the_same_with_a_and_b_swapped_and_to_all_answers(
+    client: TestClient,
+) -> None:
     page = client.get("/compare?path=first&path=second").text
-    links = {text: unescape(href) for href, text in re.findall('<a href="([^"]+)">([^<]+)</a>', page)}
+    links = {
+        text: unescape(href) for href, text in re.findall('<a href="([^"]+)">([^<]+)</a>', page)
+    }
     swapped = client.get(links["Swap A and B"]).text
     assert "A: cruise · prompt v2 · json<br>B: proxy · prompt v2 · json" in swapped
     assert 'href="/compare?path=second&amp;path=first&amp;a=first">Swap A and B' in swapped
@@ -188,12 +205,18 @@ def test_a_report_is_of_what_is_picked(client: TestClient) -> None:
         ("/compare", "0 runs are picked; pick two to compare them"),
         ("/compare?path=first", "1 runs are picked; pick two to compare them"),
         ("/compare?path=first&path=first", "1 runs are picked"),
-        ("/compare?path=first&path=first/sweep-tau", "first/sweep-tau is no finished run of a model"),
+        (
+            "/compare?path=first&path=first/sweep-tau",
+            "first/sweep-tau is no finished run of a model",
+        ),
         ("/compare?path=first&path=killed", "killed is no finished run of a model; pick others"),
         pytest.param("/compare?path=first&path=other", "first and ", marks=pytest.mark.slow),
         ("/report", "no run is picked"),
         pytest.param("/report?path=first&path=other", "first and ", marks=pytest.mark.slow),
-        ("/run?path=killed", "killed is unfinished (the same command continues it); it has no page yet"),
+        (
+            "/run?path=killed",
+            "killed is unfinished (the same command continues it); it has no page yet",
+        ),
         ("/run?path=cut", "cut has no decisions.parquet of its own; make the run again"),
         ("/run?path=garbled", "decisions.parquet is broken ("),
     ],
@@ -223,7 +246,10 @@ def test_a_bug_is_a_page_too_and_the_terminal_has_its_trace(
 ) -> None:
     monkeypatch.setattr(pages, "report", lambda *_: 1 / 0)
     answer = client.get("/report?path=second")
-    assert (answer.status_code, said(answer)) == (500, "this page cannot be made; the terminal says why")
+    assert (answer.status_code, said(answer)) == (
+        500,
+        "this page cannot be made; the terminal says why",
+    )
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
@@ -250,7 +276,9 @@ def test_hostile_text_stays_text(client: TestClient, reports: Path) -> None:
     assert "⟨U+202E⟩gat" in page
     [link] = re.findall(r'href="(/run\?path=%3Cimg[^"]+)"', listed)
     assert client.get(link).status_code == 200
-    [value] = [a["value"] for tag, a in tags if a.get("type") == "checkbox" and a["value"] != "first"]
+    [value] = [
+        a["value"] for tag, a in tags if a.get("type") == "checkbox" and a["value"] != "first"
+    ]
     assert value == name
     assert client.get("/report", params={"path": value}).status_code == 200
 
@@ -279,7 +307,9 @@ def test_a_long_report_does_not_keep_the_list_waiting(
     monkeypatch.setattr(pages, "report", slow)
     answers: list[str] = []
     with client:
-        drawing = threading.Thread(target=lambda: answers.append(client.get("/report?path=second").text))
+        drawing = threading.Thread(
+            target=lambda: answers.append(client.get("/report?path=second").text)
+        )
         drawing.start()
         assert begun.wait(60)
         assert "tag of first" in client.get("/").text
@@ -294,7 +324,9 @@ def test_it_works_without_scripts_and_from_the_keyboard(client: TestClient) -> N
         page = client.get(address).text
         assert "<script" not in page
         assert not re.search(r"\son\w+=|style=|tabindex", page)
-        assert not re.findall(r'(?:href|src|action)="(?!/|data:,)', page), "nothing is fetched from elsewhere"
+        assert not re.findall(r'(?:href|src|action)="(?!/|data:,)', page), (
+            "nothing is fetched from elsewhere"
+        )
     page = client.get("/").text
     labelled = re.findall(r'<label for="(\w+)"', page)
     assert labelled == ["q"]

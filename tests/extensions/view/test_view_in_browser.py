@@ -1,4 +1,6 @@
-"""`harness view` in a real browser: what is picked is compared, and a run's page works in its sandbox."""
+"""`harness view` in a real browser: what is picked is compared,
+and a run's page works in its sandbox.
+"""
 
 import re
 import shutil
@@ -47,7 +49,8 @@ def address(folder):
     command = [sys.executable, "-m", "harness", "view", str(folder), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
-            yield process.stdout.readline().split()[0]  # with its token, as whoever ran it copies it
+            # with its token, as whoever ran it copies it
+            yield process.stdout.readline().split()[0]
         finally:
             process.kill()
 
@@ -145,9 +148,14 @@ def test_links_lead_out_of_a_sandbox_and_the_token_stays_out_of_addresses(page, 
     page.get_by_role("link", name="All runs").focus()
     page.keyboard.press("Enter")
     page.wait_for_url(list_of_runs)
-    for path in ("run?path=first", "report?path=first&path=second", "compare?path=first&path=second"):
+    for path in (
+        "run?path=first",
+        "report?path=first&path=second",
+        "compare?path=first&path=second",
+    ):
         page.goto(f"{list_of_runs}{path}")
-        page.get_by_role("link", name="All runs").click(timeout=5000)  # fails if something lies over it
+        # fails if something lies over it
+        page.get_by_role("link", name="All runs").click(timeout=5000)
         page.wait_for_url(list_of_runs)
     assert page.locator("tbody th").count() == 3
     page.reload()

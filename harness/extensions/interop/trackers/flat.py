@@ -14,7 +14,9 @@ _TABLES = ("channels", "networks", "schedules", "kept")  # of which a condition 
 
 
 def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
-    """Return a run's settings by dotted names, without those that have no value; conditions by name."""
+    """Return a run's settings by dotted names, without those that have no value;
+    conditions by name.
+    """
     conditions = [point["name"] for point in settings["conditions"]]
     some = {name: value for name, value in settings.items() if name not in _TABLES}
     return dict(_leaves({**some, "conditions": conditions}, ""))
@@ -31,7 +33,9 @@ def _leaves(table: Mapping[str, Any], above: str) -> Iterator[tuple[str, str | i
 
 
 def figures(done: "Evaluated") -> dict[str, float]:
-    """Return figures: `CONDITION/METRIC`, with the ends of its 95 % interval and its n behind a dot."""
+    """Return figures: `CONDITION/METRIC`,
+    with the ends of its 95 % interval and its n behind a dot.
+    """
     named: dict[str, float | None] = {}
     for score in (score for score in done.scores if score.interval != "seed means"):
         name = f"{score.condition}/{score.metric}"

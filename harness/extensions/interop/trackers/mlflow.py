@@ -1,4 +1,6 @@
-"""Runs in MLflow, at `MLFLOW_TRACKING_URI`: settings as parameters, figures as metrics, the page as well."""
+"""Runs in MLflow, at `MLFLOW_TRACKING_URI`:
+settings as parameters, figures as metrics, the page as well.
+"""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,6 @@
-"""Runs in Weights & Biases, where its own variables say: `WANDB_PROJECT`, `WANDB_MODE`, `WANDB_API_KEY`."""
+"""Runs in Weights & Biases, where its own variables say:
+`WANDB_PROJECT`, `WANDB_MODE`, `WANDB_API_KEY`.
+"""
 
 import os
 from collections.abc import Mapping

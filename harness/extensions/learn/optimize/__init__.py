@@ -1,1 +1,3 @@
-"""`harness prompt optimize`: search the wording of a prompt on tune layouts, certify it on report layouts."""
+"""`harness prompt optimize`: search the wording of a prompt on tune layouts,
+certify it on report layouts.
+"""

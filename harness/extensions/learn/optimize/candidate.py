@@ -1,4 +1,6 @@
-"""A prompt with something of its text chosen or rewritten, as a version that can be written to a folder."""
+"""A prompt with something of its text chosen or rewritten,
+as a version that can be written to a folder.
+"""
 
 import json
 import re
@@ -47,23 +49,31 @@ def space(prompt: Prompt) -> dict[str, int]:
 
 
 def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
-    """Return a prompt with alternatives chosen by number, from 0. Raises UserError if its files are wrong."""
+    """Return a prompt with alternatives chosen by number, from 0.
+    Raises UserError if its files are wrong.
+    """
     sizes = space(base)
     changes = ", ".join(f"{name} {n + 1} of {sizes[name]}" for name, n in choice.items() if n)
     files = {**base.files, **{f"{role}.j2": resolved(base.texts[role], choice) for role in ROLES}}
     if base.example_sets:
-        examples = read_examples(files.pop(EXAMPLES), EXAMPLES).only(base.example_sets[choice.get(SETS, 0)])
+        examples = read_examples(files.pop(EXAMPLES), EXAMPLES).only(
+            base.example_sets[choice.get(SETS, 0)]
+        )
         files |= {EXAMPLES: text_of(examples)} if examples else {}
     return _candidate(base, files, changes or "first alternatives")
 
 
 def systems(base: Prompt) -> dict[str, str]:
     """Return the text of each role's block `system`, with its first alternatives."""
-    return {role: match[2] for role in ROLES if (match := SYSTEM.search(resolved(base.texts[role])))}
+    return {
+        role: match[2] for role in ROLES if (match := SYSTEM.search(resolved(base.texts[role])))
+    }
 
 
 def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
-    """Return a prompt with some roles' blocks `system` rewritten. Raises UserError if its files are wrong."""
+    """Return a prompt with some roles' blocks `system` rewritten.
+    Raises UserError if its files are wrong.
+    """
     first, own = chosen(base), systems(base)
     files = dict(first.prompt.files)
     for role, text in texts.items():
@@ -75,7 +85,10 @@ def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
     new = {role: text for role, text in texts.items() if text != own[role]}
     if not new:
         return first
-    what = f"system text {sha256_bytes(canonical_json(new).encode())[:8]} of the {' and the '.join(new)}"
+    what = (
+        f"system text {sha256_bytes(canonical_json(new).encode())[:8]} of the "
+        f"{' and the '.join(new)}"
+    )
     return replace(_candidate(base, files, what), rewritten=new)
 
 
@@ -98,6 +111,10 @@ def _toml(value: Any) -> str:
 def write(candidate: Candidate, folder: Path, more: Mapping[str, str]) -> None:
     """Write a version's files, and beside them others that are not part of its digest."""
     folder.mkdir(parents=True, exist_ok=True)
-    ordered: Sequence[str] = [*more, *(name for name in candidate.prompt.files if name != PROMPT), PROMPT]
+    ordered: Sequence[str] = [
+        *more,
+        *(name for name in candidate.prompt.files if name != PROMPT),
+        PROMPT,
+    ]
     for name in ordered:  # prompt.toml last: without it, there is no version
         write_whole(folder / name, more.get(name) or candidate.prompt.files[name])

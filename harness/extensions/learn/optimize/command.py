@@ -1,4 +1,6 @@
-"""`harness prompt optimize`: search the wording of a prompt on tune seeds, certify it on report seeds."""
+"""`harness prompt optimize`: search the wording of a prompt on tune seeds,
+certify it on report seeds.
+"""
 
 import re
 import shlex
@@ -33,7 +35,8 @@ CONDITION = "single-local"
 SAMPLE = 4  # layouts of a family that a dry run counts on
 HELP = {
     "prompt": "Prompt version to start from. Default: the scenario's usual one.",
-    "dataset": "Dataset of report layouts to certify on, or suite:NAME for several families at once.",
+    "dataset": "Dataset of report layouts to certify on, or "
+    "suite:NAME for several families at once.",
     "condition": "Operating point to search under, one. Default: single-local.",
 }
 
@@ -52,10 +55,13 @@ def command(
     ),
     reflect: str | None = typer.Option(
         None,
-        help="Model that rewrites the system text by what went wrong (GEPA), such as a served one. Default: "
+        help="Model that rewrites the system text by what went wrong (GEPA), such as a served one. "
+        "Default: "
         "the search chooses among the alternatives that the prompt marks.",
     ),
-    folder: Path | None = typer.Option(None, help="Folder to write the search to. Default: reports/NAME."),
+    folder: Path | None = typer.Option(
+        None, help="Folder to write the search to. Default: reports/NAME."
+    ),
     workers: options.Workers = "2",
     no_cache: options.NoCache = False,
     dry_run: bool = typer.Option(
@@ -70,8 +76,8 @@ def command(
 ) -> None:
     """Search the wording of a prompt, and certify the winner.
 
-    It searches on tune seeds, and asks once on report seeds whether the winner is better than what it came
-    from. If the search is stopped, the same command continues it.
+    It searches on tune seeds, and asks once on report seeds whether the winner is better than what
+    it came from. If the search is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
@@ -100,11 +106,18 @@ def command(
     silent, who = as_json or quiet, options.workers_of(workers)
     engine_name = f"GEPA with {reflect}" if reflect else "alternatives"
     if dry_run:
-        with TemporaryDirectory() as place, bar("freezing a few tune layouts", quiet=silent) as progress:
-            few = own or built(scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress)
+        with (
+            TemporaryDirectory() as place,
+            bar("freezing a few tune layouts", quiet=silent) as progress,
+        ):
+            few = own or built(
+                scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress
+            )
             specs = [resolve.spec(settings, source) for source in few]
-            episodes = [min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
-                        for manifest, _ in manifests]  # fmt: skip
+            episodes = [
+                min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
+                for manifest, _ in manifests
+            ]
             asks = counted(specs, sizes, budget, 0 if own else layouts, episodes, tokenizer)
         if as_json:
             echo_json(asks)
@@ -115,11 +128,15 @@ def command(
     _check_name(out, (where / WORK).is_dir())
     begins = work.WorkStart(
         settings={
-            "version": out, "budget": budget, "engine": engine_name, "prompt_sha256": base.sha256,
+            "version": out,
+            "budget": budget,
+            "engine": engine_name,
+            "prompt_sha256": base.sha256,
             "tune": [source.dataset.sha256 for source in own] or [layouts, first_seed],
-            "report": [sha256 for _, sha256 in manifests], "evaluation": to_builtins(settings),
+            "report": [sha256 for _, sha256 in manifests],
+            "evaluation": to_builtins(settings),
         }
-    )  # fmt: skip
+    )
     if begun := work.begun(where, work.WorkStart):
         work.same(where, begins.settings, begun.settings)
     cache, label = None if no_cache else default_file(), f"asking {printable(settings.model, 30)}"
@@ -130,10 +147,20 @@ def command(
         sources = own or built(scenarios, place, layouts, first_seed, who, progress)
         specs = [resolve.spec(settings, source) for source in sources]
         plan = Search(
-            base, specs, partial(_report, settings, names, sources), budget, out, Path("prompts"),
-            engine_name, shlex.join(["harness", *sys.argv[1:]]),
-        )  # fmt: skip
-        engine = _reflecting(reflect, specs[0], place, begins.settings) if reflect else engines.alternatives
+            base,
+            specs,
+            partial(_report, settings, names, sources),
+            budget,
+            out,
+            Path("prompts"),
+            engine_name,
+            shlex.join(["harness", *sys.argv[1:]]),
+        )
+        engine = (
+            _reflecting(reflect, specs[0], place, begins.settings)
+            if reflect
+            else engines.alternatives
+        )
         study = search(plan, engine, where, place, open_backend, progress, cache)
     finish(study, where, as_json, quiet)
     if not silent and Path("prompts", out).is_dir():
@@ -141,8 +168,12 @@ def command(
     work.tidy(where)
 
 
-def _report(settings: Settings, names: Sequence[str], tune: "Sequence[FrozenSource]") -> "list[Spec]":
-    """Return what certifies. Raises UserError if it has a layout that was tuned on, under other seeds."""
+def _report(
+    settings: Settings, names: Sequence[str], tune: "Sequence[FrozenSource]"
+) -> "list[Spec]":
+    """Return what certifies. Raises UserError if it has a layout that was tuned on,
+    under other seeds.
+    """
     from harness.dataset import rebuilt
     from harness.evaluate import resolve
 
@@ -153,13 +184,17 @@ def _report(settings: Settings, names: Sequence[str], tune: "Sequence[FrozenSour
 
 
 def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "Prompt":
-    """Return the version to start from. Raises UserError for what can be told to be wrong before any work."""
+    """Return the version to start from.
+    Raises UserError for what can be told to be wrong before any work.
+    """
     from harness.evaluate import resolve
     from harness.evaluate.latency import MEASURED
     from harness.prompts.versions import unfit
 
     if budget < 1:
-        raise UserError(f"--budget {budget}: give the most questions that the search may ask, 1 or more")
+        raise UserError(
+            f"--budget {budget}: give the most questions that the search may ask, 1 or more"
+        )
     if len(points := resolve.points(settings.condition, settings.control, settings.attack)) != 1:
         names = " ".join(point.name for point in points)
         raise UserError(f"--condition {printable(names)}: a prompt is searched under one; give one")
@@ -168,7 +203,8 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
     ego, _ = resolve.agents(settings, scenarios[0])
     if not ego.can.language_model:
         raise UserError(
-            f"--model {printable(ego.card.name)}: it reads the scene and no prompt, so that no wording "
+            f"--model {printable(ego.card.name)}: it reads the scene and no prompt, so that no "
+            "wording "
             "changes what it does; give a language model (`harness model list`)"
         )
     for scenario in scenarios:
@@ -206,15 +242,18 @@ def _show_counted(counted: dict[str, Any], engine: str) -> None:
     if counted["choices"]:
         marks = ", ".join(f"{name} ({n})" for name, n in counted["choices"].items())
         typer.echo(
-            f"{marks}: {counted['wordings']} wordings, {counted['wordings_in_a_round']} of them in a "
+            f"{marks}: {counted['wordings']} wordings, {counted['wordings_in_a_round']} of them in "
+            "a "
             "round of the search"
         )
     typer.echo(
-        f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes up to "
+        f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes up "
+        "to "
         f"{counted['questions_a_wording']} on the tune layouts"
     )
     typer.echo(
-        f"certificate: up to {counted['certificate_questions']} questions on report layouts, both prompts"
+        f"certificate: up to {counted['certificate_questions']} questions on report layouts, both "
+        "prompts"
     )
     for each in counted["prompt_tokens"]:
         echo_prompt_tokens(each)

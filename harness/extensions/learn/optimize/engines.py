@@ -37,15 +37,15 @@ These are some of its decisions, and what each action would have been worth:
 <side_info>
 
 Write a better template of the system message. Keep what stands in {{ }} and {% %} as it is, and leave the \
-form of the answer alone, which is asked for elsewhere. Write only the template, between ``` and ```."""
+form of the answer alone, which is asked for elsewhere. Write only the template, between ``` and ```."""  # noqa: E501
 
 
 def alternatives(tuning: Tuning) -> None:
     """Search the marked alternatives by coordinate descent.
 
-    Each alternative of each choice is played with the best of the others, first on half of the layouts, and
-    on the rest if it is not worse there. The best stays; it ends when a round over all choices changes
-    nothing.
+    Each alternative of each choice is played with the best of the others, first on half of the
+    layouts, and on the rest if it is not worse there. The best stays; it ends when a round over all
+    choices changes nothing.
     """
     base = tuning.base
     sizes = space(base)
@@ -69,14 +69,21 @@ def _better(tuning: Tuning, new: Candidate, old: Candidate) -> bool:
 class Reflecting:
     """The engine of GEPA, with a model that reads what went wrong and writes system messages anew.
 
-    Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs the loop. All that it draws is
-    seeded, and what the model wrote is kept, so that a stopped search goes on by beginning again.
+    Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs the loop. All that it
+    draws is seeded, and what the model wrote is kept, so that a stopped search goes on by beginning
+    again.
     """
 
     def __init__(
-        self, asked: Callable[[str], str], kept: Path, settings: Mapping[str, Any], roles: Sequence[str]
+        self,
+        asked: Callable[[str], str],
+        kept: Path,
+        settings: Mapping[str, Any],
+        roles: Sequence[str],
     ):
-        """`asked` is the model; `kept` the file of what it wrote so far in a search of these settings."""
+        """`asked` is the model; `kept` the file of what it wrote so far in a search of these
+        settings.
+        """
         self._asked, self._roles = asked, roles
         self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()))
         self.replies = 0
@@ -88,12 +95,19 @@ class Reflecting:
         own = systems(tuning.base)
         with strangers("gepa"):
             gepa.optimize(
-                {role: own[role] for role in self._roles if role in own}, trainset=layouts, valset=layouts,
-                adapter=adapter, reflection_lm=lambda prompt: self._reply(str(prompt), adapter),
-                reflection_prompt_template=ASKED, reflection_minibatch_size=min(BATCH, len(layouts)),
-                stop_callbacks=adapter.over, skip_perfect_score=False, seed=GEPA_SEED, logger=_Silent(),
+                {role: own[role] for role in self._roles if role in own},
+                trainset=layouts,
+                valset=layouts,
+                adapter=adapter,
+                reflection_lm=lambda prompt: self._reply(str(prompt), adapter),
+                reflection_prompt_template=ASKED,
+                reflection_minibatch_size=min(BATCH, len(layouts)),
+                stop_callbacks=adapter.over,
+                skip_perfect_score=False,
+                seed=GEPA_SEED,
+                logger=_Silent(),
                 raise_on_exception=False,
-            )  # fmt: skip
+            )
         if adapter.error and not isinstance(adapter.error, Spent):
             raise adapter.error
 
@@ -108,7 +122,9 @@ class Reflecting:
 
 
 def asked_of(backend: Backend) -> Callable[[str], str]:
-    """Return a model as a function from a question to its answer. It raises Unanswered if there is none."""
+    """Return a model as a function from a question to its answer.
+    It raises Unanswered if there is none.
+    """
 
     def asked(prompt: str) -> str:
         request = Request(
@@ -143,7 +159,9 @@ class _Adapter:
         self._still, self._spent = 0, -1
 
     def over(self, state: Any) -> bool:
-        """Return whether the search is to end: the budget is spent, something failed, or nothing is new."""
+        """Return whether the search is to end:
+        the budget is spent, something failed, or nothing is new.
+        """
         self._still = self._still + 1 if self._tuning.spent == self._spent else 0
         self._spent = self._tuning.spent
         return self.error is not None or self._still > self.IDLE
@@ -167,22 +185,32 @@ class _Adapter:
             raise
         weights = tuning.weights(np.arange(len(tuning.layouts))) * len(tuning.layouts)
         scores = [each.score * float(weights[n]) for n, each in zip(batch, played, strict=True)]
-        return EvaluationBatch([each.score for each in played], scores, played if capture_traces else None)
+        return EvaluationBatch(
+            [each.score for each in played], scores, played if capture_traces else None
+        )
 
     def make_reflective_dataset(
-        self, candidate: dict[str, str], eval_batch: "EvaluationBatch[Any, Any]",
+        self,
+        candidate: dict[str, str],
+        eval_batch: "EvaluationBatch[Any, Any]",
         components_to_update: list[str],
-    ) -> Mapping[str, Sequence[Mapping[str, Any]]]:  # fmt: skip
-        records = [_reflected(self._tuning, candidate, each) for each in eval_batch.trajectories or ()]
+    ) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        records = [
+            _reflected(self._tuning, candidate, each) for each in eval_batch.trajectories or ()
+        ]
         return dict.fromkeys(components_to_update, records)
 
 
 def _reflected(tuning: Tuning, candidate: Mapping[str, str], trace: Played | str) -> dict[str, str]:
-    """Return one course for the reflecting model: a question, its answer, and what is to be said of it."""
+    """Return one course for the reflecting model:
+    a question, its answer, and what is to be said of it.
+    """
     if isinstance(trace, str):
         return {"Inputs": "", "Generated Outputs": "", "Feedback": trace}
     decision, text = of_course(trace)
     prompt: Prompt = rewritten(tuning.base, candidate).prompt
     graph, scenario = decision.scene.graphs[decision.scene.viewers[0]], decision.dataset.scenario
-    user = prompt.render(graph, decision.dataset.actions, words=scenario.prompt_words)[-1]["content"]
+    user = prompt.render(graph, decision.dataset.actions, words=scenario.prompt_words)[-1][
+        "content"
+    ]
     return {"Inputs": user, "Generated Outputs": decision.raw, "Feedback": text}

@@ -1,4 +1,6 @@
-"""Say in words what other actions would have been worth: exact, from the tree, for who rewrites a prompt."""
+"""Say in words what other actions would have been worth:
+exact, from the tree, for who rewrites a prompt.
+"""
 
 import numpy as np
 
@@ -10,7 +12,9 @@ from harness.world.scene_graph import Conflict
 
 
 def of_course(played: Played) -> tuple[Decision, str]:
-    """Return the decision of a course that lost most, and what is to be said of it and of the outcome."""
+    """Return the decision of a course that lost most,
+    and what is to be said of it and of the outcome.
+    """
     lost = [_lost(decision) for decision in played.course]
     worst = played.course[int(np.argmax(lost))]
     end = "The episode succeeded." if played.success == 1 else "The episode failed."
@@ -20,16 +24,23 @@ def of_course(played: Played) -> tuple[Decision, str]:
 
 
 def of_decision(decision: Decision) -> str:
-    """Return what was stated and done, what each action was worth, and who was out of sight and unreported.
+    """Return what was stated and done, what each action was worth,
+    and who was out of sight and unreported.
 
-    An action's worth is the probability that the episode succeeds after it if all later actions are drawn
-    evenly (`Forest.worth`). What an action lost is the best action's worth less its own.
+    An action's worth is the probability that the episode succeeds after it if all later actions are
+    drawn evenly (`Forest.worth`). What an action lost is the best action's worth less its own.
     """
     actions = decision.dataset.actions
-    stated = ", ".join(f"{a} {_share(p)}" for a, p in zip(actions, decision.policy.tolist(), strict=True))
-    return " ".join([
-        f"It stated {stated}, and did {actions[decision.action]}.", _worths(decision), *_unseen(decision)
-    ])  # fmt: skip
+    stated = ", ".join(
+        f"{a} {_share(p)}" for a, p in zip(actions, decision.policy.tolist(), strict=True)
+    )
+    return " ".join(
+        [
+            f"It stated {stated}, and did {actions[decision.action]}.",
+            _worths(decision),
+            *_unseen(decision),
+        ]
+    )
 
 
 def _worths(decision: Decision) -> str:
@@ -42,7 +53,9 @@ def _worths(decision: Decision) -> str:
         lost = worth[best] - worth[n]
         after = ", and nothing could save the episode after it" if not worth[n] else ""
         parts.append(
-            f"{actions[n]} lost {_share(lost)}{after}" if lost else f"{actions[n]} was worth as much"
+            f"{actions[n]} lost {_share(lost)}{after}"
+            if lost
+            else f"{actions[n]} was worth as much"
         )
     return "; ".join(parts) + "."
 
@@ -52,7 +65,9 @@ def _unseen(decision: Decision) -> list[str]:
     scene, scenario = decision.scene, decision.dataset.scenario
     ego = scene.graphs[scene.viewers[0]]
     truth = truth_graph(scenario, scene.state)
-    reported = " ".join(str((answer.message or {}).get("evidence", answer.raw)) for answer in decision.heard)
+    reported = " ".join(
+        str((answer.message or {}).get("evidence", answer.raw)) for answer in decision.heard
+    )
     sentences = []
     for node in truth.nodes:
         conflicts = [conflict for conflict in truth.conflicts if conflict.vehicle == node.id]
@@ -72,7 +87,10 @@ def _meets(conflict: Conflict) -> str:
     if ours is None or theirs is None:
         return f"from {conflict.sector}"
     gap_s = theirs - ours
-    return f"from {conflict.sector}, {abs(gap_s):.1f} s {'later' if gap_s > 0 else 'earlier'} than the ego"
+    return (
+        f"from {conflict.sector}, {abs(gap_s):.1f} s {'later' if gap_s > 0 else 'earlier'} than "
+        "the ego"
+    )
 
 
 def _share(p: float) -> str:

@@ -22,10 +22,13 @@ from harness.world.scenario import Scenario
 
 
 def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
-    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on, are for this purpose."""
+    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on,
+    are for this purpose.
+    """
     if purposes(first, count) != [wanted]:
         raise UserError(
-            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune seeds "
+            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune "
+            "seeds "
             f"({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report "
             f"seeds (from {FIRST['report']})"
         )
@@ -34,10 +37,13 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
 def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSource]:
     """Return datasets of tune layouts for those that are reported.
 
-    Raises UserError unless there is one of each scenario, in order, whose layouts are those of its seeds.
+    Raises UserError unless there is one of each scenario, in order,
+    whose layouts are those of its seeds.
     """
     if len(names) != len(reported):
-        raise UserError(f"--tune: {len(names)} given for {len(reported)} datasets; give one each, in order")
+        raise UserError(
+            f"--tune: {len(names)} given for {len(reported)} datasets; give one each, in order"
+        )
     sources = [resolve.frozen(FrozenSettings(), name) for name in names]
     for name, source, other in zip(names, sources, reported, strict=True):
         scenario = scenario_of(other)
@@ -45,12 +51,14 @@ def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSour
         only_for("tune", "--tune", name, manifest.seed, manifest.episodes)
         if source.scenario.name != scenario.name:
             raise UserError(
-                f"--tune {printable(name)}: it is of {source.scenario.name}, and not of {scenario.name} as "
+                f"--tune {printable(name)}: it is of {source.scenario.name}, and not of "
+                f"{scenario.name} as "
                 "--dataset is; give one of the same scenario"
             )
         if not set(manifest.trees_sha256).isdisjoint(other.trees_sha256):
             raise UserError(
-                f"--tune {printable(name)}: it has a layout of {printable(other.name)}, where the winner is "
+                f"--tune {printable(name)}: it has a layout of {printable(other.name)}, where the "
+                "winner is "
                 "certified; build one of other seeds"
             )
         rebuilt.refuse(source.dataset)
@@ -58,9 +66,13 @@ def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSour
 
 
 def built(
-    scenarios: Sequence[Scenario], place: Path, layouts: int, first_seed: int, workers: Workers,
+    scenarios: Sequence[Scenario],
+    place: Path,
+    layouts: int,
+    first_seed: int,
+    workers: Workers,
     progress: Progress,
-) -> list[FrozenSource]:  # fmt: skip
+) -> list[FrozenSource]:
     """Return tune layouts of each scenario, which are frozen if they are not there."""
     from harness.dataset.build import build
 
@@ -75,18 +87,27 @@ def built(
 
 
 def counted(
-    specs: Sequence[Spec], sizes: Mapping[str, int], budget: int, layouts: int, episodes: Sequence[int],
+    specs: Sequence[Spec],
+    sizes: Mapping[str, int],
+    budget: int,
+    layouts: int,
+    episodes: Sequence[int],
     tokenizer: Path | None,
-) -> dict[str, Any]:  # fmt: skip
-    """Return how many requests are to be expected, and the tokens of their prompts, from tune layouts."""
+) -> dict[str, Any]:
+    """Return how many requests are to be expected, and the tokens of their prompts,
+    from tune layouts.
+    """
     of_family = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
     here = [len(list(spec.source.layout_seeds)) for spec in specs]
     each = [c["requests"] / n for c, n in zip(of_family, here, strict=True)]
     return {
-        "choices": dict(sizes), "wordings": prod(sizes.values()) if sizes else None,
+        "choices": dict(sizes),
+        "wordings": prod(sizes.values()) if sizes else None,
         "wordings_in_a_round": 1 + sum(n - 1 for n in sizes.values()) if sizes else None,
         "budget": budget,
-        "questions_a_wording": round(sum(q * (layouts or n) for q, n in zip(each, here, strict=True))),
+        "questions_a_wording": round(
+            sum(q * (layouts or n) for q, n in zip(each, here, strict=True))
+        ),
         "certificate_questions": 2 * round(sum(q * n for q, n in zip(each, episodes, strict=True))),
         "prompt_tokens": [c["prompt_tokens"] for c in of_family],
-    }  # fmt: skip
+    }

@@ -1,4 +1,6 @@
-"""Search the wording of a prompt version on tune layouts, and certify the winner once on report layouts."""
+"""Search the wording of a prompt version on tune layouts,
+and certify the winner once on report layouts.
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +44,8 @@ class Search:
     """What is searched, and where it is written."""
 
     base: Prompt
-    tune: Sequence[Spec]  # evaluations of the base on tune layouts, one a family, each of one condition
+    # evaluations of the base on tune layouts, one a family, each of one condition
+    tune: Sequence[Spec]
     # the same on report layouts: they are opened when a winner stands, and not before
     report: Callable[[], Sequence[Spec]]
     budget: int  # most questions on tune layouts
@@ -53,7 +56,9 @@ class Search:
 
 
 def choices(prompt: Prompt) -> dict[str, int]:
-    """Return the number of alternatives of each choice of a prompt. Raises UserError if there are none."""
+    """Return the number of alternatives of each choice of a prompt.
+    Raises UserError if there are none.
+    """
     sizes = space(prompt)
     if not sizes:
         raise UserError(
@@ -81,13 +86,19 @@ def render_all(spec: Spec) -> None:
 
 
 def search(
-    plan: Search, engine: Engine, out: Path, place: Path, opens: Opens, progress: Progress,
+    plan: Search,
+    engine: Engine,
+    out: Path,
+    place: Path,
+    opens: Opens,
+    progress: Progress,
     cache_file: Path | None,
-) -> Study:  # fmt: skip
+) -> Study:
     """Search, certify, write the version, and return what was tried and what it gained.
 
-    `place` is the folder of what is kept until the end. The two runs on report layouts stay in `out`. If no
-    candidate is better than the base on tune layouts, no report layout is read and no version written.
+    `place` is the folder of what is kept until the end. The two runs on report layouts stay in
+    `out`. If no candidate is better than the base on tune layouts, no report layout is read and no
+    version written.
     """
     for spec in plan.tune:
         render_all(spec)
@@ -103,7 +114,8 @@ def search(
         tuning.rank(base)
     except Spent:
         raise UserError(
-            f"--budget {plan.budget}: the base alone takes more on {len(tuning.layouts)} tune layouts; "
+            f"--budget {plan.budget}: the base alone takes more on {len(tuning.layouts)} tune "
+            "layouts; "
             "give more, or fewer --layouts"
         ) from None
     with suppress(Spent):
@@ -143,8 +155,12 @@ def _success(run: Run) -> Floats:
     return np.asarray(values[SUCCESS][0])
 
 
-def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[Success, list[dict[str, Estimate]]]:
-    """Return how success counts, and by family (and for all) both prompts' estimates and their difference."""
+def _certificate(
+    old: Sequence[Run], new: Sequence[Run]
+) -> tuple[Success, list[dict[str, Estimate]]]:
+    """Return how success counts, and by family (and for all) both prompts' estimates and their
+    difference.
+    """
     rules = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in old])
     rows = [
         {OLD: rule.estimate(a), NEW: rule.estimate(b), "difference": rule.difference(b, a)}
@@ -158,30 +174,50 @@ def _certificate(old: Sequence[Run], new: Sequence[Run]) -> tuple[Success, list[
 
 
 def _study(
-    plan: Search, tuning: Tuning, winner: Candidate, report: Sequence[Spec],
-    runs: Mapping[str, Sequence[Run]], replies: int,
-) -> Study:  # fmt: skip
+    plan: Search,
+    tuning: Tuning,
+    winner: Candidate,
+    report: Sequence[Spec],
+    runs: Mapping[str, Sequence[Run]],
+    replies: int,
+) -> Study:
     import pandas as pd
 
     base, agent = plan.base, plan.tune[0].ego
     tried = [_row(tuning, record) for record in tuning.records.values()]
     tune = [
-        {"scenario": s.scenario.name, "layouts": len(list(s.source.layout_seeds)), "seeds": _seeds(s)}
+        {
+            "scenario": s.scenario.name,
+            "layouts": len(list(s.source.layout_seeds)),
+            "seeds": _seeds(s),
+        }
         for s in tuning.specs
     ]
-    where = f"{len(tuning.layouts)} tune layouts ({', '.join(sorted({_seeds(s) for s in tuning.specs}))})"
+    where = (
+        f"{len(tuning.layouts)} tune layouts "
+        f"({', '.join(sorted({_seeds(s) for s in tuning.specs}))})"
+    )
     manifest: dict[str, Any] = {
-        "version": plan.version, "sha256": winner.key,
+        "version": plan.version,
+        "sha256": winner.key,
         "base": {"version": base.version, "sha256": base.sha256},
-        "engine": plan.engine, "model": agent.card.record(), "answer": agent.answer,
-        "condition": plan.tune[0].points[0].name, "tune": tune, "budget": plan.budget,
-        "questions": tuning.spent, "tokens": tuning.tokens, "reflections": replies,
+        "engine": plan.engine,
+        "model": agent.card.record(),
+        "answer": agent.answer,
+        "condition": plan.tune[0].points[0].name,
+        "tune": tune,
+        "budget": plan.budget,
+        "questions": tuning.spent,
+        "tokens": tuning.tokens,
+        "reflections": replies,
         "tried": [
             {**row, **({"system": dict(r.candidate.rewritten)} if r.candidate.rewritten else {})}
             for row, r in zip(tried, tuning.records.values(), strict=True)
-        ], "chosen": winner.what, "command": plan.command,
+        ],
+        "chosen": winner.what,
+        "command": plan.command,
         "versions": versions(),
-    }  # fmt: skip
+    }
     best, first = (tuning.records[key] for key in (winner.key, chosen(base).key))
     cost = f"{tuning.spent} questions of {plan.budget}, {tuning.tokens} tokens"
     cost += f", {replies} texts of the reflecting model" if replies else ""
@@ -189,26 +225,35 @@ def _study(
     tables, data = [_tried_table(tried)], {"tried": pd.DataFrame(tried)}
     if not runs:
         headline = [
-            f"None is better than {base.version} for {agent.name} on the tune layouts, so no version was "
+            f"None is better than {base.version} for {agent.name} on the tune layouts, so no "
+            "version was "
             "written and no report layout was read.",
             f"{searched}.",
         ]
         return Study(
-            "optimize", f"Wordings of {base.version} for {agent.name}", headline, [_about(plan)], tables,
-            data, {**manifest, "certificate": None}, manifest,
-        )  # fmt: skip
+            "optimize",
+            f"Wordings of {base.version} for {agent.name}",
+            headline,
+            [_about(plan)],
+            tables,
+            data,
+            {**manifest, "certificate": None},
+            manifest,
+        )
     success, rows = _certificate(runs[OLD], runs[NEW])
     names = [spec.source.name for spec in report] + (["mean"] if len(rows) > len(report) else [])
     answers = [answer for side in runs.values() for run in side for answer in run.answers]
     again = looks(base, plan.prompts) + 1
     certificate = {
-        "metric": success.metric, "seeds": [_seeds(spec) for spec in report], "questions": len(answers),
+        "metric": success.metric,
+        "seeds": [_seeds(spec) for spec in report],
+        "questions": len(answers),
         "tokens": tokens(answers),
         "families": [
             {"dataset": name, **{side: as_mapping(e) for side, e in row.items()}}
             for name, row in zip(names, rows, strict=True)
         ],
-    }  # fmt: skip
+    }
     manifest |= {"certificate": certificate, "looks": again}
     last = rows[-1]
     gain, what = last["difference"], success.words
@@ -216,7 +261,8 @@ def _study(
     verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else unclear
     verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [
-        f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on report "
+        f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on "
+        "report "
         f"layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
         f"{', '.join(map(_seeds, report))}, read once, after the search).",
         f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
@@ -225,7 +271,10 @@ def _study(
         f"The certificate took {len(answers)} questions and {tokens(answers)} tokens more.",
     ]
     caveats = (
-        [f"Report layouts were read for versions that this one comes from, too: look number {again}."]
+        [
+            "Report layouts were read for versions that this one comes from, too: look number "
+            f"{again}."
+        ]
         if again > 1
         else []
     )
@@ -233,28 +282,44 @@ def _study(
         "Certificate, on report layouts",
         ("dataset", f"{base.version}, %", f"{plan.version}, %", "difference, points", "n"),
         [
-            (name, shown(row[OLD]), shown(row[NEW]), shown(row["difference"], POINTS, "+"),
-             str(row["difference"].n))
+            (
+                name,
+                shown(row[OLD]),
+                shown(row[NEW]),
+                shown(row["difference"], POINTS, "+"),
+                str(row["difference"].n),
+            )
             for name, row in zip(names, rows, strict=True)
         ],
         f"{what.capitalize()}, paired by layout, 95 % intervals over layouts.",
         terminal=range(5),
-    )  # fmt: skip
+    )
     flat = [
         {"dataset": name, "side": side, **ends(e)}
-        for name, row in zip(names, rows, strict=True) for side, e in row.items()
-    ]  # fmt: skip
+        for name, row in zip(names, rows, strict=True)
+        for side, e in row.items()
+    ]
     return Study(
-        "optimize", f"{plan.version}, from {base.version}, for {agent.name}", headline, [_about(plan)],
-        [table, *tables], {**data, "certificate": pd.DataFrame(flat)}, manifest, manifest, caveats=caveats,
-    )  # fmt: skip
+        "optimize",
+        f"{plan.version}, from {base.version}, for {agent.name}",
+        headline,
+        [_about(plan)],
+        [table, *tables],
+        {**data, "certificate": pd.DataFrame(flat)},
+        manifest,
+        manifest,
+        caveats=caveats,
+    )
 
 
 def _about(plan: Search) -> str:
     return (
-        f"Engine: {plan.engine}. Condition: {plan.tune[0].points[0].name}. Score on tune layouts: success, "
-        "balanced over layouts with and without a danger where there are both, then the worth of what is "
-        "stated (the tree's probability of success if later actions are drawn evenly), then the shorter text."
+        f"Engine: {plan.engine}. Condition: {plan.tune[0].points[0].name}. Score on tune layouts: "
+        "success, "
+        "balanced over layouts with and without a danger where there are both, then the worth of "
+        "what is "
+        "stated (the tree's probability of success if later actions are drawn evenly), then the "
+        "shorter text."
     )
 
 
@@ -273,11 +338,14 @@ def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
     known = len(layouts) > 0
     worth = [record.played[n].worth for n in layouts.tolist()]
     return {
-        "wording": record.candidate.what, "sha256": record.candidate.key, "layouts": len(layouts),
-        "questions": len(record.asked), "characters": record.length,
+        "wording": record.candidate.what,
+        "sha256": record.candidate.key,
+        "layouts": len(layouts),
+        "questions": len(record.asked),
+        "characters": record.length,
         "success": round(_mean(tuning, record), 6) if known else None,
         "worth": round(float(tuning.weights(layouts) @ worth), 6) if known else None,
-    }  # fmt: skip
+    }
 
 
 def _tried_table(tried: Sequence[Mapping[str, Any]]) -> Table:
@@ -289,13 +357,20 @@ def _tried_table(tried: Sequence[Mapping[str, Any]]) -> Table:
         ("wording", "layouts", "success, %", "worth", "questions", "characters"),
         [
             (
-                row["wording"], str(row["layouts"]), cell(row["success"], 100, ".1f"),
-                cell(row["worth"], 1, ".3f"), str(row["questions"]), str(row["characters"]),
+                row["wording"],
+                str(row["layouts"]),
+                cell(row["success"], 100, ".1f"),
+                cell(row["worth"], 1, ".3f"),
+                str(row["questions"]),
+                str(row["characters"]),
             )
             for row in tried
         ],
-        "Success is balanced where there are layouts with and without a danger. A wording that was worse on "
-        "half of the layouts was not played on the rest. These layouts chose, so that the best one's figure "
+        "Success is balanced where there are layouts with and without a danger. A wording that was "
+        "worse on "
+        "half of the layouts was not played on the rest. These layouts chose, so that the best "
+        "one's figure "
         "flatters it. Characters are those of the ego's prompt in the first decision point.",
-        terminal=range(5), most=12,
-    )  # fmt: skip
+        terminal=range(5),
+        most=12,
+    )

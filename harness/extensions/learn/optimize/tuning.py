@@ -1,9 +1,9 @@
 """Play candidates on tune layouts within a budget of questions, and say which is best.
 
-A candidate's score is its success, balanced over layouts with and without a danger where there are both, and
-a thousandth of the worth of what it states: the probability that the tree gives success if its policy decides
-once and all later actions are drawn evenly. So a layout more outweighs any worth, and worth decides between
-equals; of prompts with equal scores, the shorter is better.
+A candidate's score is its success, balanced over layouts with and without a danger where there are
+both, and a thousandth of the worth of what it states: the probability that the tree gives success
+if its policy decides once and all later actions are drawn evenly. So a layout more outweighs any
+worth, and worth decides between equals; of prompts with equal scores, the shorter is better.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -82,18 +82,30 @@ class Tuning:
     """
 
     def __init__(
-        self, specs: Sequence[Spec], budget: int, backend: Backend, latency: Latency,
-        place: Path, progress: Progress,
-    ) -> None:  # fmt: skip
+        self,
+        specs: Sequence[Spec],
+        budget: int,
+        backend: Backend,
+        latency: Latency,
+        place: Path,
+        progress: Progress,
+    ) -> None:
         """`place` is the folder of the answers so far; `progress` gets the number of questions."""
         self.specs, self.base, self.budget = specs, specs[0].ego.prompt, budget
         self.records: dict[str, Record] = {}
         self.spent = 0
-        self._backend, self._latency, self._place, self._progress = backend, latency, place, progress
+        self._backend, self._latency, self._place, self._progress = (
+            backend,
+            latency,
+            place,
+            progress,
+        )
 
     @cached_property
     def layouts(self) -> list[tuple[int, int]]:
-        """The family and the number of each layout's episode; layouts are named by their place here."""
+        """The family and the number of each layout's episode;
+        layouts are named by their place here.
+        """
         return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
 
     @cached_property
@@ -109,7 +121,9 @@ class Tuning:
         return np.array(sorted(n for those in kinds.values() for n in those[::2]))
 
     def weights(self, layouts: Ints) -> Floats:
-        """Return what each of some layouts counts, 1 in all: families alike, and both halves of each."""
+        """Return what each of some layouts counts, 1 in all:
+        families alike, and both halves of each.
+        """
         family = np.array([self.layouts[n][0] for n in layouts])
         weights = np.zeros(len(layouts))
         for inside in (family == n for n in np.unique(family)):
@@ -118,7 +132,9 @@ class Tuning:
         return np.asarray(weights / weights.sum())
 
     def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
-        """Return what a candidate does on some layouts. Raises Spent before the budget is exceeded."""
+        """Return what a candidate does on some layouts.
+        Raises Spent before the budget is exceeded.
+        """
         wanted = list(layouts)
         record = self.records.get(candidate.key)
         if record is None:
@@ -132,8 +148,12 @@ class Tuning:
         return [record.played[n] for n in wanted]
 
     def score(self, candidate: Candidate, layouts: Ints) -> float:
-        """Return a candidate's score over some layouts. Raises Spent before the budget is exceeded."""
-        return float(self.weights(layouts) @ [each.score for each in self.play(candidate, layouts.tolist())])
+        """Return a candidate's score over some layouts.
+        Raises Spent before the budget is exceeded.
+        """
+        return float(
+            self.weights(layouts) @ [each.score for each in self.play(candidate, layouts.tolist())]
+        )
 
     def rank(self, candidate: Candidate) -> tuple[float, int]:
         """Return what grows with how good a candidate is on all layouts."""
@@ -146,22 +166,30 @@ class Tuning:
         return sum(tokens(read_kept(file).values()) for file in self._place.glob("answers-*.jsonl"))
 
     def best(self) -> Candidate:
-        """Return the best candidate of those that were played on all layouts; of equals the first."""
+        """Return the best candidate of those that were played on all layouts;
+        of equals the first.
+        """
         whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
         return max(whole, key=self.rank)
 
     def _length(self, prompt: Prompt) -> int:
         chats = [
-            changed(spec, prompt).ego.rendered(scene.graphs[scene.viewers[0]], spec.actions, (), words)
+            changed(spec, prompt).ego.rendered(
+                scene.graphs[scene.viewers[0]], spec.actions, (), words
+            )
             for spec in self.specs
             for scene in spec.source.trial(1, ego_alone=True)
             for words in [spec.scenario.prompt_words]
         ]
         return sum(len(message["content"]) for chat in chats for message in chat)
 
-    def _walked(self, record: Record, family: int, episodes: Mapping[int, int]) -> dict[int, Played]:
+    def _walked(
+        self, record: Record, family: int, episodes: Mapping[int, int]
+    ) -> dict[int, Played]:
         dataset = _dataset(self.specs[family]).of_episodes(episodes.keys())
-        spec = replace(changed(self.specs[family], record.candidate.prompt), source=FrozenSource(dataset))
+        spec = replace(
+            changed(self.specs[family], record.candidate.prompt), source=FrozenSource(dataset)
+        )
         kept = self._place / f"answers-{record.candidate.key[:16]}-{family}.jsonl"
         asker = _Asker(self, record, spec, kept)
         world, [point] = FrozenWorld(dataset, spec.points, spec.seeds), spec.points
@@ -178,19 +206,24 @@ class Tuning:
                     values[scene.record.episode].append(float(policy @ forest.worth[node]))
                 if part.due.seed[row] == spec.seeds[0]:
                     on_time = part.result.on_time[row]
-                    heard = [v for v, h in zip(scene.viewers[1:], on_time.tolist(), strict=False) if h]
-                    own, *theirs = (asker.answers.get(f"{scene.id}/{v}") for v in (scene.viewers[0], *heard))
+                    heard = [
+                        v for v, h in zip(scene.viewers[1:], on_time.tolist(), strict=False) if h
+                    ]
+                    own, *theirs = (
+                        asker.answers.get(f"{scene.id}/{v}") for v in (scene.viewers[0], *heard)
+                    )
                     action, said = int(part.result.action[row]), tuple(filter(None, theirs))
                     courses[scene.record.episode].append(
                         Decision(dataset, scene, policy, action, said, own.raw if own else "")
                     )
         return {
             episode: Played(
-                float(success[n]), float(np.mean(values[episode])) if values[episode] else 0.0,
+                float(success[n]),
+                float(np.mean(values[episode])) if values[episode] else 0.0,
                 tuple(courses[episode]),
             )
             for n, episode in enumerate(dataset.episodes)
-        }  # fmt: skip
+        }
 
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
         """Take new questions from the budget. Raises Spent, and takes none, if too few are left."""
@@ -204,23 +237,30 @@ class Tuning:
 
 
 class _Asker(Asker):
-    """Takes questions from the budget before they are asked, also those that a stopped search asked."""
+    """Takes questions from the budget before they are asked,
+    also those that a stopped search asked.
+    """
 
     def __init__(self, tuning: Tuning, record: Record, spec: Spec, kept: Path) -> None:
         super().__init__(spec, lambda: tuning._backend, tuning._latency, kept)
         self._charge = partial(tuning.take, record)
 
-    def _ask_at(self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False) -> None:
+    def _ask_at(
+        self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False
+    ) -> None:
         viewers = (range(int(blind), len(self.spec.viewers(scene))) for scene in scenes)
         wanted = [
             (scene.id, place, blind)
             for scene, there, asked in zip(scenes, viewers, places or repeat(None), strict=False)
-            for place in there if asked is None or place in asked
-        ]  # fmt: skip
+            for place in there
+            if asked is None or place in asked
+        ]
         self._charge(wanted)
         super()._ask_at(scenes, places, blind)
 
-    def fusion_call(self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT) -> Fuses:
+    def fusion_call(
+        self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Fuses:
         self._charge([(scenes[0].id, code, rewrites) for code in codes.tolist()])
         return super().fusion_call(scenes, codes, rewrites)
 
@@ -234,7 +274,8 @@ def changed(spec: Spec, prompt: Prompt) -> Spec:
     """Return an evaluation with another prompt, of all agents that have the ego's."""
     version = spec.ego.prompt.version
     helpers = [
-        replace(each, prompt=prompt) if each.prompt.version == version else each for each in spec.helpers
+        replace(each, prompt=prompt) if each.prompt.version == version else each
+        for each in spec.helpers
     ]
     return replace(spec, ego=replace(spec.ego, prompt=prompt), helpers=tuple(helpers))
 

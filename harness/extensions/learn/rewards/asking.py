@@ -21,13 +21,19 @@ def read_by(asking: Asking, role: str) -> dict[str, Any]:
     """Return how answers in a role are read: arguments of `intent`, as plain values."""
     shape = asking.prompt.shape(role, asking.scenario.actions)
     return {
-        "answer": asking.answer, "role": role, "actions": list(shape.actions), "form": shape.form,
-        "extension": shape.extension, "reasons_first": role in asking.prompt.reasons_first,
-    }  # fmt: skip
+        "answer": asking.answer,
+        "role": role,
+        "actions": list(shape.actions),
+        "form": shape.form,
+        "extension": shape.extension,
+        "reasons_first": role in asking.prompt.reasons_first,
+    }
 
 
 def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
-    """Return who is asked: a viewer by id, the ego for None, one of all by a uniform draw for `any`."""
+    """Return who is asked: a viewer by id, the ego for None,
+    one of all by a uniform draw for `any`.
+    """
     return scene.viewers[int(draw * len(scene.viewers))] if viewer == ANY else scene.viewer(viewer)
 
 
@@ -46,18 +52,30 @@ def rows(
         name = viewer_of(scene, viewer, float(noise.uniforms((), "viewer", scene.id)))
         graph = scene.graphs[name]
         yield {
-            "prompt": asking.chat(graph), "scene": scene.id, "viewer": name,
-            "values": values.table[n].tolist(), "optimal": optimal(values.table[n]).tolist(),
-            "constant": constant, "scenario": data.scenario.name, "layout_seed": seed,
-            "purpose": purpose(seed, 1), "danger": forest.dangers[forest.tree[n]] is not None,
+            "prompt": asking.chat(graph),
+            "scene": scene.id,
+            "viewer": name,
+            "values": values.table[n].tolist(),
+            "optimal": optimal(values.table[n]).tolist(),
+            "constant": constant,
+            "scenario": data.scenario.name,
+            "layout_seed": seed,
+            "purpose": purpose(seed, 1),
+            "danger": forest.dangers[forest.tree[n]] is not None,
             **read_by(asking, graph.role),
-        }  # fmt: skip
+        }
 
 
 def intent(
-    text: str, *, answer: str, role: str, actions: Sequence[str], form: str | None = None,
-    extension: str = "", reasons_first: bool = False,
-) -> tuple[float, ...] | None:  # fmt: skip
+    text: str,
+    *,
+    answer: str,
+    role: str,
+    actions: Sequence[str],
+    form: str | None = None,
+    extension: str = "",
+    reasons_first: bool = False,
+) -> tuple[float, ...] | None:
     """Return the distribution (A,) that an answer states; None if it cannot be read."""
     if answer == "readout":
         letter = readout.spelt(text)[:1]
@@ -65,29 +83,41 @@ def intent(
         known = letter and letter in letters and not readout.spelt(text)[1:2].isalnum()
         return tuple(float(each == letter) for each in letters) if known else None
     return parse(
-        text, role=role, actions=tuple(actions), form=form, extension=extension, reasons_first=reasons_first
+        text,
+        role=role,
+        actions=tuple(actions),
+        form=form,
+        extension=extension,
+        reasons_first=reasons_first,
     ).intent
 
 
-Worth = Callable[[Sequence[float], Sequence[float]], float]  # of a distribution, by what actions are worth
+# of a distribution, by what actions are worth
+Worth = Callable[[Sequence[float], Sequence[float]], float]
 
 
 def driven(p: Sequence[float], values: Sequence[float]) -> float:
-    """Return the worth of the action that a distribution drives: the likeliest; of equals each as often."""
+    """Return the worth of the action that a distribution drives: the likeliest;
+    of equals each as often.
+    """
     likeliest = np.array(p) == max(p)
     return float(np.mean(np.array(values)[likeliest]))
 
 
 def stated(p: Sequence[float], values: Sequence[float]) -> float:
-    """Return the mean worth of a distribution, which tells apart those that drive the same action."""
+    """Return the mean worth of a distribution,
+    which tells apart those that drive the same action.
+    """
     return float(np.dot(p, values))
 
 
-def earned(text: str, values: Sequence[float], constant: int, worth: Worth = driven, **how: Any) -> float:
+def earned(
+    text: str, values: Sequence[float], constant: int, worth: Worth = driven, **how: Any
+) -> float:
     """Return what an answer is worth, less the action that is always taken.
 
-    An answer that cannot be read drives nobody: it is worth 0. `values` has the worth of each action, (A,);
-    `constant` is the index of the other.
+    An answer that cannot be read drives nobody: it is worth 0. `values` has the worth of each
+    action, (A,); `constant` is the index of the other.
     """
     p = intent(text, **how)
     return (0.0 if p is None else worth(p, values)) - float(values[constant])
@@ -97,14 +127,19 @@ READ_BY = ("answer", "role", "actions", "form", "extension", "reasons_first")
 
 
 def advantage(
-    prompts: Sequence[Any], completions: Sequence[Any], *, values: Sequence[Sequence[float]],
-    constant: Sequence[int], **columns: Any,
-) -> list[float]:  # fmt: skip
+    prompts: Sequence[Any],
+    completions: Sequence[Any],
+    *,
+    values: Sequence[Sequence[float]],
+    constant: Sequence[int],
+    **columns: Any,
+) -> list[float]:
     """Return the advantage of each completion: a reward function of TRL's trainers.
 
     Args:
         prompts: as the trainer has them; not read.
-        completions: texts, or chats whose last message is the answer; one without a text cannot be read.
+        completions: texts, or chats whose last message is the answer;
+            one without a text cannot be read.
         values: like the further columns, those of the rows that the prompts are from.
         constant: the action beside which each is judged.
         columns: the further columns of `rows`; others are left alone.
@@ -113,21 +148,30 @@ def advantage(
 
 
 def expected_advantage(
-    prompts: Sequence[Any], completions: Sequence[Any], *, values: Sequence[Sequence[float]],
-    constant: Sequence[int], **columns: Any,
-) -> list[float]:  # fmt: skip
-    """Return the advantage of the distribution that each completion states, and not of what it drives.
+    prompts: Sequence[Any],
+    completions: Sequence[Any],
+    *,
+    values: Sequence[Sequence[float]],
+    constant: Sequence[int],
+    **columns: Any,
+) -> list[float]:
+    """Return the advantage of the distribution that each completion states,
+    and not of what it drives.
 
-    It differs between answers that drive the same, so a trainer that samples few answers to a question learns
-    from more of them; but who is unsure and right earns less than who is sure. Arguments: as of `advantage`.
+    It differs between answers that drive the same, so a trainer that samples few answers to a
+    question learns from more of them; but who is unsure and right earns less than who is sure.
+    Arguments: as of `advantage`.
     """
     return _rewards(stated, completions, values, constant, columns)
 
 
 def _rewards(
-    worth: Worth, completions: Sequence[Any], values: Sequence[Sequence[float]],
-    constant: Sequence[int], columns: Mapping[str, Any],
-) -> list[float]:  # fmt: skip
+    worth: Worth,
+    completions: Sequence[Any],
+    values: Sequence[Sequence[float]],
+    constant: Sequence[int],
+    columns: Mapping[str, Any],
+) -> list[float]:
     rewards = []
     for n, completion in enumerate(completions):
         how = {name: columns[name][n] for name in READ_BY}

@@ -1,9 +1,9 @@
 """Driving as a Gymnasium environment: one decision a step, with the worth of every action known.
 
-The reward of a step is minus its regret: the worth of what is taken, less the best worth there. Summed over
-an episode it is success, less whether success was possible, where the best takes the rest. An action is an
-index, or a distribution over the actions: then the reward is the mean, and the action that is taken is drawn
-from it by the environment's own generator.
+The reward of a step is minus its regret: the worth of what is taken, less the best worth there.
+Summed over an episode it is success, less whether success was possible, where the best takes the
+rest. An action is an index, or a distribution over the actions: then the reward is the mean, and
+the action that is taken is drawn from it by the environment's own generator.
 """
 
 from collections.abc import Mapping
@@ -34,12 +34,13 @@ CHARACTERS = frozenset({"\n", "\t", *map(chr, range(0x20, 0x3000))})
 class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
     """Decides for the ego, a decision a step, on layouts that may be learnt from.
 
-    An observation is a chat that asks the viewer (`text`), or the numbers of its scene graph (`arrays`):
-    `numbers`, named by `self.numbers`, 0 where `known` is 0. The last of an episode repeats the one before.
+    An observation is a chat that asks the viewer (`text`), or the numbers of its scene graph
+    (`arrays`): `numbers`, named by `self.numbers`, 0 where `known` is 0. The last of an episode
+    repeats the one before.
 
-    `info` has what no driver knows: `values` and `optimal` of every action, (A,), `lost` if success is out of
-    reach, `scene`, `layout_seed`, `danger` (its sector, "" without one) and `viewer`; after a step the index
-    `taken`, and at the end `success`.
+    `info` has what no driver knows: `values` and `optimal` of every action, (A,), `lost` if success
+    is out of reach, `scene`, `layout_seed`, `danger` (its sector, "" without one) and `viewer`;
+    after a step the index `taken`, and at the end `success`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 # as gymnasium declares it
@@ -47,14 +48,25 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     expected_advantage = staticmethod(asking.expected_advantage)
 
     def __init__(
-        self, source: Trees | Roads, ask: Asking, *, observation: Observation = "text",
-        viewer: str | None = None, reward: Reward = "regret", distributions: bool = False,
-    ) -> None:  # fmt: skip
-        for name, given, allowed in (("observation", observation, Observation), ("reward", reward, Reward)):
+        self,
+        source: Trees | Roads,
+        ask: Asking,
+        *,
+        observation: Observation = "text",
+        viewer: str | None = None,
+        reward: Reward = "regret",
+        distributions: bool = False,
+    ) -> None:
+        for name, given, allowed in (
+            ("observation", observation, Observation),
+            ("reward", reward, Reward),
+        ):
             if given not in get_args(allowed):
                 raise unknown(name, str(given), get_args(allowed))
         if reward == "regret" and isinstance(source, Roads) and not source.then:
-            raise UserError('reward="regret" needs values; give then="local-view", or reward="success"')
+            raise UserError(
+                'reward="regret" needs values; give then="local-view", or reward="success"'
+            )
         self.source, self.ask, self.actions = source, ask, source.scenario.actions
         self.viewer, self.reward, self._text = viewer, reward, observation == "text"
         scene = source.begin(source.seeds[0]).scene
@@ -62,7 +74,9 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         self.numbers = tuple(name for name, _ in numbers(graph, source.scenario.road()))
         of_actions = (len(self.actions),)
         self.action_space = (
-            spaces.Box(0.0, 1.0, of_actions) if distributions else spaces.Discrete(len(self.actions))
+            spaces.Box(0.0, 1.0, of_actions)
+            if distributions
+            else spaces.Discrete(len(self.actions))
         )
         text = spaces.Text(MOST_CHARS, charset=CHARACTERS)
         each = (len(self.numbers),)
@@ -75,25 +89,29 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
 
     @property
     def values(self) -> Values:
-        """The worth of every action at every decision point, as arrays. Raises UserError without trees."""
+        """The worth of every action at every decision point, as arrays.
+        Raises UserError without trees.
+        """
         return self._trees("values").values
 
     def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
         """Return questions of all layouts, for trainers of text models: a row each (`asking.rows`).
 
-        They are of decisions that matter, so many of each level of each layout (`values.drawn`). Raises
-        UserError without trees.
+        They are of decisions that matter,
+        so many of each level of each layout (`values.drawn`). Raises UserError without trees.
         """
         trees = self._trees("rows()")
         at = trees.drawn(per_level)
-        return [*asking.rows(trees.dataset, trees.values, trees.constant, self.ask, self.viewer, at)]
+        return [
+            *asking.rows(trees.dataset, trees.values, trees.constant, self.ask, self.viewer, at)
+        ]
 
     def references(self, per_level: int = 6) -> dict[str, dict[str, float]]:
         """Return what those earn who need no model: lines to draw beside a training curve.
 
-        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `success` what it drives
-        on their layouts, balanced over those with and without a danger. `full-view` sees everything. Raises
-        UserError without trees, or if no decision of their layouts matters.
+        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `success` what
+        it drives on their layouts, balanced over those with and without a danger. `full-view` sees
+        everything. Raises UserError without trees, or if no decision of their layouts matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))
@@ -103,10 +121,14 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         scenario, seeds = self.source.scenario, self.source.seeds
         prompt = self.ask.prompt
         return {
-            "scenarios": {scenario.name: digest(scenario.parameters.stated())}, "layouts": len(seeds),
-            "first_seed": seeds[0], "purpose": purpose(seeds[0], len(seeds)), "then": self.source.then,
-            "reward": self.reward, "prompts": {prompt.version: prompt.sha256} if self._text else {},
-        }  # fmt: skip
+            "scenarios": {scenario.name: digest(scenario.parameters.stated())},
+            "layouts": len(seeds),
+            "first_seed": seeds[0],
+            "purpose": purpose(seeds[0], len(seeds)),
+            "then": self.source.then,
+            "reward": self.reward,
+            "prompts": {prompt.version: prompt.sha256} if self._text else {},
+        }
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -162,17 +184,26 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         viewer = asking.viewer_of(scene, self.viewer, float(self.np_random.random()))
         record, graph = scene.record, scene.graphs[viewer]
         info = {
-            "values": values.copy(), "optimal": optimal(values), "lost": bool((values == 0).all()),
-            "scene": scene.id, "layout_seed": record.episode_seed, "danger": record.danger.sector or "",
+            "values": values.copy(),
+            "optimal": optimal(values),
+            "lost": bool((values == 0).all()),
+            "scene": scene.id,
+            "layout_seed": record.episode_seed,
+            "danger": record.danger.sector or "",
             "viewer": viewer,
-        }  # fmt: skip
+        }
         if self._text:
             return tuple(self.ask.chat(graph)), info
         read = [number for _, number in numbers(graph, self.source.scenario.road())]
         known = np.array([number is not None for number in read], np.int8)
-        return {"numbers": np.array([number or 0.0 for number in read], np.float32), "known": known}, info
+        return {
+            "numbers": np.array([number or 0.0 for number in read], np.float32),
+            "known": known,
+        }, info
 
     def _trees(self, what: str) -> Trees:
         if isinstance(self.source, Trees):
             return self.source
-        raise UserError(f"{what} of driven episodes are not known in advance; leave out driven=True")
+        raise UserError(
+            f"{what} of driven episodes are not known in advance; leave out driven=True"
+        )

@@ -1,4 +1,6 @@
-"""Layouts that may be learnt from, and their trees: built once, kept on disk, never of report seeds."""
+"""Layouts that may be learnt from, and their trees:
+built once, kept on disk, never of report seeds.
+"""
 
 import operator
 import re
@@ -26,11 +28,15 @@ def seeds(which: str | int, layouts: int) -> range:
     Raises UserError for seeds that numbers are reported of, of two purposes, or none at all.
     """
     if isinstance(which, str) and which not in FIRST:
-        raise unknown("seeds", which, [name for name in FIRST if name != "report"], "; or the first seed")
+        raise unknown(
+            "seeds", which, [name for name in FIRST if name != "report"], "; or the first seed"
+        )
     first = FIRST[which] if isinstance(which, str) else whole("seeds", which)
     layouts = whole("layouts", layouts)
     if not 0 <= first <= LAST_SEED - layouts or layouts < 1:
-        raise UserError(f"seeds {first}, layouts {layouts}: give a seed from 0 on, and 1 layout or more")
+        raise UserError(
+            f"seeds {first}, layouts {layouts}: give a seed from 0 on, and 1 layout or more"
+        )
     refuse(purpose(first, layouts), f"seeds={which!r}")
     return range(first, first + layouts)
 
@@ -47,15 +53,18 @@ def refuse(kind: Purpose, what: str) -> None:
     """Raise UserError if layouts are those that numbers are reported of."""
     if kind == "report":
         raise UserError(
-            f"{what}: numbers are reported of layout seeds from {FIRST['report']} on, and nothing may learn "
-            f'from them; give seeds="train" ({FIRST["train"]} to {FIRST["report"] - 1}) or seeds="tune"'
+            f"{what}: numbers are reported of layout seeds from {FIRST['report']} on, and nothing "
+            "may learn "
+            f'from them; give seeds="train" ({FIRST["train"]} to {FIRST["report"] - 1}) or '
+            f'seeds="tune"'
         )
 
 
 def stored(dataset: str) -> Dataset:
     """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds.
 
-    The seeds count, and not what its manifest says that they are for; some layouts are rebuilt from them.
+    The seeds count, and not what its manifest says that they are for;
+    some layouts are rebuilt from them.
     """
     data = load(find(dataset))
     refuse(purpose(data.manifest.seed, data.manifest.episodes), f"dataset {printable(dataset)}")
@@ -63,7 +72,9 @@ def stored(dataset: str) -> Dataset:
     return data
 
 
-def trees(scenario: Scenario, of: range, workers: Workers, progress: Callable[[int], None]) -> Dataset:
+def trees(
+    scenario: Scenario, of: range, workers: Workers, progress: Callable[[int], None]
+) -> Dataset:
     """Return the trees of a scenario's layouts; what is not in the user's cache folder is built.
 
     A build that was stopped goes on. Raises UserError if another process is building them.

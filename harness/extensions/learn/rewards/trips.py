@@ -90,19 +90,27 @@ class Trees:
 
     @cached_property
     def constant(self) -> int:
-        """The action beside which each is judged; the best of these layouts where nobody has measured it."""
+        """The action beside which each is judged;
+        the best of these layouts where nobody has measured it.
+        """
         action = constant(self.scenario)
         if action is None:
             return best_constant(self.dataset.forest, self.dataset.dangerous)
         return self.scenario.actions.index(action)
 
     def drawn(self, per_level: int) -> Ints:
-        """Return decision points that matter, so many of each level of each tree; see `values.drawn`."""
+        """Return decision points that matter,
+        so many of each level of each tree; see `values.drawn`.
+        """
         data = self.dataset
-        return drawn(data.forest, data.dangerous, self.values.decides, per_level, self.scenario.name)
+        return drawn(
+            data.forest, data.dangerous, self.values.decides, per_level, self.scenario.name
+        )
 
     def references(self, at: Ints) -> dict[str, dict[str, float]]:
-        """Return of who needs no model the mean `advantage` at points (n,), and balanced `success`."""
+        """Return of who needs no model the mean `advantage` at points (n,),
+        and balanced `success`.
+        """
         if not len(at):
             raise UserError("no decision of these layouts matters; give more layouts")
         forest, dangerous = self.dataset.forest, self.dataset.dangerous
@@ -127,7 +135,9 @@ class Trees:
     def begin(self, seed: int) -> "TreeTrip":
         seed = whole("layout seed", seed)
         if seed not in self.seeds:
-            raise UserError(f"layout seed {seed} has no tree here; give one of {_range(self.seeds)}")
+            raise UserError(
+                f"layout seed {seed} has no tree here; give one of {_range(self.seeds)}"
+            )
         return TreeTrip(self, int(self.dataset.forest.root[self.seeds.index(seed)]))
 
 
@@ -210,7 +220,9 @@ class RoadTrip:
         return values
 
     def _succeeded(self, end: Outcome) -> bool:
-        return end.judged(self.reference, self.world.layout.danger, self.of.scenario.parameters).success
+        return end.judged(
+            self.reference, self.world.layout.danger, self.of.scenario.parameters
+        ).success
 
     def take(self, action: int) -> None:
         self.world.act(self.of.scenario.actions[action])

@@ -1,19 +1,20 @@
-"""What every action is worth at the decision points of trees, as arrays: rewards without a simulator.
+"""What every action is worth at the decision points of trees, as arrays:
+rewards without a simulator.
 
-The worth of an action is the probability that the episode succeeds after it. Trees give it exactly, whoever
-decides from there on:
+The worth of an action is the probability that the episode succeeds after it.
+Trees give it exactly, whoever decides from there on:
 
 - `best`: whoever decides best and sees everything. It is 1 or 0: whether success is still possible.
 - a reference driver, such as `local-view`, which sees no more than the ego. It is 1 or 0 as well.
 - `uniform`: every action is drawn with the same probability.
 
-The worth of a distribution at a decision point is `sum_a p(a) v(a)`, and its gradient in p is v. Where
-success is out of reach after every action, nothing can be learnt: the point is `lost`.
+The worth of a distribution at a decision point is `sum_a p(a) v(a)`, and its gradient in p is v.
+Where success is out of reach after every action, nothing can be learnt: the point is `lost`.
 
-Most points forgive nearly every action, so that one action that is always taken is worth nearly as much as
-the best. So an answer's reward is its *advantage* over such a constant: the worth of the action that it
-drives, less that of the action which did best in tune layouts of the scenario (the driver `constant`). Points
-in which all actions are worth the same are left out.
+Most points forgive nearly every action, so that one action that is always taken is worth nearly as
+much as the best. So an answer's reward is its *advantage* over such a constant: the worth of the
+action that it drives, less that of the action which did best in tune layouts of the scenario (the
+driver `constant`). Points in which all actions are worth the same are left out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,16 +55,20 @@ class Values:
         return cls(forest.ids, forest.actions, then, table)
 
     def __call__(self, points: Sequence[str] | Ints, p: Floats | None = None) -> Floats:
-        """Return the worth of each action at n decision points, (n, A); given distributions p (n, A), theirs.
+        """Return the worth of each action at n decision points, (n, A);
+        given distributions p (n, A), theirs.
 
-        The points are ids, or places among `ids`, which is faster. Raises KeyError for an unknown id.
+        The points are ids, or places among `ids`, which is faster.
+        Raises KeyError for an unknown id.
         """
         places = points if isinstance(points, np.ndarray) else self.at(points)
         values = self.table[places]
         return values if p is None else np.einsum("na,na->n", p, values)
 
     def at(self, ids: Sequence[str]) -> Ints:
-        """Return the places of decision points among `ids`, (n,). Raises KeyError for an unknown one."""
+        """Return the places of decision points among `ids`, (n,).
+        Raises KeyError for an unknown one.
+        """
         return np.fromiter(map(self.place.__getitem__, ids), np.intp, len(ids))
 
     @cached_property
@@ -82,23 +87,28 @@ class Values:
 
 
 def balanced(success: Floats | Bools, dangerous: Bools) -> float:
-    """Return the mean success (E,) of layouts with a danger and without, as far as there are both."""
+    """Return the mean success (E,) of layouts with a danger and without,
+    as far as there are both.
+    """
     kinds = [success[kind].mean() for kind in (dangerous, ~dangerous) if kind.any()]
     return float(np.mean(kinds))
 
 
 def best_constant(forest: Forest, dangerous: Bools) -> int:
-    """Return the action that does best if it is always taken, by balanced success; of equals the first."""
+    """Return the action that does best if it is always taken, by balanced success;
+    of equals the first.
+    """
     success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
     return int(np.argmax(success))
 
 
 def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario: str) -> Ints:
-    """Return points among those that are asked for, (N,), so many of each level of each tree, ascending.
+    """Return points among those that are asked for, (N,),
+    so many of each level of each tree, ascending.
 
-    They are drawn by scenario and layout seed. A level that has fewer has them several times, so that levels
-    weigh alike: an episode passes one point of each. Layouts with and without a danger have as many in all,
-    as balanced success weighs them, so of the rarer kind more are drawn.
+    They are drawn by scenario and layout seed. A level that has fewer has them several times, so
+    that levels weigh alike: an episode passes one point of each. Layouts with and without a danger
+    have as many in all, as balanced success weighs them, so of the rarer kind more are drawn.
     """
     alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
     kinds = len(np.unique(dangerous))
@@ -106,7 +116,10 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
     sizes = np.bincount(forest.tree).tolist()
     seeds = forest.seeds.tolist()
     draws = np.concatenate(
-        [noise.uniforms((size,), "rows", scenario, seed) for size, seed in zip(sizes, seeds, strict=True)]
+        [
+            noise.uniforms((size,), "rows", scenario, seed)
+            for size, seed in zip(sizes, seeds, strict=True)
+        ]
     )
     levels = forest.tree * (int(forest.step.max()) + 1) + forest.step
     order = np.lexsort((draws, levels))
@@ -120,6 +133,8 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
 
 
 def optimal(values: Floats) -> Bools:
-    """Return which actions are worth most, (..., A); none where all are worth nothing, or it is not known."""
+    """Return which actions are worth most, (..., A);
+    none where all are worth nothing, or it is not known.
+    """
     most = values.max(axis=-1, keepdims=True)
     return np.asarray((values == most) & (most > 0))

@@ -1,4 +1,6 @@
-"""What a distilled model learns to answer: a distribution as a prompt asks for it, and what pictures show."""
+"""What a distilled model learns to answer:
+a distribution as a prompt asks for it, and what pictures show.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,15 +19,16 @@ from harness.world.scene_graph import Conflict, SceneGraph
 PARTS = 20  # of a stated distribution: so small a model cannot make hundredths sum to 1
 MOST_SEEN = 5  # vehicles of a picture that are listed
 HIGH, MEDIUM = 0.6, 0.3  # probability of the most careful action from which risk has that name
-CLASSES = 10  # of how far the nearest vehicle in a square of a picture is, a digit each; 0 is nobody
+# of how far the nearest vehicle in a square of a picture is, a digit each; 0 is nobody
+CLASSES = 10
 STEP_M = 7.0  # from one class to the next; the last has no end
 
 
 def evidence(view: SceneGraph, named: bool = True) -> str:
     """Report who brakes ahead of the ego, or comes closest to it, or what the viewer cannot see.
 
-    The gap is by how many seconds that vehicle is later than the ego where their ways meet. A vehicle that
-    is not `named` in the prompt is no more than one.
+    The gap is by how many seconds that vehicle is later than the ego where their ways meet. A
+    vehicle that is not `named` in the prompt is no more than one.
     """
 
     def who(conflict: Conflict) -> str:
@@ -45,7 +48,9 @@ def evidence(view: SceneGraph, named: bool = True) -> str:
 
 
 def sights(view: SceneGraph) -> str:
-    """Report what a viewer's cameras show, the nearest first: kinds, metres ahead and to the left, lamps."""
+    """Report what a viewer's cameras show, the nearest first:
+    kinds, metres ahead and to the left, lamps.
+    """
     seen = [node for node in view.nodes if "camera" in node.sensors]
     seen.sort(key=lambda node: float(np.hypot(node.forward_m, node.left_m)))
     parts = []
@@ -61,7 +66,9 @@ def _gap_s(conflict: Conflict) -> float | None:
     return None if ours is None or theirs is None else theirs - ours
 
 
-def message(view: SceneGraph, intent: Floats, actions: Sequence[str], named: bool = True) -> dict[str, Any]:
+def message(
+    view: SceneGraph, intent: Floats, actions: Sequence[str], named: bool = True
+) -> dict[str, Any]:
     """Return a helper's message that states an intent, with what any prompt may show of it."""
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
@@ -76,10 +83,17 @@ def message(view: SceneGraph, intent: Floats, actions: Sequence[str], named: boo
 
 
 def answer(
-    prompt: Prompt, view: SceneGraph, intent: Floats, actions: Sequence[str], *, bare: bool = False,
+    prompt: Prompt,
+    view: SceneGraph,
+    intent: Floats,
+    actions: Sequence[str],
+    *,
+    bare: bool = False,
     named: bool = True,
-) -> str:  # fmt: skip
-    """Return the answer that states an intent; `bare` without free text, as a constrained answer begins."""
+) -> str:
+    """Return the answer that states an intent;
+    `bare` without free text, as a constrained answer begins.
+    """
     sent = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))
     body = f'"action_distribution":{{{numbers}}}'
@@ -99,8 +113,8 @@ def answer(
 def cells(sight: Sight) -> Ints:
     """Return the class of every token of a picture, (tokens,), row by row.
 
-    A letter and a line of words are one answer a picture, too little for a vision encoder that begins with
-    random weights. This is an answer a token.
+    A letter and a line of words are one answer a picture, too little for a vision encoder that
+    begins with random weights. This is an answer a token.
     """
     frame, viewer = sight.frame, sight.state.vehicle(sight.viewer_id)
     classes = np.zeros(len(frame.ids) + 1, dtype=np.int64)  # the last is of pixels that nobody owns

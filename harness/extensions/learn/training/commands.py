@@ -1,4 +1,6 @@
-"""`harness model distill` trains a small language model; `harness prompt examples` shows answers to any."""
+"""`harness model distill` trains a small language model;
+`harness prompt examples` shows answers to any.
+"""
 
 import time
 from pathlib import Path
@@ -34,25 +36,30 @@ def distill(
     ),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the model's name."),
     prompt: list[str] = typer.Option(
-        ["v2", "v4"], help="Prompt version to learn; it is used in the scenarios that it fits. Repeatable."
+        ["v2", "v4"],
+        help="Prompt version to learn; it is used in the scenarios that it fits. Repeatable.",
     ),
     base: str | None = typer.Option(
         None,
         help="Model to begin as, by card, folder, .gguf file or hub id. Default: random weights.",
     ),
     lora: bool = typer.Option(
-        False, "--lora", help="Train an adapter of a published base and keep its weights as they are."
+        False,
+        "--lora",
+        help="Train an adapter of a published base and keep its weights as they are.",
     ),
     rank: int | None = typer.Option(None, help=f"Rank of the adapter. Default: {RANK}."),
     rate: float | None = typer.Option(
         None,
-        help=f"Learning rate for a published base. Default: {RATES[False]:g}; {RATES[True]:g} with --lora.",
+        help=f"Learning rate for a published base. Default: {RATES[False]:g}; {RATES[True]:g} with "
+        "--lora.",
     ),
     dtype: str = typer.Option(
         DTYPES[0], help="What layers of a published base compute in: float32 or bfloat16."
     ),
     report: float | None = typer.Option(
-        None, help=f"Weight of the words behind a letter, for a published base. Default: {REPORT:g}."
+        None,
+        help=f"Weight of the words behind a letter, for a published base. Default: {REPORT:g}.",
     ),
     objective: str = typer.Option(
         OBJECTIVES[0], help="What letters learn: imitation of soft labels, or values of actions."
@@ -62,23 +69,32 @@ def distill(
         FIRST["train"], help="Layout seed of the first layout; train seeds are 100000 to 199999."
     ),
     samples: str = typer.Option(
-        SAMPLES, help="Sequences of the stages excerpts, alone, messages and answers; 0 leaves one out."
+        SAMPLES,
+        help="Sequences of the stages excerpts, alone, messages and answers; 0 leaves one out.",
     ),
-    seed: int = typer.Option(0, help="Seed of the initial weights and of the order of the sequences."),
+    seed: int = typer.Option(
+        0, help="Seed of the initial weights and of the order of the sequences."
+    ),
     batch: int = typer.Option(BATCH, help="Sequences per training step."),
     device: str = typer.Option("cpu", help="Where to train: cpu, cuda or cuda:N."),
-    threads: int | None = typer.Option(None, help="Number of CPU threads. Default: PyTorch's choice."),
+    threads: int | None = typer.Option(
+        None, help="Number of CPU threads. Default: PyTorch's choice."
+    ),
     workers: options.Workers = "2",
 ) -> None:
     """Train a small Qwen3, or a published model, in some scenarios.
 
-    With an image prompt the small one is a Qwen3-VL, which takes pictures and text. If the training is
-    stopped, the same command continues it.
+    With an image prompt the small one is a Qwen3-VL, which takes pictures and text.
+    If the training is stopped, the same command continues it.
     """
     from harness.prompts import versions as prompts
 
     extras.need("harness model distill", "torch", "transformers", "highway_env")
-    for flag, value, least in (("--batch", batch, 1), ("--threads", threads, 1), ("--seed", seed, 0)):
+    for flag, value, least in (
+        ("--batch", batch, 1),
+        ("--threads", threads, 1),
+        ("--seed", seed, 0),
+    ):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
     if objective not in OBJECTIVES:
@@ -88,17 +104,20 @@ def distill(
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
         raise UserError(
-            f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train seeds "
+            f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train "
+            "seeds "
             f"alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
     learnt = {each: tuple(v for v in versions if not prompts.unfit(v, each)) for each in driven}
     for each, some in learnt.items():
         if not some:
             raise UserError(
-                f"--prompt {printable(' '.join(prompt))}: none is for {each.name}; give {each.prompt}, or "
+                f"--prompt {printable(' '.join(prompt))}: none is for {each.name}; give "
+                f"{each.prompt}, or "
                 "one of your own"
             )
-    # A stage has a batch at least, and that of messages takes a scene for four sequences of each prompt.
+    # A stage has a batch at least, and that of messages takes a scene for four sequences of each
+    # prompt.
     counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))
 
     from harness.backends.card import Card
@@ -111,7 +130,9 @@ def distill(
 
     how = Adapt(*adapt) if isinstance(start, Card) else None
     samples_of = dict(zip(STAGES, counts, strict=True))
-    plan = Plan(samples_of, batch=batch, seed=seed, adapt=how, objective=cast("Objective", objective))
+    plan = Plan(
+        samples_of, batch=batch, seed=seed, adapt=how, objective=cast("Objective", objective)
+    )
     begun_s = time.monotonic()
     drawn = layouts * len(learnt)
     for each in learnt:
@@ -126,9 +147,15 @@ def distill(
             progress(drawn + sum(counts[: STAGES.index(stage)]) + seen - progress.done)
 
         facts = run(
-            Curriculum(learnt, layouts, first_seed, start), plan, out, progress, show, choose_device(device),
-            threads, options.workers_of(workers),
-        )  # fmt: skip
+            Curriculum(learnt, layouts, first_seed, start),
+            plan,
+            out,
+            progress,
+            show,
+            choose_device(device),
+            threads,
+            options.workers_of(workers),
+        )
     for apart in facts["held_out"]:
         typer.echo(
             f"{apart['scenario']}: held-out KL {apart['kl_nats']:.3f} nats (mean label "
@@ -138,14 +165,17 @@ def distill(
         others = (f"{name} {worth:.3f}" for name, worth in apart["references"].items())
         typer.echo(f"  who needs no model: value {', '.join(others)}")
     typer.echo(
-        f"wrote {printable(out)}: {facts['parameters']:,} parameters, {time.monotonic() - begun_s:.0f} s"
+        f"wrote {printable(out)}: {facts['parameters']:,} parameters, "
+        f"{time.monotonic() - begun_s:.0f} s"
     )
 
 
 def examples(
     version: Version,
     scenario: str = typer.Option(..., help="Scenario to take the examples from."),
-    count: int = typer.Option(2, help="Number of examples for each role, each from a layout of its own."),
+    count: int = typer.Option(
+        2, help="Number of examples for each role, each from a layout of its own."
+    ),
     first_seed: int = typer.Option(
         FIRST["train"], help="Layout seed of the first example; train seeds are 100000 to 199999."
     ),
@@ -161,7 +191,9 @@ def examples(
     draft, played = prompts.load(version), ready_to_drive(scenario, count, first_seed, "--count")
     file = resources.find("prompts", version) / EXAMPLES
     if draft.released:
-        raise UserError(f"prompt {version} is released; copy it to a new version to give it examples")
+        raise UserError(
+            f"prompt {version} is released; copy it to a new version to give it examples"
+        )
     if draft.examples:
         raise UserError(f"{printable(file)} is there already; delete it to draw others")
     if reason := prompts.unfit(draft, played):
@@ -181,16 +213,26 @@ def _counts(text: str, least: int) -> list[int]:
         counts = [int(part) for part in text.split(",")]
     except ValueError:
         counts = []
-    if len(counts) != len(SAMPLES.split(",")) or not any(counts) or any(0 != n < least for n in counts):
+    if (
+        len(counts) != len(SAMPLES.split(","))
+        or not any(counts)
+        or any(0 != n < least for n in counts)
+    ):
         raise UserError(
-            f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or more each, "
+            f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or "
+            "more each, "
             "or 0 to leave a stage out"
         )
     return counts
 
 
 def _base(
-    text: str | None, lora: bool, rank: int | None, rate: float | None, dtype: str, report: float | None
+    text: str | None,
+    lora: bool,
+    rank: int | None,
+    rate: float | None,
+    dtype: str,
+    report: float | None,
 ) -> "tuple[Path | Card | None, tuple[int | None, float, Any, float]]":
     """Return what a model begins as, and how a published one is changed, in the order of `Adapt`.
 
@@ -207,7 +249,12 @@ def _base(
         raise unknown("--dtype", dtype, DTYPES)
     if report is not None and not 0 <= report <= MOST:
         raise UserError(f"--report {report:g}: give 0 to {MOST}")
-    adapt = (rank or RANK if lora else None, rate or RATES[lora], dtype, REPORT if report is None else report)
+    adapt = (
+        rank or RANK if lora else None,
+        rate or RATES[lora],
+        dtype,
+        REPORT if report is None else report,
+    )
     folder = Path(text or "")
     ours = (cards.TAUGHT, "model.safetensors", "tokenizer.json")
     if text and not lora and all((folder / name).is_file() for name in ours):
@@ -222,7 +269,9 @@ def _base(
 
 
 def _published(text: str) -> "Card":
-    """Return the card of a model whose weights can be taught. Raises UserError if there are none."""
+    """Return the card of a model whose weights can be taught.
+    Raises UserError if there are none.
+    """
     from harness.backends import cards
 
     engine = cards.resolve(text).engine
@@ -230,6 +279,7 @@ def _published(text: str) -> "Card":
         return cards.resolve(text, "transformers")
     except UserError:
         raise UserError(
-            f"--base {printable(text)}: it runs on {engine} alone and has no weights that can be taught; "
+            f"--base {printable(text)}: it runs on {engine} alone and has no weights that can be "
+            "taught; "
             "give a model that runs on transformers, such as smollm2-135m (`harness model list`)"
         ) from None

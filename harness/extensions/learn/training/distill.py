@@ -36,8 +36,8 @@ class Curriculum:
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
     layouts: int  # how many of each scenario
     seed: int  # layout seed of the first
-    # folder of a model of texts that was distilled here, which it begins as, or the card of a published one;
-    # None begins with random weights
+    # folder of a model of texts that was distilled here, which it begins as, or the card of a
+    # published one; None begins with random weights
     base: Path | Card | None = None
 
     def __post_init__(self) -> None:
@@ -48,7 +48,9 @@ class Curriculum:
             has = "takes pictures" if self.base.vision else "has an adapter already"
             raise UserError(f"--base {name} {has}; give a plain model of texts")
         if any(prompt.image for prompts in self.prompts.values() for prompt in prompts):
-            raise UserError(f"--base {name} is taught texts alone; leave image prompts out of --prompt")
+            raise UserError(
+                f"--base {name} is taught texts alone; leave image prompts out of --prompt"
+            )
         locate(self.base)  # now, and not after the layouts are drawn
 
     def settings(self) -> dict[str, Any]:
@@ -61,7 +63,9 @@ class Curriculum:
             "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},
             "layouts": self.layouts,
             "first_seed": self.seed,
-            "base_sha256": sha256_file(self.base / WEIGHTS) if isinstance(self.base, Path) else None,
+            "base_sha256": sha256_file(self.base / WEIGHTS)
+            if isinstance(self.base, Path)
+            else None,
             **({"base": published.base_name(self.base)} if isinstance(self.base, Card) else {}),
         }
 
@@ -76,19 +80,22 @@ def distill(
     threads: int | None = None,
     workers: Workers = 1,
 ) -> dict[str, Any]:
-    """Train a model in some scenarios and write checkpoint, tokenizer, GGUF file and model card to `out`.
+    """Train a model in some scenarios and write checkpoint, tokenizer,
+    GGUF file and model card to `out`.
 
-    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes. The name
-    of `out`, a folder to make, becomes the model's. `drawing` is called with the number of layouts just
-    drawn, `progress` with the stage, the sequences seen in it and the loss. Without `threads`, PyTorch
-    chooses how many it takes on a CPU. Returns what the model card states: data, plan, curves, and the KL of
-    the read-out on held-out layouts. Raises UserError if the folder holds a finished model or something else.
+    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes.
+    The name of `out`, a folder to make, becomes the model's. `drawing` is called with the number of
+    layouts just drawn, `progress` with the stage, the sequences seen in it and the loss. Without
+    `threads`, PyTorch chooses how many it takes on a CPU. Returns what the model card states: data,
+    plan, curves, and the KL of the read-out on held-out layouts. Raises UserError if the folder
+    holds a finished model or something else.
     """
     if threads:
         torch.set_num_threads(threads)
     if (out / FACTS).is_file() and not (out / WORK).is_dir():
         raise UserError(
-            f"--out {printable(out)} already holds a finished model; choose another folder or delete it"
+            f"--out {printable(out)} already holds a finished model; choose another folder or "
+            "delete it"
         )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
     settings = {**learnt, **plan.settings()}
@@ -107,8 +114,12 @@ def distill(
     return facts
 
 
-def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: Progress) -> dict[str, Any]:
-    """Train what is missing, and write the model's folder; its card states what is `learnt` from."""
+def _trained(
+    learnt: Mapping[str, Any], student: Student, out: Path, progress: Progress
+) -> dict[str, Any]:
+    """Train what is missing, and write the model's folder;
+    its card states what is `learnt` from.
+    """
     plan = student.plan
     curves = {name: student.stage(name, progress) for name in STAGES}
     weights = student.rounded()
@@ -123,7 +134,10 @@ def _trained(learnt: Mapping[str, Any], student: Student, out: Path, progress: P
     }
     student.model.eval()
     if student.published:
-        facts |= {"base_sha256": student.published.sha256, "licence": student.published.card.licence}
+        facts |= {
+            "base_sha256": student.published.sha256,
+            "licence": student.published.card.licence,
+        }
         student.published.write(out, weights)
         return _described(out, facts, published.model_card)
     facts |= {
@@ -158,7 +172,8 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
         if curve
     )
     held_out = "\n".join(
-        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
+        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
+        f"{row['questions']} "
         f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
         f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
         for row in facts["held_out"]
@@ -196,4 +211,4 @@ The value of who needs no model, at the same questions:
 on prompts that show nothing but the conflicts, `messages` after it with helpers' messages in the ego's
 prompt. `answers` is the JSON text, which states the read-out's own distribution. The losses are of different
 sums and compare within a stage only; curves are in `training.json`.
-"""
+"""  # noqa: E501

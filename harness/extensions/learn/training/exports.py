@@ -22,7 +22,9 @@ def _report_seeds_too(value: bool, option: str) -> str | None:
 
 
 REPORT_SEEDS_TOO = Option(
-    bool, "With --sft and --dpo: also allow layouts with report seeds (200000 and above).", _report_seeds_too
+    bool,
+    "With --sft and --dpo: also allow layouts with report seeds (200000 and above).",
+    _report_seeds_too,
 )
 LEAST = Option(
     float, "With --dpo: how much less an answer must be worth, above 0 to 1. Default: 0.1.", _margin
@@ -33,14 +35,17 @@ class Lessons:
     """Chats with the answers that the decision trees show to be right."""
 
     help = (
-        "Write chats to fine-tune on as JSON Lines; their answers are those that the decision trees show to "
+        "Write chats to fine-tune on as JSON Lines; their answers are those that the decision "
+        "trees show to "
         "be right."
     )
     doing = "writing chats"
     needs = ()
     options = MappingProxyType({"report-seeds-too": REPORT_SEEDS_TOO})
 
-    def write(self, run: Run, file: Path, dataset: Path | None, *, report_seeds_too: bool = False) -> Path:
+    def write(
+        self, run: Run, file: Path, dataset: Path | None, *, report_seeds_too: bool = False
+    ) -> Path:
         from harness.extensions.learn.training import pairs
 
         return pairs.write(run, file, report_seeds_too, dataset)
@@ -49,15 +54,23 @@ class Lessons:
 class Preferences:
     """The same chats with the model's own answers as the rejected ones."""
 
-    help = "Write the same chats with the model's own answers as the rejected ones, where these are worse."
+    help = (
+        "Write the same chats with the model's own answers as the rejected ones, where these are "
+        "worse."
+    )
     doing = "writing chats"
     needs = ()
     options = MappingProxyType({"margin": LEAST, "report-seeds-too": REPORT_SEEDS_TOO})
 
     def write(
-        self, run: Run, file: Path, dataset: Path | None, *, margin: float = MARGIN,
+        self,
+        run: Run,
+        file: Path,
+        dataset: Path | None,
+        *,
+        margin: float = MARGIN,
         report_seeds_too: bool = False,
-    ) -> Path:  # fmt: skip
+    ) -> Path:
         from harness.extensions.learn.training import pairs
 
         return pairs.write(run, file, report_seeds_too, dataset, margin)

@@ -1,16 +1,18 @@
 """The decision points that a model learns from, and what it should have intended there.
 
-They are drawn from the decision trees of train layouts, up to `PER_LEVEL` points of each level. So a model
-sees the scenes that its own errors lead to. An episode passes one point of each level, so the levels of a
-layout weigh alike: the point at which every episode begins as much as all points of a later level together.
+They are drawn from the decision trees of train layouts, up to `PER_LEVEL` points of each level. So
+a model sees the scenes that its own errors lead to. An episode passes one point of each level, so
+the levels of a layout weigh alike: the point at which every episode begins as much as all points of
+a later level together.
 
-An action is safe if the episode still succeeds when the driver that sees no more than the ego takes the rest:
-what only one who sees everything could still save is not safe for who does not. Each safe action has the
-weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one has none. Where IDLE and
-another come to the same (FASTER at the highest speed level, a lane as good) most goes to IDLE. A viewer that
-cannot tell scenes apart is best served by the mean of their labels, so what it cannot see makes it unsure. A
-point at which nothing is safe any more teaches nothing; what follows it may, where that driver is too bold to
-take the rest and one more SLOWER saves it.
+An action is safe if the episode still succeeds when the driver that sees no more than the ego takes
+the rest: what only one who sees everything could still save is not safe for who does not. Each safe
+action has the weight exp(-delay / 0.25 s), so that a needless SLOWER counts little; an unsafe one
+has none. Where IDLE and another come to the same (FASTER at the highest speed level, a lane as
+good) most goes to IDLE. A viewer that cannot tell scenes apart is best served by the mean of their
+labels, so what it cannot see makes it unsure. A point at which nothing is safe any more teaches
+nothing; what follows it may, where that driver is too bold to take the rest and one more SLOWER
+saves it.
 """
 
 from collections import Counter
@@ -69,7 +71,9 @@ class Lessons:
 
     @cached_property
     def weights(self) -> Mapping[str, float]:
-        """Return how often each scene is learnt from, by its id: each level of a layout in all as often."""
+        """Return how often each scene is learnt from, by its id:
+        each level of a layout in all as often.
+        """
         levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
         weights = np.array([1 / points[level] for level in levels])
@@ -81,7 +85,9 @@ class Lessons:
         return dict(zip((scene.id for scene in self.scenes), weights.tolist(), strict=True))
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
-        """Split off a share of the layouts, the last ones, at least one: those that are kept, and those."""
+        """Split off a share of the layouts, the last ones, at least one:
+        those that are kept, and those.
+        """
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
         kept = tuple(scene for scene in self.scenes if scene.record.episode not in last)
         held = tuple(scene for scene in self.scenes if scene.record.episode in last)
@@ -89,9 +95,14 @@ class Lessons:
 
 
 def draw(
-    scenario: Scenario, prompts: Sequence[Prompt], layouts: int, seed: int, place: Path, workers: Workers,
+    scenario: Scenario,
+    prompts: Sequence[Prompt],
+    layouts: int,
+    seed: int,
+    place: Path,
+    workers: Workers,
     progress: Callable[[int], None],
-) -> Lessons:  # fmt: skip
+) -> Lessons:
     """Draw the layouts that the folder `place` lacks, a file each, and read all of them.
 
     A killed call resumes from that folder. Layout number n of `layouts` has layout seed `seed + n`;
@@ -119,7 +130,9 @@ def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
 
 
 def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
-    """Draw a layout's decision points that are learnt from: the `record` and the soft `label` of each."""
+    """Draw a layout's decision points that are learnt from:
+    the `record` and the soft `label` of each.
+    """
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []
     level = [World.start(scenario, seed)]
@@ -150,10 +163,13 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
 
 
 def label(ends_s: Mapping[str, float]) -> Floats:
-    """Return the soft label (A,) of a decision point from when the episode succeeds after each action.
+    """Return the soft label (A,) of a decision point from when the episode succeeds after each
+    action.
 
     These are seconds, inf for never; at least one has to be finite.
     """
     time_s = np.array(list(ends_s.values()))
-    weight = np.array([PRIOR.get(a, 1.0) for a in ends_s]) * np.exp((time_s.min() - time_s) / SOFTNESS_S)
+    weight = np.array([PRIOR.get(a, 1.0) for a in ends_s]) * np.exp(
+        (time_s.min() - time_s) / SOFTNESS_S
+    )
     return np.asarray(weight / weight.sum())

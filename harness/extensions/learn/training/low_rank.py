@@ -1,7 +1,7 @@
 """A LoRA adapter while it is trained, and its files, in peft's format.
 
-Hu et al., "LoRA: low-rank adaptation of large language models" (2021): y = W x + alpha / r * B A x, with W
-kept. Two matrices a layer are less than the package that trains them would bring.
+Hu et al., "LoRA: low-rank adaptation of large language models" (2021): y = W x + alpha / r * B A x,
+with W kept. Two matrices a layer are less than the package that trains them would bring.
 """
 
 import json
@@ -20,13 +20,17 @@ SCALE = 2.0  # alpha / r
 
 
 class LowRank(torch.nn.Module):  # type: ignore[misc]
-    """A linear layer (out, in) that stays, plus two matrices (rank, in) and (out, rank) that learn."""
+    """A linear layer (out, in) that stays,
+    plus two matrices (rank, in) and (out, rank) that learn.
+    """
 
     def __init__(self, kept: Any, rank: int, generator: Any) -> None:
         super().__init__()
         rows, columns = kept.weight.shape
         self.kept = kept
-        start = torch.empty(rank, columns).uniform_(-1.0, 1.0, generator=generator) / math.sqrt(columns)
+        start = torch.empty(rank, columns).uniform_(-1.0, 1.0, generator=generator) / math.sqrt(
+            columns
+        )
         self.a = torch.nn.Parameter(start)
         self.b = torch.nn.Parameter(torch.zeros(rows, rank))
 
@@ -59,10 +63,16 @@ def write(model: Any, out: Path, base: str) -> None:
         for end, matrix in ((A, layer.a), (B, layer.b)):
             tensors[f"{PREFIX}{name}{end}"] = matrix.detach().half().cpu().contiguous()
     config = {
-        "peft_type": "LORA", "task_type": "CAUSAL_LM", "base_model_name_or_path": base, "r": rank,
-        "lora_alpha": SCALE * rank, "lora_dropout": 0.0, "bias": "none", "inference_mode": True,
+        "peft_type": "LORA",
+        "task_type": "CAUSAL_LM",
+        "base_model_name_or_path": base,
+        "r": rank,
+        "lora_alpha": SCALE * rank,
+        "lora_dropout": 0.0,
+        "bias": "none",
+        "inference_mode": True,
         "target_modules": sorted({name.rpartition(".")[2] for name, _ in _layers(model)}),
-    }  # fmt: skip
+    }
     with replacing(out / TENSORS) as part:
         save_file(tensors, part, metadata={"format": "pt"})
     write_whole(out / CONFIG, json.dumps(config, indent=1) + "\n")

@@ -1,4 +1,5 @@
-"""The embedded models before they have learnt anything, and their language: a small BPE with ChatML.
+"""The embedded models before they have learnt anything, and their language:
+a small BPE with ChatML.
 
 One reads texts, a Qwen3; one sees as well, a Qwen3-VL whose text part is the same.
 """
@@ -15,10 +16,16 @@ from harness.backends.vision import Vision
 from harness.core.errors import UserError, printable
 
 CONTEXT_TOKENS = 2048
-# 512 entries leave a prompt a third longer (371 tokens against 282, prompt v2, ego); merges end at 819.
+# 512 entries leave a prompt a third longer (371 tokens against 282, prompt v2, ego); merges end at
+# 819.
 VOCABULARY = 768
 END, START, PAD = "<|im_end|>", "<|im_start|>", "<|endoftext|>"
-PICTURE, VIDEO, BEGINS, ENDS = "<|image_pad|>", "<|video_pad|>", "<|vision_start|>", "<|vision_end|>"
+PICTURE, VIDEO, BEGINS, ENDS = (
+    "<|image_pad|>",
+    "<|video_pad|>",
+    "<|vision_start|>",
+    "<|vision_end|>",
+)
 MARKS = (PICTURE, VIDEO, BEGINS, ENDS)
 WEIGHTS = "model.safetensors"
 TEMPLATE = (
@@ -28,23 +35,31 @@ TEMPLATE = (
 SEEING_TEMPLATE = TEMPLATE.replace(
     "{{ m.content }}",
     "{% if m.content is string %}{{ m.content }}{% else %}{% for part in m.content %}"
-    f"{{% if part.type == 'image' %}}{BEGINS}{PICTURE}{ENDS}{{% else %}}{{{{ part.text }}}}{{% endif %}}"
+    f"{{% if part.type == 'image' %}}{BEGINS}{PICTURE}{ENDS}{{% else %}}{{{{ part.text }}}}{{% "
+    f"endif %}}"
     "{% endfor %}{% endif %}",
 )
 VISION = Vision(512, 256, patch_px=16, merge=2)  # as Qwen3-VL's
 LAYERS, HIDDEN, HEADS, HEAD = 4, 96, 3, 32
 EYES = {  # its vision encoder: a quarter of the weights
-    "depth": 2, "hidden_size": 48, "intermediate_size": 96, "num_heads": 3, "out_hidden_size": HIDDEN,
-    "patch_size": VISION.patch_px, "spatial_merge_size": VISION.merge, "deepstack_visual_indexes": [],
+    "depth": 2,
+    "hidden_size": 48,
+    "intermediate_size": 96,
+    "num_heads": 3,
+    "out_hidden_size": HIDDEN,
+    "patch_size": VISION.patch_px,
+    "spatial_merge_size": VISION.merge,
+    "deepstack_visual_indexes": [],
     "num_position_embeddings": 256,
-}  # fmt: skip
+}
 
 
 def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
-    """Make a `Qwen3ForCausalLM` of half a million random weights, or a `Qwen3VLForConditionalGeneration`.
+    """Make a `Qwen3ForCausalLM` of half a million random weights,
+    or a `Qwen3VLForConditionalGeneration`.
 
-    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual stream. One that
-    `sees` takes pictures; `tokenizer` is a `tokenizers.Tokenizer`.
+    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual
+    stream. One that `sees` takes pictures; `tokenizer` is a `tokenizers.Tokenizer`.
     """
     import torch
     import transformers
@@ -52,36 +67,56 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
     torch.manual_seed(seed)
     ids = tokenizer.token_to_id
     text = {
-        "vocab_size": tokenizer.get_vocab_size(), "hidden_size": HIDDEN, "intermediate_size": 320,
-        "num_hidden_layers": LAYERS, "num_attention_heads": HEADS, "num_key_value_heads": 1, "head_dim": HEAD,
-        "max_position_embeddings": CONTEXT_TOKENS, "eos_token_id": ids(END), "pad_token_id": ids(PAD),
+        "vocab_size": tokenizer.get_vocab_size(),
+        "hidden_size": HIDDEN,
+        "intermediate_size": 320,
+        "num_hidden_layers": LAYERS,
+        "num_attention_heads": HEADS,
+        "num_key_value_heads": 1,
+        "head_dim": HEAD,
+        "max_position_embeddings": CONTEXT_TOKENS,
+        "eos_token_id": ids(END),
+        "pad_token_id": ids(PAD),
         "bos_token_id": None,
-    }  # fmt: skip
+    }
     if sees:
         # A third of the frequencies each for time, height and width, in turn.
         shares = [-(-(HEAD // 2 - axis) // 3) for axis in range(3)]
-        rope = {"rope_type": "default", "rope_theta": 10000.0, "mrope_section": shares,
-                "mrope_interleaved": True}  # fmt: skip
+        rope = {
+            "rope_type": "default",
+            "rope_theta": 10000.0,
+            "mrope_section": shares,
+            "mrope_interleaved": True,
+        }
         model = transformers.Qwen3VLForConditionalGeneration(
             transformers.Qwen3VLConfig(
-                text_config={**text, "rope_parameters": rope}, vision_config=EYES, tie_word_embeddings=True,
-                image_token_id=ids(PICTURE), video_token_id=ids(VIDEO), vision_start_token_id=ids(BEGINS),
+                text_config={**text, "rope_parameters": rope},
+                vision_config=EYES,
+                tie_word_embeddings=True,
+                image_token_id=ids(PICTURE),
+                video_token_id=ids(VIDEO),
+                vision_start_token_id=ids(BEGINS),
                 vision_end_token_id=ids(ENDS),
             )
-        )  # fmt: skip
+        )
         model.generation_config.update(eos_token_id=ids(END), pad_token_id=ids(PAD))
         embed = model.model.visual.patch_embed
-        # A convolution whose stride is its size is a product of matrices, and takes many times as long.
+        # A convolution whose stride is its size is a product of matrices, and takes many times as
+        # long.
         embed.forward = lambda patches: torch.nn.functional.linear(
             patches, embed.proj.weight.flatten(1), embed.proj.bias
         )
     else:
-        model = transformers.Qwen3ForCausalLM(transformers.Qwen3Config(**text, tie_word_embeddings=True))
+        model = transformers.Qwen3ForCausalLM(
+            transformers.Qwen3Config(**text, tie_word_embeddings=True)
+        )
     with torch.no_grad():
         for name, p in model.named_parameters():
             if p.ndim == 2:
                 std = 0.04 if "embed" in name else 1 / math.sqrt(p.shape[1])
-                residual = "o_proj" in name or "down_proj" in name or "attn.proj" in name or "fc2" in name
+                residual = (
+                    "o_proj" in name or "down_proj" in name or "attn.proj" in name or "fc2" in name
+                )
                 p.normal_(0.0, std / (math.sqrt(2 * LAYERS) if residual else 1.0))
     return model
 
@@ -105,7 +140,8 @@ def take_over(model: Any, base: Path) -> None:
             place[: len(values)] = values
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise UserError(
-            f"--base {printable(base)}: {printable(str(error), 160)}; give the folder of a model that "
+            f"--base {printable(base)}: {printable(str(error), 160)}; give the folder of a model "
+            "that "
             "`harness model distill` made of text prompts"
         ) from None
 
@@ -116,21 +152,28 @@ def image_processor() -> Any:
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     pixels = {"shortest_edge": 1 << 12, "longest_edge": 1 << 20}
-    return Qwen2VLImageProcessorPil(patch_size=VISION.patch_px, merge_size=VISION.merge, size=pixels)
+    return Qwen2VLImageProcessorPil(
+        patch_size=VISION.patch_px, merge_size=VISION.merge, size=pixels
+    )
 
 
 def read_tokenizer(base: Path, sees: bool) -> Any:
-    """Read a model's tokenizer; for one that `sees`, add the tokens around pictures behind its own."""
+    """Read a model's tokenizer; for one that `sees`,
+    add the tokens around pictures behind its own.
+    """
     from tokenizers import Tokenizer
 
-    built = Tokenizer.from_str(tokenizer_of(base).to_str())  # of its own: that one is kept for others
+    # of its own: that one is kept for others
+    built = Tokenizer.from_str(tokenizer_of(base).to_str())
     if sees:
         built.add_special_tokens(_special(MARKS))
     return built
 
 
 def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
-    """Train a byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser: every digit stands alone."""
+    """Train a byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser:
+    every digit stands alone.
+    """
     from tokenizers import models, pre_tokenizers, trainers
 
     tokenizer = byte_level(models.BPE())
@@ -157,12 +200,16 @@ def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
     A picture's mark stands there once for each of its tokens.
     """
     picture = f"{BEGINS}{PICTURE * VISION.tokens}{ENDS}"
-    parts = [f"{START}{m['role']}\n{picture * ('image' in m)}{m['content']}{END}\n" for m in messages]
+    parts = [
+        f"{START}{m['role']}\n{picture * ('image' in m)}{m['content']}{END}\n" for m in messages
+    ]
     return parts[0], "".join(parts[1:]) + f"{START}assistant\n"
 
 
 def save_tokenizer(tokenizer: Any, folder: Path) -> None:
-    """Write it as transformers reads it, chat template included, and what makes patches of pictures."""
+    """Write it as transformers reads it, chat template included,
+    and what makes patches of pictures.
+    """
     from transformers import PreTrainedTokenizerFast
 
     fast = PreTrainedTokenizerFast(

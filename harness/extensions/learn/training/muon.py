@@ -1,8 +1,8 @@
 """Muon in float32, for CPUs: matrices move along the orthogonal factor of their momentum.
 
-After Jordan et al., "Muon: an optimizer for hidden layers in neural networks" (2024), with the step size of
-Liu et al., "Muon is scalable for LLM training" (2025). PyTorch's own computes in bfloat16, which
-a CPU without such arithmetic emulates: much of a training step goes there.
+After Jordan et al., "Muon: an optimizer for hidden layers in neural networks" (2024), with the step
+size of Liu et al., "Muon is scalable for LLM training" (2025). PyTorch's own computes in bfloat16,
+which a CPU without such arithmetic emulates: much of a training step goes there.
 """
 
 from collections.abc import Callable, Iterable
@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-QUINTIC = (3.4445, -4.7750, 2.0315)  # Jordan et al.: steepest at zero, singular values end in 0.7 to 1.2
+# Jordan et al.: steepest at zero, singular values end in 0.7 to 1.2
+QUINTIC = (3.4445, -4.7750, 2.0315)
 STEPS = 5
 
 
@@ -42,7 +43,9 @@ def _shape(p: Any) -> tuple[int, int]:
 
 
 def orthogonal(m: Any) -> Any:
-    """Matrices (n, rows, columns) with their singular values near 1, by Newton and Schulz's iteration."""
+    """Matrices (n, rows, columns) with their singular values near 1,
+    by Newton and Schulz's iteration.
+    """
     if m.shape[1] > m.shape[2]:
         return orthogonal(m.mT).mT
     x = m / m.norm(dim=(1, 2), keepdim=True).clamp(min=1e-7)

@@ -1,8 +1,9 @@
 """A run's questions with the answers that they should have had, as chats for fine-tuning.
 
-A line a question, in TRL's conversational form: a prompt, and its completion or a chosen and a rejected one.
-The answer states the soft label of `lessons.py`, with the outcomes of the dataset's decision trees: the best
-action has most of it. Chats are messages, since a chat template is the model's own.
+A line a question, in TRL's conversational form: a prompt, and its completion or a chosen and a
+rejected one. The answer states the soft label of `lessons.py`, with the outcomes of the dataset's
+decision trees: the best action has most of it. Chats are messages, since a chat template is the
+model's own.
 """
 
 from collections.abc import Collection, Iterator
@@ -33,23 +34,30 @@ ROUNDING = 1e-9  # of probabilities that sum to 1
 
 
 def write(
-    run: Run, path: Path, report_seeds_too: bool, dataset: Path | None = None, margin: float | None = None
+    run: Run,
+    path: Path,
+    report_seeds_too: bool,
+    dataset: Path | None = None,
+    margin: float | None = None,
 ) -> Path:
     """Write a run's pairs to a file, with a `margin` its preferences, and return its path.
 
     Raises UserError if the run was driven, its dataset or prompt is not here as it was, or, where
-    `report_seeds_too` is false, its layouts are not those of their seeds or numbers are reported of them.
+    `report_seeds_too` is false, its layouts are not those of their seeds or numbers are reported of
+    them.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
         raise UserError(
-            f"{option}: {printable(run.path)} was driven, and only frozen scenes know what each action leads "
+            f"{option}: {printable(run.path)} was driven, and only frozen scenes know what each "
+            "action leads "
             "to; give a run of `harness eval`"
         )
     if not report_seeds_too:
         what = f"{option} {printable(path)}: {printable(run.path)}"
         _check_seeds(what, {episode.layout_seed for episode in run.episodes})
-        # What a run says of its layouts is a table that may be edited; its questions are the dataset's.
+        # What a run says of its layouts is a table that may be edited; its questions are the
+        # dataset's.
         layouts = dataset_of(run, dataset).of_episodes(run.grid.episodes)
         _check_seeds(what, layouts.seeds)
         rebuilt.refuse(layouts)
@@ -64,26 +72,31 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
     if most >= FIRST["report"]:
         raise UserError(
             f"{what} has {stated(least, most - least + 1)}, and a model that "
-            "learns from them can no longer be measured on them; make a run on a dataset of train seeds, "
+            "learns from them can no longer be measured on them; make a run on a dataset of train "
+            "seeds, "
             f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
         )
 
 
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield what each viewer was asked, fusion calls included, and the answer that the tree asks for.
+    """Yield what each viewer was asked, fusion calls included,
+    and the answer that the tree asks for.
 
-    A decision point after which no action succeeds teaches nothing and is left out. The dataset is the one
-    that the run states, or lies in `folder`. Raises UserError if it or the prompt is not here as it was.
+    A decision point after which no action succeeds teaches nothing and is left out. The dataset is
+    the one that the run states, or lies in `folder`. Raises UserError if it or the prompt is not
+    here as it was.
     """
     for asked, completion, _ in _answered(run, folder):
         yield {"prompt": asked.pop("prompt"), "completion": _said(completion), **asked}
 
 
 def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the same with the model's own answer as the rejected one, where it is worth less by `margin`.
+    """Yield the same with the model's own answer as the rejected one,
+    where it is worth less by `margin`.
 
-    An answer is worth the probability with which its distribution leaves success possible; one that cannot be
-    read is worth nothing, and of a read-out the likeliest letter counts. What got no answer is left out.
+    An answer is worth the probability with which its distribution leaves success possible; one that
+    cannot be read is worth nothing, and of a read-out the likeliest letter counts. What got no
+    answer is left out.
     """
     for asked, completion, stored in _answered(run, folder):
         values, p, raw = asked["values"], stored.intent, stored.raw
@@ -95,9 +108,12 @@ def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator
         least = float(np.dot(asked["probabilities"], values)) - margin
         if stored.error is None and raw.strip() and worth <= least + ROUNDING:
             yield {
-                "prompt": asked.pop("prompt"), "chosen": _said(completion), "rejected": _said(raw),
-                **asked, "value_rejected": worth,
-            }  # fmt: skip
+                "prompt": asked.pop("prompt"),
+                "chosen": _said(completion),
+                "rejected": _said(raw),
+                **asked,
+                "value_rejected": worth,
+            }
 
 
 def _said(text: str) -> list[dict[str, str]]:
@@ -105,18 +121,22 @@ def _said(text: str) -> list[dict[str, str]]:
 
 
 def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], str, Answer]]:
-    """Yield each question with its labels, the answer that its tree asks for, and the one that was given."""
+    """Yield each question with its labels, the answer that its tree asks for,
+    and the one that was given.
+    """
     prompts = {}
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         version, sha256 = (agent["prompt"][key] for key in ("version", "sha256"))
         if (prompt := prompt_of(run, agent["prompt"])) is None:
             raise UserError(
                 f"{printable(run.path)} was made with prompt {printable(version)} with sha256 "
-                f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the run again"
+                f"{printable(sha256, 13)}, which is not here as it was; restore it, or make the "
+                "run again"
             )
         if prompt.image and agent["image"] != "none":
             raise UserError(
-                f"{printable(run.path)} showed pictures by prompt {printable(version)}, and the file "
+                f"{printable(run.path)} showed pictures by prompt {printable(version)}, and the "
+                "file "
                 "holds texts alone; give a run with --image none, or of another prompt"
             )
         prompts[version] = prompt
@@ -136,8 +156,10 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
         for stored in (each for each in answers.values() if BLIND not in each.key):
             if stored.viewer not in scene.graphs:
                 raise UserError(
-                    f"{printable(run.path / 'answers.jsonl')} has an answer of {printable(stored.viewer)!r} "
-                    f"in {scene.id}, where {', '.join(scene.viewers)} were asked; make the run again"
+                    f"{printable(run.path / 'answers.jsonl')} has an answer of "
+                    f"{printable(stored.viewer)!r} "
+                    f"in {scene.id}, where {', '.join(scene.viewers)} were asked; make the run "
+                    "again"
                 )
             agent = run.agent(stored)
             prompt = prompts[agent["prompt"]["version"]]
@@ -157,8 +179,13 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
             seed = int(scene.record.episode_seed)
             safe = forest.safe[forest.place[scene.id]]
             asked = {
-                "prompt": sent, "scene": scene.id, "viewer": stored.key, "layout_seed": seed,
-                "purpose": purpose(seed, 1), "actions": list(q.actions),
-                "probabilities": q.label.tolist(), "values": safe.astype(float).tolist(),
-            }  # fmt: skip
+                "prompt": sent,
+                "scene": scene.id,
+                "viewer": stored.key,
+                "layout_seed": seed,
+                "purpose": purpose(seed, 1),
+                "actions": list(q.actions),
+                "probabilities": q.label.tolist(),
+                "values": safe.astype(float).tolist(),
+            }
             yield asked, completion, stored

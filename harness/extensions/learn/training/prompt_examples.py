@@ -1,4 +1,6 @@
-"""Examples for a prompt version: decision points of train layouts, answered as their outcomes ask for."""
+"""Examples for a prompt version: decision points of train layouts,
+answered as their outcomes ask for.
+"""
 
 from collections.abc import Callable
 
@@ -16,19 +18,22 @@ from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
 PATIENCE = 8  # layouts that are passed over, at most, for want of an action that was shown less
-Candidate = tuple[SceneGraph, Floats, int]  # a scene graph, its soft label (A,), and its best action's number
+# a scene graph, its soft label (A,), and its best action's number
+Candidate = tuple[SceneGraph, Floats, int]
 
 
 def examples(
     prompt: Prompt, scenario: Scenario, count: int, first_seed: int, progress: Callable[[int], None]
 ) -> Examples:
-    """Draw `count` examples for each role, 1 or more, each from a layout of its own from `first_seed` on.
+    """Draw `count` examples for each role, 1 or more,
+    each from a layout of its own from `first_seed` on.
 
-    Of a layout's decision points, one is taken whose best action the role's examples have shown least so far,
-    the most careful of such actions first, and whose viewer sees a conflict, so that there is a reason to be
-    seen; a keyed draw decides between equals. A layout in which nothing is safe is passed over, and so are a
-    few whose best actions have all been shown oftener than others. `progress` is called with 1 for each
-    layout that gave examples. Raises UserError if the train seeds end before there are enough.
+    Of a layout's decision points, one is taken whose best action the role's examples have shown
+    least so far, the most careful of such actions first, and whose viewer sees a conflict, so that
+    there is a reason to be seen; a keyed draw decides between equals. A layout in which nothing is
+    safe is passed over, and so are a few whose best actions have all been shown oftener than
+    others. `progress` is called with 1 for each layout that gave examples. Raises UserError if the
+    train seeds end before there are enough.
     """
     chosen: dict[str, list[Example]] = {role: [] for role in ROLES}
     times = {role: [0] * len(scenario.actions) for role in ROLES}
@@ -36,17 +41,24 @@ def examples(
     while len(chosen["ego"]) < count:
         if purposes(seed, 1) != ["train"]:
             raise UserError(
-                f"--first-seed {first_seed}: layout seed {seed} is no train seed; give {FIRST['train']} to "
+                f"--first-seed {first_seed}: layout seed {seed} is no train seed; give "
+                f"{FIRST['train']} to "
                 f"{FIRST['report'] - 1}"
             )
         if points := decision_points(scenario, seed, 0):
-            picked = {role: point for role in ROLES if (point := _pick(points, role, times[role], seed))}
-            rare = all(times[role][best] == min(times[role]) for role, (_, _, best) in picked.items())
+            picked = {
+                role: point for role in ROLES if (point := _pick(points, role, times[role], seed))
+            }
+            rare = all(
+                times[role][best] == min(times[role]) for role, (_, _, best) in picked.items()
+            )
             passed = 0 if rare or passed == PATIENCE else passed + 1
             if not passed:
                 for role, (graph, label, best) in picked.items():
                     times[role][best] += 1
-                    chosen[role].append(Example(seed, graph, answer(prompt, graph, label, scenario.actions)))
+                    chosen[role].append(
+                        Example(seed, graph, answer(prompt, graph, label, scenario.actions))
+                    )
                 progress(1)
         seed += 1
     return Examples(scenario.name, ego=tuple(chosen["ego"]), helper=tuple(chosen["helper"]))

@@ -1,4 +1,6 @@
-"""A published model that is taught: opened as it is evaluated, its chat template and tokenizer kept."""
+"""A published model that is taught: opened as it is evaluated,
+its chat template and tokenizer kept.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,19 +36,24 @@ class Adapt:
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
-    dtype: Literal["float32", "bfloat16"] = "float32"  # in which its layers compute; weights are float32
-    report: float = 0.3  # weight of the words behind a letter, which it learns soon, beside the letter's KL
+    # in which its layers compute; weights are float32
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    # weight of the words behind a letter, which it learns soon, beside the letter's KL
+    report: float = 0.3
 
 
 class Published:
     """A published model of texts that learns, and how it reads a chat."""
 
     def __init__(self, card: Card, adapt: Adapt, seed: int, device: str) -> None:
-        """Open a card's weights on transformers. Raises UserError if they cannot be found or taught."""
+        """Open a card's weights on transformers.
+        Raises UserError if they cannot be found or taught.
+        """
         where = checkpoint(card)
         hub, self.model = load(card, where, dtype="float32", device=device)
         self.card, self.hub = card, hub
-        if torch.device(device).type == "cpu":  # whose fused attention goes back more slowly than matrices do
+        # whose fused attention goes back more slowly than matrices do
+        if torch.device(device).type == "cpu":
             self.model.set_attn_implementation("eager")
         self.sha256 = _digest(card, where)
         self.chat = Chat(card.name, HubTokenizer(hub), None, card.system)
@@ -63,7 +70,9 @@ class Published:
             trunk.forward = torch.autocast(torch.device(device).type, torch.bfloat16)(trunk.forward)
 
     def read(self, messages: Sequence[Mapping[str, str]]) -> tuple[NDArray[np.int32], int, str]:
-        """Return a prompt's tokens, how many of them all of its kind share, and a name for that kind."""
+        """Return a prompt's tokens, how many of them all of its kind share,
+        and a name for that kind.
+        """
         ids = self.encode(self.chat.render(messages, thinking=False))
         kind = "\n".join(message["content"] for message in messages[:-1])
         if kind not in self._heads:
@@ -77,7 +86,9 @@ class Published:
         """Return the token of each letter. Raises UserError if one is none."""
         tokens = [self.encode(text) for text in texts]
         if any(len(each) != 1 for each in tokens):
-            raise UserError(f"--base {printable(self.card.name)}: a letter of {texts} is no token of its own")
+            raise UserError(
+                f"--base {printable(self.card.name)}: a letter of {texts} is no token of its own"
+            )
         return [token for (token,) in tokens]
 
     def write(self, out: Path, weights: Mapping[str, Any]) -> None:
@@ -90,11 +101,16 @@ class Published:
         self.hub.save_pretrained(out)
 
     def _check(self) -> None:
-        """Raise UserError if a model's logits are more than its states times its output embedding."""
+        """Raise UserError if a model's logits are more than its states times its output
+        embedding.
+        """
         with torch.no_grad():
             ids = torch.tensor([self.encode("Answer with one letter.")], device=self.model.device)
             states = self.model.base_model(ids).last_hidden_state
-            ours, theirs = states @ self.model.get_output_embeddings().weight.T, self.model(ids).logits
+            ours, theirs = (
+                states @ self.model.get_output_embeddings().weight.T,
+                self.model(ids).logits,
+            )
         if (ours - theirs).abs().max() > _TELLING * max(1.0, float(theirs.abs().max())):
             raise UserError(
                 f"--base {printable(self.card.name)} changes its logits, which is not taught here"
@@ -102,33 +118,46 @@ class Published:
 
 
 def base_name(card: Card) -> str:
-    """Return what `--model` opens a base by, on any engine: the name of its card file, a path or an id."""
+    """Return what `--model` opens a base by, on any engine:
+    the name of its card file, a path or an id.
+    """
     named = argument(card)
     return named.partition(":")[0] if named == card.name else named
 
 
 def _digest(card: Card, where: Path) -> str:
-    """Return the sha256 of a model's weights: of its GGUF file or its only shard, else its commit."""
+    """Return the sha256 of a model's weights:
+    of its GGUF file or its only shard, else its commit.
+    """
     file = find_gguf(card) if is_gguf(card) else where / WEIGHTS
     return sha256_file(file) if file.is_file() else str(hub_commit(where))
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
-    """Write README.md of a taught model's folder from what `distill` returns: base, data and losses."""
+    """Write README.md of a taught model's folder from what `distill` returns:
+    base, data and losses.
+    """
     plan, adapt = facts["plan"], facts["plan"]["adapt"]
     losses = "\n".join(
         f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} | "
         f"{curve[-1][2]:.3f} |"
-        for stage, curve in facts["curves"].items() if curve
-    )  # fmt: skip
+        for stage, curve in facts["curves"].items()
+        if curve
+    )
     held_out = "\n".join(
-        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | {row['questions']} "
+        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
+        f"{row['questions']} "
         f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
-        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} | {row['value_of_the_likeliest']:.3f} "
+        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} | "
+        f"{row['value_of_the_likeliest']:.3f} "
         f"| {_shares(row['likeliest'])} |"
         for row in facts["held_out"]
     )
-    kind = f"A LoRA adapter of rank {adapt['rank']} for" if adapt["rank"] else "All weights, taught, of"
+    kind = (
+        f"A LoRA adapter of rank {adapt['rank']} for"
+        if adapt["rank"]
+        else "All weights, taught, of"
+    )
     licence = facts["licence"] or "not stated"
     first, count = facts["first_seed"], facts["layouts"]
     scenarios = "; ".join(f"`{spelling}`" for spelling in facts["spellings"])
@@ -169,11 +198,13 @@ The value of who needs no model, at the same questions:
 prompts that show nothing but the conflicts, `messages` after it with helpers' messages in the ego's prompt.
 `answers` is the JSON text, which states the read-out's own distribution. A stage of no sequences was left
 out. The losses are of different sums and compare within a stage only; curves are in `training.json`.
-"""
+"""  # noqa: E501
 
 
 def references_table(facts: Mapping[str, Any]) -> str:
-    """Return a Markdown table of the value of those who need no model, beside the model's, by scenario."""
+    """Return a Markdown table of the value of those who need no model,
+    beside the model's, by scenario.
+    """
     names = dict.fromkeys(name for row in facts["held_out"] for name in row["references"])
     lines = [f"| scenario | the model | {' | '.join(f'`{name}`' for name in names)} |"]
     lines.append("|---|---|" + "---|" * len(names))

@@ -64,7 +64,9 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 
 
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
-    """Repeat the questions that have conflicts or a picture, with no text in them but the conflicts."""
+    """Repeat the questions that have conflicts or a picture,
+    with no text in them but the conflicts.
+    """
     for q in questions:
         if q.graph.conflicts or q.image:
             shown = structs.replace(q.graph, nodes=(), sectors=())
@@ -75,7 +77,9 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
 def with_messages(
     lessons: Lessons, scenes: Sequence[Scene], intents: Mapping[str, Floats]
 ) -> Iterator[Question]:
-    """Ask the ego with what some of its helpers sent; `intents` are the helpers' read-outs, by key."""
+    """Ask the ego with what some of its helpers sent;
+    `intents` are the helpers' read-outs, by key.
+    """
     for scene in scenes:
         ego, *helpers = scene.viewers
         for prompt in lessons.prompts:
@@ -91,7 +95,11 @@ def with_messages(
 
 
 def question(
-    lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt, heard: Sequence[Mapping[str, Any]] = ()
+    lessons: Lessons,
+    scene: Scene,
+    viewer: str,
+    prompt: Prompt,
+    heard: Sequence[Mapping[str, Any]] = (),
 ) -> Question:
     """Return what a viewer is asked in a scene, with the messages that it heard."""
     graph, scenario = scene.graphs[viewer], lessons.scenario
@@ -108,14 +116,17 @@ def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
 
 
 def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
-    """Return the mean probability that answers (n, A) give to actions after which the episode succeeds.
+    """Return the mean probability that answers (n, A) give to actions after which the episode
+    succeeds.
 
     Those are the actions that the soft labels (n, A) give any.
     """
     return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
 
 
-def references(questions: Sequence[Question], labels: Floats, weights: Sequence[float]) -> dict[str, float]:
+def references(
+    questions: Sequence[Question], labels: Floats, weights: Sequence[float]
+) -> dict[str, float]:
     """Return the value of those who need no model: lines beside a model's, by the driver's name."""
     scenario = questions[0].scenario
     each = np.eye(len(scenario.actions))

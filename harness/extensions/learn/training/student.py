@@ -52,7 +52,8 @@ BARE = 0.25  # texts without free text, as constrained answers are; a share of a
 HELD_OUT = 0.05  # layouts that are not trained on, a share of all
 WATCHED = 256  # most questions of held-out layouts that are read along the way
 
-Progress = Callable[..., None]  # of the stage, the sequences seen in it, the loss, and what is watched
+# of the stage, the sequences seen in it, the loss, and what is watched
+Progress = Callable[..., None]
 T = TypeVar("T")
 
 
@@ -60,7 +61,12 @@ class Student:
     """The lessons as questions, the tokenizer, and the model as it grows."""
 
     def __init__(
-        self, lessons: Sequence[Lessons], plan: Plan, work: Path, device: str, base: Path | Card | None = None
+        self,
+        lessons: Sequence[Lessons],
+        plan: Plan,
+        work: Path,
+        device: str,
+        base: Path | Card | None = None,
     ) -> None:
         self.plan, self.work = plan, work
         self.lessons, self.held_out = zip(*(each.split(HELD_OUT) for each in lessons), strict=True)
@@ -73,7 +79,10 @@ class Student:
         if isinstance(base, Card):
             assert plan.adapt
             self.published = Published(base, plan.adapt, plan.seed, device)
-            self.model, self.letters = self.published.model, self.published.letters(readout.letters(most))
+            self.model, self.letters = (
+                self.published.model,
+                self.published.letters(readout.letters(most)),
+            )
             return
         self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
@@ -88,12 +97,13 @@ class Student:
             self.taught = {_place(q): intent for q, intent in zip(texts, read, strict=True)}
 
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
-        """Make samples that ask for one letter; drawn by the target, it is followed by a report in words.
+        """Make samples that ask for one letter;
+        drawn by the target, it is followed by a report in words.
 
-        The target is the label. A picture's is what the base reads out of the same viewer's scene graph in
-        words, if it learns both: a label depends on what nobody sees as well, which is noise to an eye that
-        has yet to open. The report is of the nearest conflict, or of whom the picture shows, where there is
-        one and `seen` is true.
+        The target is the label. A picture's is what the base reads out of the same viewer's scene
+        graph in words, if it learns both: a label depends on what nobody sees as well, which is
+        noise to an eye that has yet to open. The report is of the nearest conflict, or of whom the
+        picture shows, where there is one and `seen` is true.
         """
         rng = np.random.default_rng(self.plan.seed)
         samples = []
@@ -111,7 +121,10 @@ class Student:
             answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named)
             for q, p, b in zip(questions, intents, bare, strict=True)
         ]
-        return [self._sample(q, q.messages, text, None) for q, text in zip(questions, replies, strict=True)]
+        return [
+            self._sample(q, q.messages, text, None)
+            for q, text in zip(questions, replies, strict=True)
+        ]
 
     @cached_property
     def asked(self) -> list[Sample]:
@@ -120,7 +133,8 @@ class Student:
 
     @cached_property
     def heard(self) -> list[Question]:
-        """Return the ego's questions with messages in some scenes; the first stages' model states them.
+        """Return the ego's questions with messages in some scenes;
+        the first stages' model states them.
 
         Raises UserError if no message reaches the ego in the scenes that are taken.
         """
@@ -135,7 +149,9 @@ class Student:
             for prompt in each.prompts
         }
         spoke = [
-            (q.key, sample) for q, sample in zip(self.questions, self.asked, strict=True) if q.key in helpers
+            (q.key, sample)
+            for q, sample in zip(self.questions, self.asked, strict=True)
+            if q.key in helpers
         ]
         file = self.work / "heard.pt"
         if not file.is_file():  # after a kill, a later stage's model would read otherwise
@@ -146,8 +162,10 @@ class Student:
         heard = [q for each, scenes in some for q in with_messages(each, scenes, intents)]
         if not heard:
             raise UserError(
-                f"--samples: {self.plan.samples['messages']} sequences of the stage messages take too few "
-                "scenes: no message reaches the ego in them; give more, or a scenario with more helpers"
+                f"--samples: {self.plan.samples['messages']} sequences of the stage messages take "
+                "too few "
+                "scenes: no message reaches the ego in them; give more, or a scenario with more "
+                "helpers"
             )
         return heard
 
@@ -161,9 +179,12 @@ class Student:
         with_heard = self.reading(heard)
         if stage == "messages":
             return with_heard + self.some(self.asked, len(heard))
-        # As many texts of the ego, alone and with messages, as of all helpers: each decision needs the ego's.
+        # As many texts of the ego, alone and with messages, as of all helpers: each decision needs
+        # the ego's.
         pairs = list(zip(self.questions, self.asked, strict=True))
-        kinds = [[pair for pair in pairs if pair[0].graph.role == role] for role in ("helper", "ego")]
+        kinds = [
+            [pair for pair in pairs if pair[0].graph.role == role] for role in ("helper", "ego")
+        ]
         kinds.append(list(zip(heard, with_heard, strict=True)))
         most = self.plan.samples["answers"] // 6
         stated = [pair for kind in kinds for pair in self.some(kind, most)]
@@ -176,7 +197,9 @@ class Student:
         return [items[i] for i in sorted(places)]
 
     def stage(self, name: str, progress: Progress) -> Curve:
-        """Train one stage, or read it if it is done already; return its curve, empty without sequences."""
+        """Train one stage, or read it if it is done already;
+        return its curve, empty without sequences.
+        """
         done = self.work / f"{name}.pt"
         if done.is_file():
             state = torch.load(done, weights_only=True, map_location=self.model.device)
@@ -187,9 +210,16 @@ class Student:
         if not count:
             return []
         curve = run_stage(
-            self.model, self.samples(name), self.letters, self.digits, count, self.plan, show, going,
+            self.model,
+            self.samples(name),
+            self.letters,
+            self.digits,
+            count,
+            self.plan,
+            show,
+            going,
             self._watched if self.published or self.plan.objective != "imitation" else tuple,
-        )  # fmt: skip
+        )
         save({"model": learnt(self.model), "curve": curve}, done)
         going.unlink(missing_ok=True)
         return curve
@@ -209,7 +239,9 @@ class Student:
         return kl_nats(labels, read), value(labels, read, [sample.weight for sample in samples])
 
     def rounded(self) -> dict[str, Any]:
-        """Round what learnt to F16, so that every engine reads the same numbers, and return all weights."""
+        """Round what learnt to F16, so that every engine reads the same numbers,
+        and return all weights.
+        """
         halves: dict[int, Any] = {}  # by address, since some have two names
         with torch.no_grad():
             for p in (p for p in self.model.parameters() if p.requires_grad):
@@ -220,9 +252,9 @@ class Student:
     def held_out_facts(self) -> list[dict[str, Any]]:
         """Return how each scenario's read-out fits the soft labels on held-out layouts.
 
-        That is its KL (nats), and its value, balanced over layouts with and without a danger. Beside them
-        stand those of always answering the mean label, the value of its likeliest action, and that of who
-        needs no model.
+        That is its KL (nats), and its value, balanced over layouts with and without a danger.
+        Beside them stand those of always answering the mean label, the value of its likeliest
+        action, and that of who needs no model.
         """
         facts = []
         for each in self.held_out:
@@ -253,11 +285,17 @@ class Student:
         return read_out(self.model, samples, self.letters)
 
     def _sample(
-        self, question: Question, messages: Sequence[Mapping[str, str]], reply: str, target: Floats | None
+        self,
+        question: Question,
+        messages: Sequence[Mapping[str, str]],
+        reply: str,
+        target: Floats | None,
     ) -> Sample:
         if self.published:
             prompt, shared, kind = self.published.read(messages)
-            ids = np.concatenate([prompt, self.published.encode(reply + self.published.end)], dtype=np.int32)
+            ids = np.concatenate(
+                [prompt, self.published.encode(reply + self.published.end)], dtype=np.int32
+            )
             return Sample(ids, shared, kind, len(prompt), target, question.weight)
         system, rest = chat(messages)
         if system not in self._shared:
@@ -283,6 +321,8 @@ class Student:
 
 
 def _place(question: Question) -> str:
-    """Name a question's scenario, scene and viewer, and whether messages are in it, whatever its prompt."""
+    """Name a question's scenario, scene and viewer, and whether messages are in it,
+    whatever its prompt.
+    """
     place, _, version = question.key.rpartition("/")
     return place + "+m" * version.endswith("+m")

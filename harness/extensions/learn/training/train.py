@@ -1,16 +1,17 @@
 """Training in four stages, each from the weights of the one before.
 
-1. `excerpts`: prompts that show nothing but the conflicts, so that reading the numbers is learnt on short
-   sequences. The read-out (one letter) is fitted to the soft label by KL, and a report in words follows it,
-   which names the gap between two arrivals.
+1. `excerpts`: prompts that show nothing but the conflicts, so that reading the numbers is learnt on
+   short sequences. The read-out (one letter) is fitted to the soft label by KL, and a report in
+   words follows it, which names the gap between two arrivals.
 2. `alone`: the same with whole prompts, of every viewer.
 3. `messages`: the ego with its helpers' read-outs as messages, the same loss; stage 2 is rehearsed.
-4. `answers`: the text. It states the read-out's own distribution: greedy text taught on the labels would give
-   their mode, not their mean.
+4. `answers`: the text. It states the read-out's own distribution:
+   greedy text taught on the labels would give their mode, not their mean.
 
-All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading the
-numbers in it has to come from somewhere. For the same reason each token of a picture says what it shows
-(`answers.cells`), in every stage. A batch shares its system message, which is computed once.
+All along the prompts' own tokens are learnt as well: a label is a bit or two a prompt, and reading
+the numbers in it has to come from somewhere. For the same reason each token of a picture says what
+it shows (`answers.cells`), in every stage. A batch shares its system message, which is computed
+once.
 """
 
 import math
@@ -36,8 +37,10 @@ from harness.world.perception.camera import Sight
 
 Objective = Literal["imitation", "values"]
 STAGES = ("excerpts", "alone", "messages", "answers")
-PROMPT_WEIGHT = 0.3  # of the cross-entropy of the prompt's own tokens, for a model that cannot read yet
-TEXT_WEIGHT = 3.0  # of that of the answer's: two thirds of these say nothing, and would drown the numbers
+# of the cross-entropy of the prompt's own tokens, for a model that cannot read yet
+PROMPT_WEIGHT = 0.3
+# of that of the answer's: two thirds of these say nothing, and would drown the numbers
+TEXT_WEIGHT = 3.0
 LOG_STEPS = 50  # the loss is averaged over so many steps
 CELLS_WEIGHT = 1.0  # of the cross-entropy of what each token of a picture shows
 SEEN_WEIGHT = 4.0  # of the read-out of a picture, which is small beside what else it is fitted to
@@ -52,12 +55,12 @@ class Sample:
     shared: int  # how many of them are the system message, equal in all samples of a `kind`
     kind: str  # names that system message
     answer_at: int  # where the answer starts
-    # what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a text from
-    # its first token
+    # what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
+    # text from its first token
     target: Floats | None
     weight: float = 1.0  # how often it is drawn, beside others
-    # the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one, or none
-    # has
+    # the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
+    # or none has
     image: Sight | None = None
 
 
@@ -76,22 +79,33 @@ class Plan:
     def settings(self) -> dict[str, Any]:
         """Return, as plain values, what a resumed training must have in common with its start."""
         settings = asdict(self)
-        if self.objective == "imitation":  # trainings that were begun before there was another say nothing
+        # trainings that were begun before there was another say nothing
+        if self.objective == "imitation":
             del settings["objective"]
         return settings
 
 
-Curve = list[tuple[Any, ...]]  # sequences seen, mean loss, and held-out KL and value if they are watched
+# sequences seen, mean loss, and held-out KL and value if they are watched
+Curve = list[tuple[Any, ...]]
 
 
 def run_stage(
-    model: Any, samples: Sequence[Sample], letters: Sequence[int], digits: Sequence[int], count: int,
-    plan: Plan, progress: Callable[..., None], going: Path, watch: Callable[[], Sequence[float]] = tuple,
-) -> Curve:  # fmt: skip
-    """Train on `count` sequences drawn from `samples`, resuming from the checkpoint `going` if there is one.
+    model: Any,
+    samples: Sequence[Sample],
+    letters: Sequence[int],
+    digits: Sequence[int],
+    count: int,
+    plan: Plan,
+    progress: Callable[..., None],
+    going: Path,
+    watch: Callable[[], Sequence[float]] = tuple,
+) -> Curve:
+    """Train on `count` sequences drawn from `samples`,
+    resuming from the checkpoint `going` if there is one.
 
-    `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are fitted to.
-    Returns, along the way, the sequences seen, the mean loss since the last, and what `watch` returns then.
+    `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are
+    fitted to. Returns, along the way, the sequences seen, the mean loss since the last, and what
+    `watch` returns then.
     """
     device = next(model.parameters()).device
     opts, rates = _optimizers(model, plan)
@@ -99,7 +113,8 @@ def run_stage(
     start, curve = 0, []
     losses: list[Any] = []
     if going.is_file():
-        state = torch.load(going, weights_only=True, map_location="cpu")  # where AdamW counts its steps
+        # where AdamW counts its steps
+        state = torch.load(going, weights_only=True, map_location="cpu")
         restore(model, state["model"])
         for opt, kept in zip(opts, state["opts"], strict=True):
             opt.load_state_dict(kept)
@@ -109,7 +124,9 @@ def run_stage(
     model.train()
     kept_s = time.monotonic()
     for step in range(start, len(batches)):
-        scale = max(0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches))))
+        scale = max(
+            0.02, min(1.0, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / len(batches)))
+        )
         for opt, rate in zip(opts, rates, strict=True):
             opt.param_groups[0]["lr"] = rate * scale
         batch = [samples[i] for i in batches[step]]
@@ -129,7 +146,13 @@ def run_stage(
         if time.monotonic() - kept_s > KEEP_S and step + 1 < len(batches):
             states = [opt.state_dict() for opt in opts]
             save(
-                {"model": learnt(model), "opts": states, "step": step + 1, "curve": curve, "losses": losses},
+                {
+                    "model": learnt(model),
+                    "opts": states,
+                    "step": step + 1,
+                    "curve": curve,
+                    "losses": losses,
+                },
                 going,
             )
             kept_s = time.monotonic()
@@ -141,9 +164,9 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
     learning = [(n, p) for n, p in model.named_parameters() if p.requires_grad]
     if plan.adapt:
         every = [p for _, p in learning]
-        return [torch.optim.AdamW(every, lr=plan.adapt.rate, weight_decay=0.0, betas=(0.9, 0.98))], [
-            plan.adapt.rate
-        ]
+        return [
+            torch.optim.AdamW(every, lr=plan.adapt.rate, weight_decay=0.0, betas=(0.9, 0.98))
+        ], [plan.adapt.rate]
     blocks = [p for n, p in learning if p.ndim == 2 and "embed" not in n]
     rest = [p for n, p in learning if p.ndim != 2 or "embed" in n]
     return [
@@ -154,7 +177,8 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
 
 def learnt(model: Any) -> dict[str, Any]:
     """Return a model's state without the weights that do not learn."""
-    every = model.named_parameters(remove_duplicate=False)  # an output embedding may be the input's as well
+    # an output embedding may be the input's as well
+    every = model.named_parameters(remove_duplicate=False)
     frozen = {name for name, p in every if not p.requires_grad}
     return {name: value for name, value in model.state_dict().items() if name not in frozen}
 
@@ -165,7 +189,9 @@ def restore(model: Any, state: Mapping[str, Any]) -> None:
 
 
 def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.int64]:
-    """Return each step's samples by number, (steps, batch): of one kind and like length, in random order."""
+    """Return each step's samples by number, (steps, batch):
+    of one kind and like length, in random order.
+    """
     rng = np.random.default_rng(plan.seed)
     weights = np.array([sample.weight for sample in samples])
     order = rng.choice(len(samples), count, p=weights / weights.sum())
@@ -198,11 +224,14 @@ def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
     cache.batch_repeat_interleave(len(batch))
     options = _pictures(model, batch, ids)
     states = model.base_model(ids[:, shared:], past_key_values=cache, use_cache=True, **options)
-    return states.last_hidden_state.float()  # in which letters are told apart, whatever layers compute in
+    # in which letters are told apart, whatever layers compute in
+    return states.last_hidden_state.float()
 
 
 def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
-    """Return what a model that sees takes beside tokens (n, width): patches, and where each token stands."""
+    """Return what a model that sees takes beside tokens (n, width):
+    patches, and where each token stands.
+    """
     images = [s.image.pixels for s in batch if s.image is not None]
     if not images:
         return {}
@@ -216,11 +245,14 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan: Plan) -> Any:
-    """Return how ill the read-out fits its target, plus mean cross-entropies of text and pictures."""
+    """Return how ill the read-out fits its target,
+    plus mean cross-entropies of text and pictures.
+    """
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
     rest = _padded([s.ids[shared:] for s in batch]).to(device)
-    picture = rest == getattr(model.config, "image_token_id", -1)  # a model of texts has no such token
+    # a model of texts has no such token
+    picture = rest == getattr(model.config, "image_token_id", -1)
     pictures = [s.image for s in batch if s.image is not None]  # of all or of none
     total = hidden.new_zeros(())
     if not plan.adapt:  # a published model can read
@@ -244,7 +276,9 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
     if writing:
         rows = np.concatenate([np.full(end - start, i) for i, start, end in writing])
         columns = np.concatenate([np.arange(start, end) for _, start, end in writing])
-        ids = np.concatenate([batch[i].ids[start:end] for i, start, end in writing]).astype(np.int64)
+        ids = np.concatenate([batch[i].ids[start:end] for i, start, end in writing]).astype(
+            np.int64
+        )
         row, column = (torch.from_numpy(at).to(device) for at in (rows, columns - shared - 1))
         text = F.cross_entropy(
             hidden[row, column] @ weight.T, torch.from_numpy(ids).to(device), reduction="none"
@@ -260,9 +294,9 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
 def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
     """Return the mean loss of letters' logits (n, A) beside soft labels (n, A), by the objective.
 
-    `imitation` is the KL to the label, in nats. `values` is what the stated distribution p loses of the value
-    that it can have, 1 - sum_a p(a) v(a), where v(a) is 1 if the episode succeeds after the action: its
-    gradient is the policy gradient, exact since the tree knows v of every action.
+    `imitation` is the KL to the label, in nats. `values` is what the stated distribution p loses of
+    the value that it can have, 1 - sum_a p(a) v(a), where v(a) is 1 if the episode succeeds after
+    the action: its gradient is the policy gradient, exact since the tree knows v of every action.
     """
     if objective == "imitation":
         return F.kl_div(F.log_softmax(logits, -1), labels, reduction="batchmean")
@@ -270,7 +304,8 @@ def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
 
 
 def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, picture: Any) -> Any:
-    """Return the cross-entropy of the prompt's own tokens behind the shared ones: it teaches numbers.
+    """Return the cross-entropy of the prompt's own tokens behind the shared ones:
+    it teaches numbers.
 
     Tokens that stand for a `picture` are none of them; like `ids`, that mask is (n, longest rest).
     """
@@ -281,15 +316,21 @@ def _prompt_loss(hidden: Any, weight: Any, batch: Sequence[Sample], ids: Any, pi
 
 
 def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
-    """Return the cross-entropy of what each picture's tokens show; vehicles and nobody weigh alike."""
+    """Return the cross-entropy of what each picture's tokens show;
+    vehicles and nobody weigh alike.
+    """
     shown = np.concatenate([cells(picture) for picture in pictures])
     target = torch.from_numpy(shown).to(logits.device)
-    weight = torch.full((logits.shape[1],), 1.0 / max(1, int((shown > 0).sum())), device=logits.device)
+    weight = torch.full(
+        (logits.shape[1],), 1.0 / max(1, int((shown > 0).sum())), device=logits.device
+    )
     weight[0] = 1.0 / max(1, int((shown == 0).sum()))
     return F.cross_entropy(logits, target, weight=weight, reduction="sum") / 2
 
 
-def read_out(model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64) -> list[Floats]:
+def read_out(
+    model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64
+) -> list[Floats]:
     """Return the distribution over the letters after each prompt, (A,) each."""
     model.eval()
     device = next(model.parameters()).device

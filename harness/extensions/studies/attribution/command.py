@@ -18,7 +18,9 @@ def command(
     sample: int = typer.Option(40, help="Number of decision points to draw at random, at most."),
     sample_seed: int = typer.Option(0, help="Seed of this draw."),
     condition: str | None = typer.Option(
-        None, help="Condition to draw decision points from. Default: 6g, or the run's last if it has no 6g."
+        None,
+        help="Condition to draw decision points from. Default: 6g, or the run's last if it has no "
+        "6g.",
     ),
     dataset: options.RunsDataset = None,
     model: options.RunModel = None,
@@ -29,8 +31,8 @@ def command(
 
     Each is left out of the prompt, or of the fusion, in turn.
 
-    The run's model is asked the questions that the run has no answer for, each once. `harness report` then
-    shows the result at each decision.
+    The run's model is asked the questions that the run has no answer for, each once. `harness
+    report` then shows the result at each decision.
     """
     from harness.extensions.studies.attribution.study import attribute, attribution_study, write
     from harness.studies.replayed_run import ReplayedRun

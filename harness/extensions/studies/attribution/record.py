@@ -1,4 +1,6 @@
-"""The file of a run's attribution, which `harness study attribute` writes: what moved its answers."""
+"""The file of a run's attribution, which `harness study attribute` writes:
+what moved its answers.
+"""
 
 from pathlib import Path
 from typing import Literal
@@ -13,11 +15,14 @@ FILE = "attribution.json"
 
 
 class LeftOut(Struct, frozen=True, kw_only=True):
-    """One object or message that was left out of a prompt or of the fusion, and what that changed."""
+    """One object or message that was left out of a prompt or of the fusion,
+    and what that changed.
+    """
 
     scene: str  # id of the decision point
     episode: int  # the episode's number
-    seed: int | None  # seed of the channel's draws, if a message was left out of a decision; None otherwise
+    # seed of the channel's draws, if a message was left out of a decision; None otherwise
+    seed: int | None
     viewer: str  # id of the vehicle whose answer changes; that of the ego for a policy
     # what the item was left out of: the prompt of the `ego` or a `helper`, or the `fusion`
     role: Literal["ego", "helper", "fusion"]

@@ -26,7 +26,12 @@ class Remarks:
             if a := of_run(run):
                 by_shift = sorted(a.left_out, key=lambda each: -(each.shift or 0.0))
                 scenes = list(dict.fromkeys(each.scene for each in by_shift))[:MOVED]
-                drawn = {"run": n, "condition": a.condition, "n": a.decision_points, "scenes": scenes}
+                drawn = {
+                    "run": n,
+                    "condition": a.condition,
+                    "n": a.decision_points,
+                    "scenes": scenes,
+                }
                 yield Markup(template.render(text=drawn, runs=runs))
 
     def left_out(self, run: Run) -> LeftOut:

@@ -1,8 +1,9 @@
-"""`harness study attribute`: what moved a run's answers and decisions, by leaving out one thing at a time.
+"""`harness study attribute`: what moved a run's answers and decisions,
+by leaving out one thing at a time.
 
-An object is left out as if no sensor of the viewer had reported it: its line, its conflict, what it hides.
-The viewer's model is asked again. A message is left out as if it had been lost: the consensus rule fuses the
-others, which is exact and asks nobody; a fusion call is made again.
+An object is left out as if no sensor of the viewer had reported it: its line, its conflict, what it
+hides. The viewer's model is asked again. A message is left out as if it had been lost: the
+consensus rule fuses the others, which is exact and asks nobody; a fusion call is made again.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,23 +59,30 @@ class Row:
 
 
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
-    """Leave out every listed object and every message heard at some decision points of a run, in turn.
+    """Leave out every listed object and every message heard at some decision points of a run, in
+    turn.
 
     At most `sample` of the condition's decision points are drawn.
 
     Raises:
-        UserError: the run has no such condition, or its model is not available or cannot be asked otherwise.
+        UserError: the run has no such condition,
+            or its model is not available or cannot be asked otherwise.
         Unanswered: too many questions got no answer; the run keeps all others.
     """
     for agent in stored.spec.agents:
         name = f"{printable(stored.run.path)}: {printable(agent.card.name)}"
         if not agent.can.closed_loop:
-            raise UserError(f"{name} has no answers to other questions; give the run that it replays")
+            raise UserError(
+                f"{name} has no answers to other questions; give the run that it replays"
+            )
         if agent.card.privileged:
-            raise UserError(f"{name} reads the truth and no prompt; give a run of local-view or of a model")
+            raise UserError(
+                f"{name} reads the truth and no prompt; give a run of local-view or of a model"
+            )
         if agent.sees:
             raise UserError(
-                f"{name} was shown pictures by prompt {agent.prompt.version}, and no object can be left out "
+                f"{name} was shown pictures by prompt {agent.prompt.version}, and no object can be "
+                "left out "
                 "of one; give a run with --image none, or of another prompt"
             )
     if condition not in stored.points:
@@ -86,15 +94,20 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
     place = {scene: n for n, scene in enumerate(drawn)}
     left_out.sort(key=lambda each: (each.episode, place[each.scene]))
     return Attribution(
-        condition=condition, decision_points=len(drawn), of=of, sample_seed=seed, left_out=tuple(left_out)
+        condition=condition,
+        decision_points=len(drawn),
+        of=of,
+        sample_seed=seed,
+        left_out=tuple(left_out),
     )
 
 
 def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
-    """Draw decision points, each with the channel seed of one of its decisions; return also of how many.
+    """Draw decision points, each with the channel seed of one of its decisions;
+    return also of how many.
 
-    Each that the condition came to is as likely as any other, and so is each seed. A larger sample has the
-    smaller one in it.
+    Each that the condition came to is as likely as any other, and so is each seed.
+    A larger sample has the smaller one in it.
     """
     run = stored.run
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
@@ -107,7 +120,9 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
         return float(noise.uniforms((1,), "attribution", seed, *key)[0])
 
     chosen = sorted(by_scene, key=chance)[:sample]
-    return {scene: min(by_scene[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(by_scene)
+    return {scene: min(by_scene[scene], key=lambda s: chance(scene, s)) for scene in chosen}, len(
+        by_scene
+    )
 
 
 def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
@@ -119,9 +134,15 @@ def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
         p = answers[f"{scene.id}/{viewer}"].intent
         if p and answers[request.id].error is None:
             yield _left_out(
-                scene, stored.dataset.actions, p, answers[request.id].intent,
-                viewer=viewer, role=request.role, item=item, kind=_kind(scene, viewer, item),
-            )  # fmt: skip
+                scene,
+                stored.dataset.actions,
+                p,
+                answers[request.id].intent,
+                viewer=viewer,
+                role=request.role,
+                item=item,
+                kind=_kind(scene, viewer, item),
+            )
 
 
 def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, str, Request]]:
@@ -131,11 +152,17 @@ def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, 
     for place, viewer in enumerate(spec.viewers(scene)):
         agent, graph = spec.agents[spec.agent(place)], graphs[viewer]
         reads = (
-            listing(graph, agent.prompt.max_objects) if agent.can.language_model else range(len(graph.nodes))
+            listing(graph, agent.prompt.max_objects)
+            if agent.can.language_model
+            else range(len(graph.nodes))
         )
         listed[viewer] = [graph.nodes[n].id for n in reads]
     for item in dict.fromkeys(chain.from_iterable(listed.values())):
-        less = {v: scene_graph(spec.scenario, scene.state, v, [item]) for v in listed if item in listed[v]}
+        less = {
+            v: scene_graph(spec.scenario, scene.state, v, [item])
+            for v in listed
+            if item in listed[v]
+        }
         name = f"{scene.id}~without-{item}"
         for request in requests(spec, [scene.changed(graphs={**graphs, **less}, scene=name)]):
             viewer = request.id.rpartition("/")[2]
@@ -144,14 +171,20 @@ def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, 
 
 
 def _kind(scene: Scene, viewer: str, item: str) -> str:
-    """Return an item's kind: without a conflict that its viewer sees, seen by the ego, or hidden from it."""
+    """Return an item's kind: without a conflict that its viewer sees, seen by the ego,
+    or hidden from it.
+    """
     if item not in {conflict.vehicle for conflict in scene.graphs[viewer].conflicts}:
         return OTHER
     return SEEN if item in scene.graphs[scene.viewers[0]].seen else HIDDEN
 
 
-def messages(stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int]) -> Iterator[LeftOut]:
-    """Every message that was in time left out in turn; `drawn` has a channel seed of each decision point."""
+def messages(
+    stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int]
+) -> Iterator[LeftOut]:
+    """Every message that was in time left out in turn;
+    `drawn` has a channel seed of each decision point.
+    """
     memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
     for [part] in walk(world, [point], stored, stored.spec.ties):
         yield from _messages(stored, part, memory, drawn)
@@ -162,12 +195,16 @@ def _messages(
     stored: ReplayedRun, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
 ) -> Iterator[LeftOut]:
     point, due, points, state = part.point, part.due, part.decision_points, memory.recall(part.due)
-    chosen = [drawn.get(points[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)]
+    chosen = [
+        drawn.get(points[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)
+    ]
     decisions, helpers = np.nonzero(part.result.on_time & np.array(chosen)[:, None])
     if not len(decisions):
         return
     broadcast = part.said.take(decisions)
-    taken = {field.name: getattr(part.result, field.name)[decisions] for field in fields(part.result)}
+    taken = {
+        field.name: getattr(part.result, field.name)[decisions] for field in fields(part.result)
+    }
     whole, at = replace(part.result, **taken), due.at[decisions]
     places = places_of(point, due, len(points))[decisions]
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
@@ -179,7 +216,11 @@ def _messages(
     fusion = FusionInputs(call, None if state is None else state[decisions])
     less = fuse(point, replace(whole, on_time=rest), broadcast.intents, fusion)
     for n, voice in enumerate(helpers.tolist()):
-        helper = voice if broadcast.intents.voice_of is None else int(broadcast.intents.voice_of[n, voice])
+        helper = (
+            voice
+            if broadcast.intents.voice_of is None
+            else int(broadcast.intents.voice_of[n, voice])
+        )
         scene = points[at[n]]
         sender = scene.viewers[1 + helper]
         items = scene.graphs[sender].seen
@@ -187,9 +228,16 @@ def _messages(
         q = None if less.fusion_failed[n] else less.fused[n].tolist()
         if not whole.fusion_failed[n]:
             yield _left_out(
-                scene, stored.dataset.actions, whole.fused[n].tolist(), q, seed=int(due.seed[decisions[n]]),
-                viewer=scene.viewers[0], role="fusion", item=sender, kind=SIGHT if sight else NO_SIGHT,
-            )  # fmt: skip
+                scene,
+                stored.dataset.actions,
+                whole.fused[n].tolist(),
+                q,
+                seed=int(due.seed[decisions[n]]),
+                viewer=scene.viewers[0],
+                role="fusion",
+                item=sender,
+                kind=SIGHT if sight else NO_SIGHT,
+            )
 
 
 def _left_out(
@@ -197,10 +245,14 @@ def _left_out(
 ) -> LeftOut:
     best = int(np.argmax(p))
     return LeftOut(
-        scene=scene.id, episode=scene.record.episode, **{"seed": None, **what}, action=actions[best],
-        instead=actions[int(np.argmax(q))] if q else None, change=q[best] - p[best] if q else None,
+        scene=scene.id,
+        episode=scene.record.episode,
+        **{"seed": None, **what},
+        action=actions[best],
+        instead=actions[int(np.argmax(q))] if q else None,
+        change=q[best] - p[best] if q else None,
         shift=distance(p, q),
-    )  # fmt: skip
+    )
 
 
 def rows(result: Attribution) -> list[Row]:
@@ -218,10 +270,12 @@ def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
     flips = np.array([float(each.instead != each.action) for each in left_out])
     failed = np.isnan(shift)
     return Row(
-        role, kind, rate_interval(shift, episodes),  # a distance is from 0 to 1, too
+        role,
+        kind,
+        rate_interval(shift, episodes),  # a distance is from 0 to 1, too
         rate_interval(np.where(failed, np.nan, flips), episodes),
         rate_interval(failed.astype(float), episodes),
-    )  # fmt: skip
+    )
 
 
 def _what(row: Row) -> str:
@@ -236,18 +290,23 @@ def headline(table: Sequence[Row]) -> str:
     """Say what moved most, or that nothing clearly did."""
     known = [row for row in table if row.shift.n]
     if not known:
-        return "Nothing was left out: no prompt of the sample lists an object, and no message was in time."
+        return (
+            "Nothing was left out: no prompt of the sample lists an object, and no message was in "
+            "time."
+        )
     most = max(known, key=lambda row: row.shift.value)
     close = [row for row in known if row is not most and not row.shift.high < most.shift.low]
     if close:
         return (
-            f"What moves answers most is not clear: {figure(most.shift, SHIFT)} of the probability moves to "
+            f"What moves answers most is not clear: {figure(most.shift, SHIFT)} of the probability "
+            "moves to "
             f"other actions at the most (n = {most.shift.n}), and the intervals of these overlap: "
             f"{some_of([_what(row) for row in (most, *close)])}."
         )
     return (
         f"The {_what(most)} moves answers most: without it, {figure(most.shift, SHIFT)} of the "
-        f"probability moves to other actions, and {figure(most.flips)} % of the most probable actions "
+        f"probability moves to other actions, and {figure(most.flips)} % of the most probable "
+        "actions "
         f"change (n = {most.shift.n})."
     )
 
@@ -256,35 +315,55 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
     """Declare the study of what was left out, of which `harness report` shows every decision."""
     table, parts = rows(result), ("shift", "flips", "failed")
     answer = {
-        "run": str(run.run.path), "condition": result.condition, "decision_points": result.decision_points,
-        "of": result.of, "sample_seed": result.sample_seed,
+        "run": str(run.run.path),
+        "condition": result.condition,
+        "decision_points": result.decision_points,
+        "of": result.of,
+        "sample_seed": result.sample_seed,
         "rows": [
             {"role": row.role, "kind": row.kind, **{n: as_mapping(getattr(row, n)) for n in parts}}
             for row in table
         ],
-    }  # fmt: skip
+    }
     cells = [
         (
-            r.kind, r.role, figure(r.shift, SHIFT), figure(r.flips), PERCENT.number(r.failed.value),
+            r.kind,
+            r.role,
+            figure(r.shift, SHIFT),
+            figure(r.flips),
+            PERCENT.number(r.failed.value),
             str(r.shift.n),
         )
         for r in table
-    ]  # fmt: skip
+    ]
     return Study(
-        "attribution", f"{run.name} · {run.run.source}", [headline(table)],
+        "attribution",
+        f"{run.name} · {run.run.source}",
+        [headline(table)],
         [
-            f"{result.decision_points} of the {result.of} decision points of {result.condition}, drawn with "
-            f"sample seed {result.sample_seed}, each as likely as any other; 95 % intervals are over "
-            "episodes. Of: the prompt that it is left out of; fusion: a message that came in time. Shift: "
-            "total variation distance of the answers or policies; flips: another action is most probable; "
+            f"{result.decision_points} of the {result.of} decision points of {result.condition}, "
+            "drawn with "
+            f"sample seed {result.sample_seed}, each as likely as any other; 95 % intervals are "
+            "over "
+            "episodes. Of: the prompt that it is left out of; fusion: a message that came in time. "
+            "Shift: "
+            "total variation distance of the answers or policies; flips: another action is most "
+            "probable; "
             "failed: the answer without it could not be read."
         ],
-        [Table(
-            "What was left out", ("left out", "of", "shift [95 %]", "flips % [95 %]", "failed", "n"), cells,
-            terminal=range(6),
-        )],
-        {}, {}, answer, caveats=run.caveats,
-    )  # fmt: skip
+        [
+            Table(
+                "What was left out",
+                ("left out", "of", "shift [95 %]", "flips % [95 %]", "failed", "n"),
+                cells,
+                terminal=range(6),
+            )
+        ],
+        {},
+        {},
+        answer,
+        caveats=run.caveats,
+    )
 
 
 def write(result: Attribution, run: Path) -> Path:

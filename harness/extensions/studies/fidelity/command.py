@@ -16,7 +16,8 @@ def command(
 ) -> None:
     """Compare frozen with closed-loop success, paired by episode.
 
-    Give at least one run of `harness eval` and one of `harness drive`, with the same models and layouts.
+    Give at least one run of `harness eval` and one of `harness drive`,
+    with the same models and layouts.
     """
     from harness.extensions.studies.fidelity.study import fidelity, fidelity_study
     from harness.studies.study import refuse_other

@@ -33,15 +33,24 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
             for world in ("frozen", "closed")
         )
         axes.errorbar(
-            x, y, np.abs(np.array([y_ends]).T - y), np.abs(np.array([x_ends]).T - x),
-            color=colours[row["condition"]], marker=markers[model], markersize=4.5, linewidth=0.7,
-        )  # fmt: skip
+            x,
+            y,
+            np.abs(np.array([y_ends]).T - y),
+            np.abs(np.array([x_ends]).T - x),
+            color=colours[row["condition"]],
+            marker=markers[model],
+            markersize=4.5,
+            linewidth=0.7,
+        )
     for model, marker in markers.items():
         axes.plot([], [], color=GREY, marker=marker, linestyle="none", label=model)
     for condition, colour in colours.items():
         axes.plot([], [], color=colour, linewidth=3, label=condition)
     axes.set(
-        xlabel="success on frozen scenes, %", ylabel="success in closed loop, %", xlim=(0, 102), ylim=(0, 102)
+        xlabel="success on frozen scenes, %",
+        ylabel="success in closed loop, %",
+        xlim=(0, 102),
+        ylim=(0, 102),
     )
     axes.set_aspect("equal")
     plain(axes, "both")

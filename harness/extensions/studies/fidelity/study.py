@@ -1,7 +1,7 @@
 """How far success on frozen scenes is success in closed loop, of models' runs.
 
-Runs of the same model, prompt and answer mode are compared episode by episode: the same layout, condition and
-channel seed.
+Runs of the same model, prompt and answer mode are compared episode by episode:
+the same layout, condition and channel seed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,13 +38,15 @@ SHOWN = 20  # ways to disagree that the page lists
 class Fidelity:
     """What the comparison says."""
 
-    # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen minus closed,
-    # paired by episode) and `agreement` (share of episodes and seeds with the same result), each with `_low`
-    # and `_high`, and `n` episodes; shares from 0 to 1
+    # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
+    # minus closed, paired by episode) and `agreement` (share of episodes and seeds with the same
+    # result), each with `_low` and `_high`, and `n` episodes; shares from 0 to 1
     table: "pd.DataFrame"
-    episodes: "pd.DataFrame"  # a row an episode, condition and seed, with the result and the failure of both
-    # Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make no
-    # difference to a model count once. NaN for fewer than `LEAST_RANKED` rows, or where all are alike
+    # a row an episode, condition and seed, with the result and the failure of both
+    episodes: "pd.DataFrame"
+    # Spearman's correlation of `frozen` and `closed` over the rows of `table`; conditions that make
+    # no difference to a model count once. NaN for fewer than `LEAST_RANKED` rows, or where all are
+    # alike
     rank: float
     ranked: int  # how many rows that is over
 
@@ -61,20 +63,27 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
     for run in runs:
         world, episodes = _episodes(run)
         by_world[world].append(episodes)
-    sources = {"frozen": "frozen scenes (harness eval)", "closed-loop": "live episodes (harness drive)"}
+    sources = {
+        "frozen": "frozen scenes (harness eval)",
+        "closed-loop": "live episodes (harness drive)",
+    }
     for world, tables in by_world.items():
         if not tables:
             raise UserError(
-                f"no run on {sources[world]} among {len(runs)} folders; give at least one of each kind"
+                f"no run on {sources[world]} among {len(runs)} folders; give at least one of each "
+                "kind"
             )
     frozen, closed = (pd.concat(tables, ignore_index=True) for tables in by_world.values())
     for each in (frozen, closed):
         if each.duplicated(list(KEY)).any():
-            raise UserError("two of the runs have the same episodes; give one run of each model and prompt")
+            raise UserError(
+                "two of the runs have the same episodes; give one run of each model and prompt"
+            )
     both = frozen.merge(closed, on=list(KEY), suffixes=("_frozen", "_closed"))
     if both.empty:
         raise UserError(
-            "the runs have no episode in common; give runs of the same model, prompt and answer mode, with "
+            "the runs have no episode in common; give runs of the same model, prompt and answer "
+            "mode, with "
             "the same conditions, seeds and layouts (harness drive --first-seed)"
         )
     rows = pd.DataFrame(_rows(both))
@@ -85,7 +94,11 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
     from scipy.stats import spearmanr
 
     distinct = rows.drop_duplicates([*WHO, "frozen", "closed"])
-    if len(distinct) < LEAST_RANKED or distinct.frozen.nunique() == 1 or distinct.closed.nunique() == 1:
+    if (
+        len(distinct) < LEAST_RANKED
+        or distinct.frozen.nunique() == 1
+        or distinct.closed.nunique() == 1
+    ):
         return np.nan, len(distinct)
     return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
 
@@ -97,21 +110,32 @@ def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
     run = read(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
     rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
-    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(**asdict(run.manifest.variant))
+    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(
+        **asdict(run.manifest.variant)
+    )
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
     for place, group in both.groupby([*WHO, "condition"], sort=False):
-        wide = group.pivot(index="seed", columns="layout_seed", values=["success_frozen", "success_closed"])
-        frozen, closed = (wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed"))
+        wide = group.pivot(
+            index="seed", columns="layout_seed", values=["success_frozen", "success_closed"]
+        )
+        frozen, closed = (
+            wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed")
+        )
         row = dict(zip((*WHO, "condition"), place, strict=True))
         for name, e in compared(frozen, closed).items():
-            row |= {f"{name}{end}": value for end, value in zip(ENDS, (e.value, e.low, e.high), strict=True)}
+            row |= {
+                f"{name}{end}": value
+                for end, value in zip(ENDS, (e.value, e.low, e.high), strict=True)
+            }
         yield {**row, "n": group.layout_seed.nunique()}
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
-    """Return how episodes ended that ended otherwise: a row a model, condition and two ends, with a count."""
+    """Return how episodes ended that ended otherwise:
+    a row a model, condition and two ends, with a count.
+    """
     ends = both.assign(
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
         closed_end=both.failure_closed.where(~both.success_closed, "success"),
@@ -131,30 +155,54 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
     heads = (PLACE, "frozen %", "closed loop %", "difference, points", "same %", "n")
     ends_heads = (PLACE, "end on frozen scenes", "end in closed loop", "episodes × seeds")
     return Study(
-        "fidelity", "Frozen and closed loop compared", headline(result),
+        "fidelity",
+        "Frozen and closed loop compared",
+        headline(result),
         [
-            "On frozen scenes, success is looked up: the outcome of each action was found in advance, by "
-            "driving on with a planner that sees everything. The same models, under the same conditions "
-            "and seeds, also drove the same layouts in closed loop. There an action takes effect as late "
+            "On frozen scenes, success is looked up: the outcome of each action was found in "
+            "advance, by "
+            "driving on with a planner that sees everything. The same models, under the same "
+            "conditions "
+            "and seeds, also drove the same layouts in closed loop. There an action takes effect "
+            "as late "
             "as its decision took, and each action changes what comes next.",
-            "Paired by episode, condition and channel seed; n is the number of episodes, each averaged "
-            "over its seeds; 95 % intervals are over episodes. A point below the figure's dashed line "
+            "Paired by episode, condition and channel seed; n is the number of episodes, each "
+            "averaged "
+            "over its seeds; 95 % intervals are over episodes. A point below the figure's dashed "
+            "line "
             "succeeds less often in closed loop.",
         ],
         [
-            Table("Side by side", heads, [
-                (_place(row), *(percent(row, *(name + end for end in ENDS)) for name in COMPARED),
-                 str(row["n"])) for row in rows
-            ], terminal=(0, 1, 2, 3, 4)),
-            Table("Where they disagree", ends_heads, [
-                (_place(row), *(str(row[name]) for name in ("frozen_end", "closed_end", "count")))
-                for row in differing
-            ]),
+            Table(
+                "Side by side",
+                heads,
+                [
+                    (
+                        _place(row),
+                        *(percent(row, *(name + end for end in ENDS)) for name in COMPARED),
+                        str(row["n"]),
+                    )
+                    for row in rows
+                ],
+                terminal=(0, 1, 2, 3, 4),
+            ),
+            Table(
+                "Where they disagree",
+                ends_heads,
+                [
+                    (
+                        _place(row),
+                        *(str(row[name]) for name in ("frozen_end", "closed_end", "count")),
+                    )
+                    for row in differing
+                ],
+            ),
         ],
         {"fidelity": result.table, "episodes": result.episodes},
-        {"sources": [{"name": str(run)} for run in runs], "versions": versions()}, result.table,
+        {"sources": [{"name": str(run)} for run in runs], "versions": versions()},
+        result.table,
         lambda: {"fidelity": _scatter(result)},
-    )  # fmt: skip
+    )
 
 
 def _scatter(result: Fidelity) -> "Figure":
@@ -169,7 +217,8 @@ def headline(result: Fidelity) -> list[str]:
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
     sentences = [
-        f"Largest difference, frozen minus closed loop: {points:+z.1f} points [{low:+z.1f}, {high:+z.1f}], "
+        f"Largest difference, frozen minus closed loop: {points:+z.1f} points [{low:+z.1f}, "
+        f"{high:+z.1f}], "
         f"{worst['model']} {worst['prompt']} under {worst['condition']}, n = {worst['n']} episodes."
     ]
     if not np.isnan(result.rank):
@@ -177,7 +226,8 @@ def headline(result: Fidelity) -> list[str]:
         sentences.insert(0, f"Spearman's rank correlation of {models}: {result.rank:.2f}.")
     elif result.ranked < LEAST_RANKED:
         sentences.append(
-            f"No rank correlation: {result.ranked} different models and conditions are too few; at least "
+            f"No rank correlation: {result.ranked} different models and conditions are too few; at "
+            "least "
             f"{LEAST_RANKED} are needed."
         )
     return sentences

@@ -31,15 +31,17 @@ HELP = {
 @options.takes(FrozenSettings, HELP, without=("ask",))
 def command(
     settings: Settings,
-    out: Path | None = typer.Option(None, help="Folder to write. Default: reports/grid-<models>-<dataset>."),
+    out: Path | None = typer.Option(
+        None, help="Folder to write. Default: reports/grid-<models>-<dataset>."
+    ),
     no_cache: options.NoCache = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
     """Evaluate every combination of ego and helper agents.
 
-    An agent is a model with a prompt version and an answer mode. Each agent is asked once in each role,
-    however many combinations it is in. If the grid is stopped, the same command continues it.
+    An agent is a model with a prompt version and an answer mode. Each agent is asked once in each
+    role, however many combinations it is in. If the grid is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
     from harness.evaluate import resolve
@@ -51,14 +53,19 @@ def command(
     frozen = source.dataset
     options.say_all(world.limit, [frozen])
     # Combinations share answers: whom one does not ask, another does.
-    settings = changed(settings, {"prompt": settings.prompt or frozen.scenario.prompt, "ask": "all"})
+    settings = changed(
+        settings, {"prompt": settings.prompt or frozen.scenario.prompt, "ask": "all"}
+    )
     theirs = _of_helpers(settings)
     modes = {*_names("--answer", settings.answer), *_names("--helper-answer", theirs.answer)}
     by_ego = _combinations(settings, "--", modes)
     egos = [resolve.agents(each, frozen.scenario)[0] for each in by_ego]
-    with resolve.helper_options({"--answer": settings.helpers.answer, "--thinking": theirs.thinking}):
+    with resolve.helper_options(
+        {"--answer": settings.helpers.answer, "--thinking": theirs.thinking}
+    ):
         helpers = [
-            resolve.agents(each, frozen.scenario)[0] for each in _combinations(theirs, "--helper-", modes)
+            resolve.agents(each, frozen.scenario)[0]
+            for each in _combinations(theirs, "--helper-", modes)
         ]
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
         raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
@@ -81,17 +88,27 @@ def command(
 def _of_helpers(settings: Settings) -> Settings:
     """Return settings whose model, prompt and modes are those of the helpers."""
     own = settings.helpers
-    given = {"model": own.model, "prompt": own.prompt, "answer": own.answer, "thinking": own.thinking}
+    given = {
+        "model": own.model,
+        "prompt": own.prompt,
+        "answer": own.answer,
+        "thinking": own.thinking,
+    }
     engine = {"engine": None} if own.model else {}
-    return changed(settings, {name: value for name, value in given.items() if value is not None} | engine)
+    return changed(
+        settings, {name: value for name, value in given.items() if value is not None} | engine
+    )
 
 
 def _combinations(settings: Settings, flag: str, modes: Collection[str]) -> list[Settings]:
     """Return the settings of each model with each prompt and answer mode.
 
-    A setting that concerns one answer mode is left out with others, if one of the grid's `modes` uses it.
+    A setting that concerns one answer mode is left out with others,
+    if one of the grid's `modes` uses it.
     """
-    lists = [_names(f"{flag}{name}", getattr(settings, name)) for name in ("model", "prompt", "answer")]
+    lists = [
+        _names(f"{flag}{name}", getattr(settings, name)) for name in ("model", "prompt", "answer")
+    ]
     combinations = []
     for model, prompt, answer in product(*lists):
         given = {**dict.fromkeys(HELPERS), "model": model, "prompt": prompt, "answer": answer}

@@ -1,8 +1,8 @@
 """`harness study grid`: every ego agent with every helper agent, and what each choice is worth.
 
-A full factorial design: a cell is a run of one ego agent with one helper agent. Cells share answers, so each
-agent is asked in each role once about a decision point, whatever cell comes to it. All cells have the same
-episodes and the same draws, so contrasts are paired by episode.
+A full factorial design: a cell is a run of one ego agent with one helper agent. Cells share
+answers, so each agent is asked in each role once about a decision point, whatever cell comes to it.
+All cells have the same episodes and the same draws, so contrasts are paired by episode.
 """
 
 import math
@@ -76,7 +76,9 @@ class Cell:
     def values(self) -> Mapping[str, Floats]:
         """Success, latency and tokens of a decision, each (C, S, E); NaN where unknown."""
         run = self.run
-        values = by_episode([METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes)
+        values = by_episode(
+            [METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes
+        )
         places, n = run.grid.places(run.decisions), len(run.episodes)
         return {**values, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
 
@@ -106,7 +108,8 @@ class Effect:
 class Halves:
     """Shares of the variance of what leads between the cells that each half explains.
 
-    What episodes by chance add is taken off, as a bootstrap over episodes says; so are intervals made.
+    What episodes by chance add is taken off, as a bootstrap over episodes says;
+    so are intervals made.
     """
 
     condition: str  # the operating point
@@ -122,7 +125,8 @@ def level(agent: Agent, field: str) -> str:
 
 
 def tokens(run: Run) -> Floats:
-    """Return tokens in and out that a decision took, of the ego and of each helper that was to reply, (n,).
+    """Return tokens in and out that a decision took,
+    of the ego and of each helper that was to reply, (n,).
 
     NaN throughout where a model of the run counts none.
     """
@@ -142,9 +146,13 @@ def tokens(run: Run) -> Floats:
 
 
 def run_cells(
-    spec: Spec, egos: Sequence[Agent], helpers: Sequence[Agent], out: Path,
-    progress: Progress, cache_file: Path | None,
-) -> "Grid":  # fmt: skip
+    spec: Spec,
+    egos: Sequence[Agent],
+    helpers: Sequence[Agent],
+    out: Path,
+    progress: Progress,
+    cache_file: Path | None,
+) -> "Grid":
     """Evaluate every combination in a folder of its own under `out`; those that are there stay.
 
     Completions are kept between runs in the cache file, if there is one.
@@ -173,7 +181,9 @@ def run_cells(
 
 @dataclass(frozen=True)
 class Grid:
-    """All cells of a full factorial design, row by row: `rows` ego agents, `columns` helper agents."""
+    """All cells of a full factorial design, row by row:
+    `rows` ego agents, `columns` helper agents.
+    """
 
     cells: tuple[Cell, ...]
     rows: int
@@ -182,7 +192,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         if len({(cell.run.conditions, cell.run.grid) for cell in self.cells}) > 1:
-            raise UserError(f"{printable(self.cells[0].run.path.parent)}: its runs are not of the same grid")
+            raise UserError(
+                f"{printable(self.cells[0].run.path.parent)}: its runs are not of the same grid"
+            )
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -249,16 +261,22 @@ class Grid:
                 yield name, (high_low + low_high) / 2, (low_low + high_high) / 2
 
     def halves(self, condition: str) -> Halves | None:
-        """Return what each half explains; None without a channel, if one varies, or if all may be alike."""
+        """Return what each half explains;
+        None without a channel, if one varies, or if all may be alike.
+        """
         at = self.conditions.index(condition)
-        if 1 in (self.rows, self.columns) or not self.cells[0].run.manifest.conditions[at]["profile"]:
+        if (
+            1 in (self.rows, self.columns)
+            or not self.cells[0].run.manifest.conditions[at]["profile"]
+        ):
             return None
         each = np.array([np.mean(cell.values[SUCCESS][at], axis=0) for cell in self.cells])
         n = each.shape[1]
         counts = self.counting.resampled(noise.generator("grid", "halves"), RESAMPLES)
         weights = self.counting.weights(counts)
         squares = _squares((each @ weights.T).reshape(self.rows, self.columns, -1))
-        # Episodes by chance add as much to the squares of what was played as resampling adds to those.
+        # Episodes by chance add as much to the squares of what was played as resampling adds to
+        # those.
         by_chance = squares[:, 1:].mean(axis=1) - squares[:, 0]
         times = np.where(np.arange(RESAMPLES + 1) > 0, 2, 1)
         shares = _shares(np.maximum(squares - times * by_chance[:, None], 0.0))
@@ -276,7 +294,9 @@ def _squares(means: Floats) -> Floats:
 
 
 def _shares(squares: Floats) -> Floats:
-    """The share of each of the three, and the first less the second, (4, B); NaN where there is nothing."""
+    """The share of each of the three, and the first less the second, (4, B);
+    NaN where there is nothing.
+    """
     total = squares.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         parts = np.where(total > 1e-12, squares / total, np.nan)
@@ -292,15 +312,20 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
     last = grid.conditions[-1]
     return Study(
-        "grid", f"{grid.rows} egos × {grid.columns} helpers on {spec.source.name}", headline(grid),
+        "grid",
+        f"{grid.rows} egos × {grid.columns} helpers on {spec.source.name}",
+        headline(grid),
         [
             f"Varied: {factors}. n = {crossed(len(episodes), len(spec.seeds))} "
-            f"({', '.join(map(str, spec.seeds))}), the same for all combinations, so differences are "
+            f"({', '.join(map(str, spec.seeds))}), the same for all combinations, so differences "
+            "are "
             "paired by episode; 95 % intervals are over episodes. All figures are in cells.csv and "
             "effects.csv; each combination's run is in cells/. The inference time is declared, or "
             "measured before the run; each run.json says which.",
-            "The figure joins the combinations that no other beats in success without taking longer (◆). "
-            "The best of many looks better than it is: choose on one set of seeds, and report on another.",
+            "The figure joins the combinations that no other beats in success without taking "
+            "longer (◆). "
+            "The best of many looks better than it is: choose on one set of seeds, and report on "
+            "another.",
         ],
         [
             *(_cells(grid, c, out, c == last) for c in reversed(grid.conditions)),
@@ -311,11 +336,14 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
             "sources": [{"name": f"{grid.rows} egos × {grid.columns} helpers"}],
             "factors": {factor.name: list(factor.levels) for factor in grid.factors},
             "cells": [str(cell.run.path.relative_to(out)) for cell in grid.cells],
-            "dataset": spec.source.name, "conditions": list(grid.conditions), "seeds": list(spec.seeds),
+            "dataset": spec.source.name,
+            "conditions": list(grid.conditions),
+            "seeds": list(spec.seeds),
             "versions": versions(),
         },
-        data, lambda: _figures(grid),
-    )  # fmt: skip
+        data,
+        lambda: _figures(grid),
+    )
 
 
 def _figures(grid: Grid) -> "dict[str, Figure]":
@@ -330,22 +358,29 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
         look: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
         steps += [
             Steps(
-                c, [cell.estimate(LATENCY, c).value for cell in grid.cells], rates[c],
+                c,
+                [cell.estimate(LATENCY, c).value for cell in grid.cells],
+                rates[c],
                 look | {"linestyle": ""},
             ),
             Steps(
-                "", [cell.estimate(LATENCY, c).value for cell in best],
-                [100 * grid.success(cell, c).value for cell in best], look, pair(grid, best[-1]),
+                "",
+                [cell.estimate(LATENCY, c).value for cell in best],
+                [100 * grid.success(cell, c).value for cell in best],
+                look,
+                pair(grid, best[-1]),
             ),
-        ]  # fmt: skip
+        ]
     return {
         "heat-map": heat_map(
             {c: np.array(rates[c]).reshape(grid.rows, grid.columns) for c in grid.conditions},
             [grid.name(grid.cells[i * grid.columns].ego, "ego") for i in range(grid.rows)],
-            [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]], "ego", "helpers",
+            [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]],
+            "ego",
+            "helpers",
         ),
         "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
-    }  # fmt: skip
+    }
 
 
 def headline(grid: Grid) -> list[str]:
@@ -357,8 +392,10 @@ def _range(grid: Grid, condition: str) -> str:
     rates = [100 * grid.success(cell, condition).value for cell in grid.cells]
     effects = [effect for effect in grid.effects if effect.condition == condition]
     return (
-        f"Under {condition}, {grid.counting.words} of the {len(rates)} combinations is {min(rates):.1f} to "
-        f"{max(rates):.1f} %; {sum(e.clear for e in effects)} of {len(effects)} effects are more than chance "
+        f"Under {condition}, {grid.counting.words} of the {len(rates)} combinations is "
+        f"{min(rates):.1f} to "
+        f"{max(rates):.1f} %; {sum(e.clear for e in effects)} of {len(effects)} effects are more "
+        "than chance "
         f"explains (n = {grid.success(grid.cells[0], condition).n})."
     )
 
@@ -370,9 +407,12 @@ def _halves(grid: Grid, h: Halves) -> str:
     elif h.apart.high < 0:
         verdict = "the choice of the helpers matters more"
     return (
-        f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains {shown(h.ego)} % of the "
-        f"differences in {grid.counting.words} between the {len(grid.cells)} combinations, the choice among "
-        f"{grid.columns} helpers {shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} "
+        f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains "
+        f"{shown(h.ego)} % of the "
+        f"differences in {grid.counting.words} between the {len(grid.cells)} combinations, the "
+        "choice among "
+        f"{grid.columns} helpers {shown(h.helpers)} %, both together {shown(h.together)} % (n = "
+        f"{h.ego.n} "
         "episodes)."
     )
 
@@ -404,11 +444,16 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
         run = f"cells/{cell.run.path.name}"
         latency = f"{cell.estimate(LATENCY, condition).value:.1f}{' ◆' * (cell.run.path in best)}"
         report = place(cell.run)
-        rows.append((
-            pair(grid, cell), shown(grid.success(cell, condition)), latency,
-            PLAIN.number(cell.estimate("tokens", condition).value), f"{cell.ego.name} + {cell.helper.name}",
-            linked(run, report),
-        ))  # fmt: skip
+        rows.append(
+            (
+                pair(grid, cell),
+                shown(grid.success(cell, condition)),
+                latency,
+                PLAIN.number(cell.estimate("tokens", condition).value),
+                f"{cell.ego.name} + {cell.helper.name}",
+                linked(run, report),
+            )
+        )
     heads = (
         "ego + helpers",
         f"{grid.counting.words} %, 95 % CI",
@@ -417,23 +462,32 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
         "agents",
         "run",
     )
-    note = "Tokens: of prompts and answers of the ego and every asked helper; a dash: a model counts none."
+    note = (
+        "Tokens: of prompts and answers of the ego and every asked helper; a dash: a model counts "
+        "none."
+    )
     return Table(condition, heads, rows, note, terminal=range(4) if terminal else ())
 
 
 def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
     known = [e for e in grid.effects if e.condition == condition and not np.isnan(e.estimate.value)]
     rows = [
-        (e.what, shown(e.estimate), p_cell(e.p)) for e in sorted(known, key=lambda e: -abs(e.estimate.value))
+        (e.what, shown(e.estimate), p_cell(e.p))
+        for e in sorted(known, key=lambda e: -abs(e.estimate.value))
     ]
     return Table(
-        f"Effect of each choice, {condition}", ("effect", "points, 95 % CI", "p"), rows,
-        f"An effect is the difference in {grid.counting.words} when one factor changes, averaged over all "
-        "other factors. An interaction (×) is half the difference between the effects of one factor at two "
+        f"Effect of each choice, {condition}",
+        ("effect", "points, 95 % CI", "p"),
+        rows,
+        f"An effect is the difference in {grid.counting.words} when one factor changes, averaged "
+        "over all "
+        "other factors. An interaction (×) is half the difference between the effects of one "
+        "factor at two "
         "levels of the other. p comes from the interval and is corrected by Holm's method for all "
         f"{len(grid.effects)} effects; bold: 0.05 or less.",
-        terminal=range(3) if terminal else (), most=MOST_EFFECTS,
-    )  # fmt: skip
+        terminal=range(3) if terminal else (),
+        most=MOST_EFFECTS,
+    )
 
 
 def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
@@ -444,16 +498,31 @@ def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
         return {f"{half}_{field}": cell.level(half, field) for half in HALVES for field in FIELDS}
 
     cells = [
-        {**who(cell), "run": cell.run.path.name, "condition": c, "metric": m, **ends(cell.estimate(m, c))}
-        for cell in grid.cells for c in grid.conditions for m in cell.values
-    ]  # fmt: skip
+        {
+            **who(cell),
+            "run": cell.run.path.name,
+            "condition": c,
+            "metric": m,
+            **ends(cell.estimate(m, c)),
+        }
+        for cell in grid.cells
+        for c in grid.conditions
+        for m in cell.values
+    ]
     if (lead := grid.counting.metric) != SUCCESS:
         cells += [
-            {**who(cell), "run": cell.run.path.name, "condition": c, "metric": lead,
-             **ends(grid.success(cell, c))}
-            for cell in grid.cells for c in grid.conditions
-        ]  # fmt: skip
+            {
+                **who(cell),
+                "run": cell.run.path.name,
+                "condition": c,
+                "metric": lead,
+                **ends(grid.success(cell, c)),
+            }
+            for cell in grid.cells
+            for c in grid.conditions
+        ]
     effects = [
-        {"condition": e.condition, "effect": e.what, **ends(e.estimate), "p_holm": e.p} for e in grid.effects
+        {"condition": e.condition, "effect": e.what, **ends(e.estimate), "p_holm": e.p}
+        for e in grid.effects
     ]
     return {"cells": pd.DataFrame(cells), "effects": pd.DataFrame(effects)}

@@ -44,9 +44,13 @@ class Questions:
         ego = self.spec.ego
         shown = f"--model {printable(ego.card.name)}"
         if not ego.can.closed_loop:
-            raise UserError(f"{shown}: a replay has no answers to twins; give the model that it replays")
+            raise UserError(
+                f"{shown}: a replay has no answers to twins; give the model that it replays"
+            )
         if ego.card.privileged:
-            raise UserError(f"{shown} reads the truth, which no twin changes; give local-view or a model")
+            raise UserError(
+                f"{shown} reads the truth, which no twin changes; give local-view or a model"
+            )
         if not any(lack(self.spec, TWINS[name]) is None for name in self.twins):
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
 
@@ -81,7 +85,12 @@ class Questions:
 
     def begin(self, identity: str) -> work.WorkStart:
         """Return what the work begins with; `identity` is the digest of the model's."""
-        settings = {**self.spec.record(), "twins": self.twins, "seed": self.seed, "identity": identity}
+        settings = {
+            **self.spec.record(),
+            "twins": self.twins,
+            "seed": self.seed,
+            "identity": identity,
+        }
         return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
@@ -99,7 +108,9 @@ class Questions:
 
 
 def lack(spec: Spec, twin: Twin) -> str | None:
-    """Return what a twin needs that this evaluation never has; None where some question may have it."""
+    """Return what a twin needs that this evaluation never has;
+    None where some question may have it.
+    """
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
@@ -109,29 +120,39 @@ def lack(spec: Spec, twin: Twin) -> str | None:
 
 
 def ask(
-    questions: Questions, out: Path, progress: Callable[[int], None], cache: Path | None, workers: Workers
+    questions: Questions,
+    out: Path,
+    progress: Callable[[int], None],
+    cache: Path | None,
+    workers: Workers,
 ) -> tuple[list[Pair], str]:
     """Ask about decision points and their twins; the same for any workers.
 
-    What was stopped in the folder before goes on. The working folder stays until `work.tidy`, which whoever
-    writes the result calls. `progress` is called with 1 for each episode that is done. Completions are kept
-    between runs in the cache file, if there is one. Each worker has a backend of its own.
+    What was stopped in the folder before goes on. The working folder stays until `work.tidy`, which
+    whoever writes the result calls. `progress` is called with 1 for each episode that is done.
+    Completions are kept between runs in the cache file, if there is one. Each worker has a backend
+    of its own.
 
     Returns:
-        The pairs of answers; and how many questions of helpers got none, in words, empty if all did. Their
+        The pairs of answers; and how many questions of helpers got none, in words,
+            empty if all did. Their
         pairs are left out.
 
     Raises:
-        UserError: the folder holds something else, the model is not available, or no question has a twin.
-        Unanswered: a question of the ego, or too many of the helpers', got no answer; the folder keeps all
-            others.
+        UserError: the folder holds something else, the model is not available,
+            or no question has a twin.
+        Unanswered: a question of the ego, or too many of the helpers', got no answer;
+            the folder keeps all others.
     """
     if (out / RESULT).exists():
         raise UserError(
-            f"--out {printable(out)} already holds finished twins; choose another folder or delete it"
+            f"--out {printable(out)} already holds finished twins; choose another folder or delete "
+            "it"
         )
     name = f"the model {questions.spec.ego.card.name}"
-    [identity] = spread(_identity, [questions.spec], workers, lambda done: None, lambda spec: name, False)
+    [identity] = spread(
+        _identity, [questions.spec], workers, lambda done: None, lambda spec: name, False
+    )
     begun = questions.begin(identity)
     if left := work.begun(out, work.WorkStart):
         work.same(out, begun.settings, left.settings)
@@ -158,7 +179,9 @@ def ask(
             raise Unanswered(str(tally))
         pairs = [pair for at in range(len(points)) for pair in by_episode[at]]
         if not pairs:
-            raise UserError(f"--twin: none applies to what was drawn: {questions.lacks(questions.twins)}")
+            raise UserError(
+                f"--twin: none applies to what was drawn: {questions.lacks(questions.twins)}"
+            )
         return pairs, tally.counts()
 
 
@@ -171,10 +194,14 @@ def _answers_file(place: Path, episode: int) -> Path:
 
 
 def _asked(
-    questions: Questions, cache: Path | None, place: Path | None,
+    questions: Questions,
+    cache: Path | None,
+    place: Path | None,
     episode: tuple[int, Sequence[Scene], Mapping[str, Answer]],
-) -> tuple[list[Pair], list[Answer]]:  # fmt: skip
-    """Ask about the decision points of an episode, then about their twins; return all answers as well."""
+) -> tuple[list[Pair], list[Answer]]:
+    """Ask about the decision points of an episode, then about their twins;
+    return all answers as well.
+    """
     (number, scenes, kept), spec = episode, questions.spec
 
     def backend() -> Backend:
@@ -198,7 +225,9 @@ def _asked(
         )
     ]
     known = {request.id for request in first}
-    then = {request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known}
+    then = {
+        request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known
+    }
     asker.ask(list(then.values()))
     pairs = [
         _pair(spec, each, number, asker.answers)
@@ -209,7 +238,9 @@ def _asked(
 
 
 def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -> Iterator[Asked]:
-    """Yield the questions about a scene that the twin changes for who reads them, each with its twin."""
+    """Yield the questions about a scene that the twin changes for who reads them,
+    each with its twin.
+    """
     graphs = scene.graphs
     if twin.graph:
         graphs = {viewer: twin.graph(spec, scene, graph) for viewer, graph in graphs.items()}
@@ -231,7 +262,9 @@ def _twins(spec: Spec, twin: Twin, scene: Scene, questions: Sequence[Request]) -
 def _fusion(spec: Spec, twin: Twin, scene: Scene, answers: Mapping[str, Answer]) -> Iterator[Asked]:
     """Yield the ego's fusion call with the messages of all helpers, and its twin."""
     by_viewer = {v: answers[f"{scene.id}/{v}"] for v in spec.viewers(scene)}
-    senders = [message["sender"] for message in messages_of(by_viewer, scene.viewers[1:], spec.actions)]
+    senders = [
+        message["sender"] for message in messages_of(by_viewer, scene.viewers[1:], spec.actions)
+    ]
     if senders and twin.senders:
         question = fusion_request(spec, scene, by_viewer, senders)
         copy = fusion_request(spec, _named(scene, twin), by_viewer, twin.senders(senders))
@@ -258,9 +291,19 @@ def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer])
         read = dict(zip(names, b.intent, strict=True))
         q = tuple(read[action] for action in spec.actions)
     return Pair(
-        twin.name, role, episode, a.scene, a.viewer, p, q, distance(p, q), held(twin, p, q), (a.raw, b.raw),
-        (a.status, b.status), (_text(both[0]), _text(both[1])),
-    )  # fmt: skip
+        twin.name,
+        role,
+        episode,
+        a.scene,
+        a.viewer,
+        p,
+        q,
+        distance(p, q),
+        held(twin, p, q),
+        (a.raw, b.raw),
+        (a.status, b.status),
+        (_text(both[0]), _text(both[1])),
+    )
 
 
 def _text(request: Request) -> str:

@@ -11,7 +11,8 @@ from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import printable, unknown
 
-EPISODES = 40  # that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
+# that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
+EPISODES = 40
 
 
 def command(
@@ -24,9 +25,13 @@ def command(
     ),
     limit: int | None = typer.Option(None, help="Use only this many episodes, from the first."),
     sample: int | None = typer.Option(
-        None, help=f"Number of episodes to draw at random. Default: {EPISODES}, or all if there are fewer."
+        None,
+        help=f"Number of episodes to draw at random. Default: {EPISODES}, or all if there are "
+        "fewer.",
     ),
-    sample_seed: int = typer.Option(0, help="Seed of this draw, and of that of their decision points."),
+    sample_seed: int = typer.Option(
+        0, help="Seed of this draw, and of that of their decision points."
+    ),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
     batch_size: options.BatchSize = 8,
@@ -35,9 +40,12 @@ def command(
     dtype: options.Dtype = None,
     fail_if: list[str] | None = typer.Option(
         None,
-        help="Gate: '[TWIN:]METRIC[.low|.high] OP NUMBER'. It fails where that is true in any role: "
-        "'mirrored:invariance_rate < 0.9'. METRIC is invariance_rate, tv_distance or failed_rate, each from "
-        "0 to 1; .low and .high are the ends of the 95 % interval. Repeatable. Exit code 1 if a gate fails.",
+        help="Gate: '[TWIN:]METRIC[.low|.high] OP NUMBER'. It "
+        "fails where that is true in any role: "
+        "'mirrored:invariance_rate < 0.9'. METRIC is invariance_rate, tv_distance or failed_rate, "
+        "each from "
+        "0 to 1; .low and .high are the ends of the 95 % interval. Repeatable. Exit code 1 if a "
+        "gate fails.",
     ),
     out: Path | None = typer.Option(
         None, help="Folder to write. Default: reports/<model>-<prompt>-twins-<dataset>."
@@ -48,9 +56,9 @@ def command(
 ) -> None:
     """Test whether answers to a question and its twin agree.
 
-    A twin is the same question put otherwise: mirrored, in other units, in other words. So what must hold of
-    both answers is known without knowing the right one. If the study is stopped, the same command
-    continues it.
+    A twin is the same question put otherwise: mirrored, in other units, in other words. So what
+    must hold of both answers is known without knowing the right one. If the study is stopped, the
+    same command continues it.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
@@ -95,7 +103,9 @@ def command(
     where = out or free_folder([spec], f"twins-{source.name}", questions.goes_on)
     label = f"asking {printable(spec.ego.card.name, 30)}, episodes"
     with bar(label, len(questions.points()), as_json or quiet) as progress:
-        pairs, unanswered = asking.ask(questions, where, progress, None if no_cache else default_file(), who)
+        pairs, unanswered = asking.ask(
+            questions, where, progress, None if no_cache else default_file(), who
+        )
     with work.going_on(where):
         rows = scoring.rows(pairs, [TWINS[name] for name in questions.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]

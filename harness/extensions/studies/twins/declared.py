@@ -1,7 +1,8 @@
-"""Twins of decision points: the same question put another way, and what must hold of the answers to both.
+"""Twins of decision points: the same question put another way,
+and what must hold of the answers to both.
 
-These are metamorphic relations (Chen et al. 2018): nobody needs to know the right answer to tell that two
-answers do not go together. A twin that does not apply to a question leaves it as it is.
+These are metamorphic relations (Chen et al. 2018): nobody needs to know the right answer to tell
+that two answers do not go together. A twin that does not apply to a question leaves it as it is.
 """
 
 import dataclasses
@@ -52,7 +53,8 @@ class Twin:
     graph: Callable[[Spec, Scene, SceneGraph], SceneGraph] | None = None
     # the twin's request, `(spec, request)`, of a language model
     text: Callable[[Spec, Request], Request] | None = None
-    view: Callable[[SceneGraph], SceneGraph] | None = None  # the same for who reads the graph and no text
+    # the same for who reads the graph and no text
+    view: Callable[[SceneGraph], SceneGraph] | None = None
     # the twin's picture, where the graph is another; None where it is the same
     image: Callable[[Image], Image] | None = None
     # whose messages a fusion call has, `(senders)`, in the place of these
@@ -60,8 +62,8 @@ class Twin:
     # the question's name for an action of the twin, where it is another
     actions: Mapping[str, str] | None = None
     modes: tuple[str, ...] = get_args(AnswerMode)  # answer modes in which it applies
-    # whether it holds of an ego that always gives the same answer, and so reads nothing; of a read-out, where
-    # the letters are read once
+    # whether it holds of an ego that always gives the same answer, and so reads nothing; of a
+    # read-out, where the letters are read once
     constant: bool = True
 
     @property
@@ -78,7 +80,9 @@ class Twin:
 
 
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
-    """Return a copy of a record with `leaf(key, value)` for leaves; those of a tuple have the tuple's key."""
+    """Return a copy of a record with `leaf(key, value)` for leaves;
+    those of a tuple have the tuple's key.
+    """
     if isinstance(value, Struct):
         values = {name: getattr(value, name) for name in value.__struct_fields__}
         return replace(value, **{name: changed(part, leaf, name) for name, part in values.items()})
@@ -110,11 +114,15 @@ def swapped(graph: SceneGraph) -> SceneGraph:
     order = [sector.sector for sector in graph.sectors]
     if {sector.sector for sector in twin.sectors} != set(order):
         return twin
-    return replace(twin, sectors=tuple(sorted(twin.sectors, key=lambda sector: order.index(sector.sector))))
+    return replace(
+        twin, sectors=tuple(sorted(twin.sectors, key=lambda sector: order.index(sector.sector)))
+    )
 
 
 def flipped(image: Image) -> Image:
-    """Return what the cameras would see in a mirror, which is what those of the mirrored scene see."""
+    """Return what the cameras would see in a mirror,
+    which is what those of the mirrored scene see.
+    """
     return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
@@ -122,8 +130,11 @@ def permuted_ids(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Every vehicle has the name of another, in all graphs of the scene alike."""
     ids = [vehicle.id for vehicle in scene.state.vehicles]
     order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
-    named = {ids[n]: ids[m] for n, m in zip(order, [*order[1:], *order[:1]], strict=True)}  # one cycle
-    twin: SceneGraph = changed(graph, lambda key, value: named.get(value, value) if key in NAMES else value)
+    # one cycle
+    named = {ids[n]: ids[m] for n, m in zip(order, [*order[1:], *order[:1]], strict=True)}
+    twin: SceneGraph = changed(
+        graph, lambda key, value: named.get(value, value) if key in NAMES else value
+    )
     return twin
 
 
@@ -131,7 +142,9 @@ NAMES = ("id", "vehicle", "viewer", "by")
 
 
 def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Round metres and m/s to none, shares to one decimal. Times stay: half a second decides conflicts."""
+    """Round metres and m/s to none, shares to one decimal. Times stay:
+    half a second decides conflicts.
+    """
 
     def leaf(key: str, value: Any) -> Any:
         if isinstance(value, float) and key.endswith(("_m", "_mps")):
@@ -149,15 +162,25 @@ def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     last = max(int(vehicle.id[1:]) for vehicle in scene.state.vehicles)
     own_mps = graph.itself.speed_mps
     node = Node(
-        f"v{last + 1}", "vehicle", away if ahead else -away, 0.0, None, 0.0,
-        0 - own_mps if ahead else own_mps, "off-lane", None, ("radar",),
+        f"v{last + 1}",
+        "vehicle",
+        away if ahead else -away,
+        0.0,
+        None,
+        0.0,
+        0 - own_mps if ahead else own_mps,
+        "off-lane",
+        None,
+        ("radar",),
         None if spec.scenario.brake_lamps else UNSET,
-    )  # fmt: skip
+    )
     return replace(graph, nodes=(*graph.nodes, node))
 
 
 def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Jitter the distances that sensors report with their noise once more, as another look would."""
+    """Jitter the distances that sensors report with their noise once more,
+    as another look would.
+    """
     draws = noise.generator("twins", "jitter", scene.id, graph.viewer)
     nodes, moved_m = [], {}
     for node in graph.nodes:
@@ -171,7 +194,9 @@ def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def _farther(conflict: Conflict, by_m: float | None) -> Conflict:
-    """Return a conflict whose way to go is longer; one with the viewer, who knows where it is, as it is."""
+    """Return a conflict whose way to go is longer;
+    one with the viewer, who knows where it is, as it is.
+    """
     if by_m is None:
         return conflict
     who = "other" if conflict.other.arc_m else "ego"
@@ -205,7 +230,8 @@ def _in_feet(key: str, value: Any) -> Any:
 
 
 def _says_units(spec: Spec, role: str) -> bool:
-    """Return whether a template has both units, and no number of its own with one, but for the target speeds.
+    """Return whether a template has both units, and no number of its own with one,
+    but for the target speeds.
 
     The numbers of examples are metres and stay so.
     """
@@ -263,7 +289,9 @@ def reordered_keys(spec: Spec, request: Request) -> Request:
 
 
 def _reversed_members(text: str) -> str:
-    """The same text with the members of its outermost objects, and of those in them, the last first."""
+    """The same text with the members of its outermost objects, and of those in them,
+    the last first.
+    """
     done, at = "", 0
     while (start := text.find('{"', at)) >= 0 and (end := _closing(text, start)):
         inner, members, comma, depth, last = text[start + 1 : end], [""], "", 0, 0
@@ -313,47 +341,77 @@ def _reworded(request: Request, reworded: Callable[[str], str]) -> Request:
         return tuple({**message, "content": reworded(message["content"])} for message in messages)
 
     return dataclasses.replace(
-        request, messages=chat(request.messages), orders=tuple(map(chat, request.orders)),
+        request,
+        messages=chat(request.messages),
+        orders=tuple(map(chat, request.orders)),
         question=request.question and request.question.reworded(reworded),
-    )  # fmt: skip
+    )
 
 
 _DECLARED = (
     Twin(
-        "mirrored", "left and right swapped", "a scenario whose scenes may be mirrored",
-        graph=mirrored, image=flipped, actions=LANES,
+        "mirrored",
+        "left and right swapped",
+        "a scenario whose scenes may be mirrored",
+        graph=mirrored,
+        image=flipped,
+        actions=LANES,
     ),
     Twin("ids", "vehicles have each other's names", graph=permuted_ids),
     Twin(
-        "order", "objects and conflicts in another order", "two objects or conflicts",
-        text=reversed_lines, view=reversed_lists,
+        "order",
+        "objects and conflicts in another order",
+        "two objects or conflicts",
+        text=reversed_lines,
+        view=reversed_lists,
     ),
     Twin("far-vehicle", "one more vehicle, far from every conflict", graph=far_vehicle),
     Twin(
-        "units", "feet and km/h for metres and m/s", "a prompt that says m and m/s", within=0.1,
-        graph=in_feet, text=other_units,
+        "units",
+        "feet and km/h for metres and m/s",
+        "a prompt that says m and m/s",
+        within=0.1,
+        graph=in_feet,
+        text=other_units,
     ),
-    Twin("rounding", "one decimal fewer in distances, speeds and shares", within=0.1, graph=rounded),
+    Twin(
+        "rounding", "one decimal fewer in distances, speeds and shares", within=0.1, graph=rounded
+    ),
     Twin("jitter", "distances with the sensors' noise once more", within=0.1, graph=jittered),
     Twin(
-        "paraphrase", "some sentences in other words", "sentences of the prompts that ship", within=0.1,
+        "paraphrase",
+        "some sentences in other words",
+        "sentences of the prompts that ship",
+        within=0.1,
         text=paraphrased,
     ),
     Twin(
-        "key-order", "keys of the JSON that the prompt shows in another order", "a prompt that shows JSON",
+        "key-order",
+        "keys of the JSON that the prompt shows in another order",
+        "a prompt that shows JSON",
         text=reordered_keys,
     ),
     Twin(
-        "letters", "letters of the read-out stand for other actions", "--answer readout",
-        text=permuted_letters, modes=("readout",), constant=False,
+        "letters",
+        "letters of the read-out stand for other actions",
+        "--answer readout",
+        text=permuted_letters,
+        modes=("readout",),
+        constant=False,
     ),
     Twin(
-        "message-order", "the helpers' messages in another order", "fusion calls in json or constrained",
-        senders=lambda senders: senders[::-1], modes=("json", "constrained"),
+        "message-order",
+        "the helpers' messages in another order",
+        "fusion calls in json or constrained",
+        senders=lambda senders: senders[::-1],
+        modes=("json", "constrained"),
     ),
     Twin(
-        "message-twice", "one helper's message twice", "fusion calls in json or constrained",
-        senders=lambda senders: [*senders, *senders[:1]], modes=("json", "constrained"),
+        "message-twice",
+        "one helper's message twice",
+        "fusion calls in json or constrained",
+        senders=lambda senders: [*senders, *senders[:1]],
+        modes=("json", "constrained"),
     ),
-)  # fmt: skip
+)
 TWINS = {twin.name: twin for twin in _DECLARED}

@@ -45,7 +45,8 @@ class Row:
     invariance_rate: Estimate  # share of pairs that hold; n is the pairs
     tv_distance: Estimate  # mean total variation; n is the pairs whose two answers were parsed
     failed_rate: Estimate  # share of pairs in which an answer failed
-    broken: tuple[Pair, ...]  # pairs that do not hold, the farthest apart first, those that failed last
+    # pairs that do not hold, the farthest apart first, those that failed last
+    broken: tuple[Pair, ...]
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
@@ -75,14 +76,18 @@ def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
 def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
     episodes = np.array([pair.episode for pair in pairs])
     apart = np.array([np.nan if pair.distance is None else pair.distance for pair in pairs])
-    broken = sorted((pair for pair in pairs if not pair.holds), key=lambda pair: -(pair.distance or 0.0))
+    broken = sorted(
+        (pair for pair in pairs if not pair.holds), key=lambda pair: -(pair.distance or 0.0)
+    )
     return Row(
-        twin, role, len(np.unique(episodes)),
+        twin,
+        role,
+        len(np.unique(episodes)),
         rate_interval(np.array([float(pair.holds) for pair in pairs]), episodes),
         rate_interval(apart, episodes),  # a distance is from 0 to 1, too
         rate_interval(np.isnan(apart).astype(float), episodes),
         tuple(broken),
-    )  # fmt: skip
+    )
 
 
 def headline(table: Sequence[Row]) -> str:
@@ -99,7 +104,8 @@ def headline(table: Sequence[Row]) -> str:
         return f"{text} Least often holds {least.twin.name}, {least.role}: {shown}."
     names = [f"{row.twin.name}, {row.role}" for row in (least, *close)]
     return (
-        f"{text} No pair clearly holds least often: it is {shown}, and the intervals of these overlap: "
+        f"{text} No pair clearly holds least often: it is {shown}, and the intervals of these "
+        "overlap: "
         f"{some_of([f'({name})' for name in names])}."
     )
 
@@ -116,7 +122,10 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
         raise unknown(f"twin of {shown}", gate.condition or "", {row.twin.name for row in table})
     failed = []
     for row in judged:
-        value, where = float(getattr(getattr(row, gate.metric), gate.end)), f"{row.twin.name} {row.role}"
+        value, where = (
+            float(getattr(getattr(row, gate.metric), gate.end)),
+            f"{row.twin.name} {row.role}",
+        )
         if np.isnan(value):
             # A gate that passes because nothing is known would guard nothing.
             raise UserError(f"{shown}: {where} has no such number; ask about more episodes")

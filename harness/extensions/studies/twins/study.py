@@ -29,9 +29,18 @@ if TYPE_CHECKING:
 EXAMPLES = 3  # of each row
 DISTANCE = Unit(decimals=2)
 HEADS = (
-    "twin", "role", "holds", "invariant %, 95 % CI", "TV distance", "failed %", "n", "constant answer %",
-    "episodes", "what is other", "examples",
-)  # fmt: skip
+    "twin",
+    "role",
+    "holds",
+    "invariant %, 95 % CI",
+    "TV distance",
+    "failed %",
+    "n",
+    "constant answer %",
+    "episodes",
+    "what is other",
+    "examples",
+)
 
 
 def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
@@ -46,27 +55,44 @@ def twins_study(
     """Declare the study of twins; `unanswered` says how many questions got no answer."""
     answer, spec = mapping(questions, rows, verdicts, unanswered), questions.spec
     return Study(
-        "twins", f"Twins: {spec.ego.name} on {spec.source.name}",
+        "twins",
+        f"Twins: {spec.ego.name} on {spec.source.name}",
         [headline(rows), *(judged(verdict, "-") for verdict in verdicts)],
         [
-            "The model is asked each question twice: as it is, and as its twin, which puts the same "
-            "situation otherwise. So what must hold of both answers is known without knowing the right "
-            f"one. {questions.count()} decision points of {len(questions.dataset.episodes)} episodes; n is "
-            "the number of questions that the twin changes; 95 % intervals are over episodes. If either "
+            "The model is asked each question twice: as it is, and as its twin, which puts the "
+            "same "
+            "situation otherwise. So what must hold of both answers is known without knowing the "
+            "right "
+            f"one. {questions.count()} decision points of {len(questions.dataset.episodes)} "
+            "episodes; n is "
+            "the number of questions that the twin changes; 95 % intervals are over episodes. If "
+            "either "
             "answer could not be parsed (failed), nothing holds, and there is no distance."
         ],
-        [Table(
-            "What holds", HEADS, [_cells(questions, row) for row in rows],
-            "A question is one viewer at one decision point. Invariant: the share of questions for which "
-            "what must hold does hold. same: both answers have the same most probable action (for a "
-            "mirrored twin, after swapping left and right back). TV <= x: the distributions are no "
-            "farther apart than x. TV: total variation distance, half the sum of the absolute "
-            "differences, 0 to 1. Constant answer: what an ego "
-            "holds that always gives the same answer, and so reads nothing.", terminal=range(7),
-        )],
-        {}, {**answer, "versions": versions()}, answer, caveats=notes(questions, rows, unanswered),
-        more=_examples(spec.actions, rows), figures=lambda: {"twins": _figure(rows)},
-    )  # fmt: skip
+        [
+            Table(
+                "What holds",
+                HEADS,
+                [_cells(questions, row) for row in rows],
+                "A question is one viewer at one decision point. Invariant: the share of questions "
+                "for which "
+                "what must hold does hold. same: both answers have the same most probable action "
+                "(for a "
+                "mirrored twin, after swapping left and right back). TV <= x: the distributions "
+                "are no "
+                "farther apart than x. TV: total variation distance, half the sum of the absolute "
+                "differences, 0 to 1. Constant answer: what an ego "
+                "holds that always gives the same answer, and so reads nothing.",
+                terminal=range(7),
+            )
+        ],
+        {},
+        {**answer, "versions": versions()},
+        answer,
+        caveats=notes(questions, rows, unanswered),
+        more=_examples(spec.actions, rows),
+        figures=lambda: {"twins": _figure(rows)},
+    )
 
 
 def _figure(rows: Sequence[Row]) -> "Figure":
@@ -77,29 +103,44 @@ def _figure(rows: Sequence[Row]) -> "Figure":
     by_place = {(row.twin.name, row.role): row for row in rows}
     roles = [role for role in ROLES if any(row.role == role for row in rows)]
     panels = [
-        Rows(quantity, names, {
-            role: [estimate(row) if (row := by_place.get((name, role))) else None for name in names]
-            for role in roles
-        }, scale)
+        Rows(
+            quantity,
+            names,
+            {
+                role: [
+                    estimate(row) if (row := by_place.get((name, role))) else None for name in names
+                ]
+                for role in roles
+            },
+            scale,
+        )
         for quantity, scale, estimate in (
             ("invariant, %", 100.0, attrgetter("invariance_rate")),
             ("TV distance", 1.0, attrgetter("tv_distance")),
         )
-    ]  # fmt: skip
+    ]
     return intervals(panels, COLOUR_OF_ROLE)
 
 
 def _cells(questions: Questions, row: Row) -> list[str]:
     name = f"{row.twin.name}-{row.role}"
     links = [
-        Markup('<a href="#{}-{}">{}</a>').format(name, n, n) for n, _ in enumerate(row.broken[:EXAMPLES], 1)
+        Markup('<a href="#{}-{}">{}</a>').format(name, n, n)
+        for n, _ in enumerate(row.broken[:EXAMPLES], 1)
     ]
     return [
-        Markup('<span id="{}">{}</span>').format(name, row.twin.name), row.role, row.twin.holds,
-        shown(row.invariance_rate), shown(row.tv_distance, DISTANCE), PERCENT.number(row.failed_rate.value),
-        str(row.invariance_rate.n), "100" if constant_holds(questions, row.twin) else "0", str(row.episodes),
-        row.twin.says, Markup(" ").join(links) or "–",
-    ]  # fmt: skip
+        Markup('<span id="{}">{}</span>').format(name, row.twin.name),
+        row.role,
+        row.twin.holds,
+        shown(row.invariance_rate),
+        shown(row.tv_distance, DISTANCE),
+        PERCENT.number(row.failed_rate.value),
+        str(row.invariance_rate.n),
+        "100" if constant_holds(questions, row.twin) else "0",
+        str(row.episodes),
+        row.twin.says,
+        Markup(" ").join(links) or "–",
+    ]
 
 
 def _examples(actions: Sequence[str], rows: Sequence[Row]) -> Markup:
@@ -118,26 +159,41 @@ def mapping(
     """Return the result as plain values; null where there is no number."""
     table = [
         {
-            "twin": row.twin.name, "role": row.role, "holds": row.twin.holds, "episodes": row.episodes,
+            "twin": row.twin.name,
+            "role": row.role,
+            "holds": row.twin.holds,
+            "episodes": row.episodes,
             "holds_of_constant": constant_holds(questions, row.twin),
             **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
         }
         for row in rows
-    ]  # fmt: skip
+    ]
     spec = questions.spec
-    plain: dict[str, Any] = msgspec.to_builtins({
-        **spec.ego.settings(), "world": spec.source.record(), "seed": questions.seed,
-        "decision_points": questions.count(), "rows": table, "left_out": missing(questions, rows),
-        **({"unanswered": unanswered} if unanswered else {}),
-        "gates": [{"gate": v.gate, "passed": not v.failed, "failed": dict(v.failed)} for v in verdicts],
-    })  # fmt: skip
+    plain: dict[str, Any] = msgspec.to_builtins(
+        {
+            **spec.ego.settings(),
+            "world": spec.source.record(),
+            "seed": questions.seed,
+            "decision_points": questions.count(),
+            "rows": table,
+            "left_out": missing(questions, rows),
+            **({"unanswered": unanswered} if unanswered else {}),
+            "gates": [
+                {"gate": v.gate, "passed": not v.failed, "failed": dict(v.failed)} for v in verdicts
+            ],
+        }
+    )
     return plain
 
 
 def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
     """Return the twins that no question has, and what they need."""
     asked = {row.twin.name for row in rows}
-    return {n: lack(questions.spec, TWINS[n]) or TWINS[n].needs for n in questions.twins if n not in asked}
+    return {
+        n: lack(questions.spec, TWINS[n]) or TWINS[n].needs
+        for n in questions.twins
+        if n not in asked
+    }
 
 
 def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> list[str]:
@@ -149,7 +205,8 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
     if not questions.spec.ego.can.language_model:
         who = questions.spec.ego.card.name
         sentences.insert(
-            0, f"{who} reads the scene graph and not the text, so this says nothing about the prompt."
+            0,
+            f"{who} reads the scene graph and not the text, so this says nothing about the prompt.",
         )
     for need, names in by_need.items():
         sentences.append(f"Left out, since no question has it: {', '.join(names)} (needs {need}).")
@@ -159,7 +216,8 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 
 
 def constant_holds(questions: Questions, twin: Twin) -> bool:
-    """Return whether a twin holds of an ego that always gives the same answer: every time, or never.
+    """Return whether a twin holds of an ego that always gives the same answer:
+    every time, or never.
 
     Over cyclic orders one letter is every action alike, which is the same for the twin.
     """
@@ -168,13 +226,21 @@ def constant_holds(questions: Questions, twin: Twin) -> bool:
 
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
     """Say what these twins would say of an ego that reads nothing."""
-    broken = list(dict.fromkeys(row.twin.name for row in rows if not constant_holds(questions, row.twin)))
-    but = f" of every twin but {', '.join(broken)}, of which it holds 0 %" if broken else " of every twin"
+    broken = list(
+        dict.fromkeys(row.twin.name for row in rows if not constant_holds(questions, row.twin))
+    )
+    but = (
+        f" of every twin but {', '.join(broken)}, of which it holds 0 %"
+        if broken
+        else " of every twin"
+    )
     return f"An ego that always gives the same answer holds 100 %{but}: to hold is not to read."
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
-    """Yield the lines that two texts do not share, `-` of the first and `+` of the other, words marked."""
+    """Yield the lines that two texts do not share, `-` of the first and `+` of the other,
+    words marked.
+    """
     old, new = a.splitlines(), b.splitlines()
     for kind, i, j, k, n in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
         if kind != "equal":
@@ -186,7 +252,9 @@ def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
             )
             for sign, words, parts in sides:
                 if any(words):
-                    shown = (_word(words[start:end], kind) for kind, start, end in parts if start < end)
+                    shown = (
+                        _word(words[start:end], kind) for kind, start, end in parts if start < end
+                    )
                     yield sign, Markup(" ").join(shown)
 
 
