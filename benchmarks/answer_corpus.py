@@ -2,7 +2,7 @@
 as a corpus.
 
     python benchmarks/answer_corpus.py MODEL.gguf answers.jsonl [--questions 60] [--most 250]
-    [--tokens 96]
+                                       [--tokens 96]
 
 Each question is asked about a moment of a tune layout and answered once at temperature 0, and twice
 each at 0.5 and 1; these five go through the engine together, which reads their prompt once. Answers

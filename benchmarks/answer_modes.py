@@ -2,9 +2,9 @@
 against a plain `generate` loop and lm-evaluation-harness.
 
     python benchmarks/answer_modes.py [--model swarm-tiny] [--prompts 32] [--batch-size 8]
-    [--repeats 1] python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16
-    --prompts 4 python benchmarks/answer_modes.py --model smollm2-135m --modes readout cyclic
-    --prompts 8
+                                      [--repeats 1]
+    python benchmarks/answer_modes.py --shape 0.6b --tokenizer GGUF --dtype bfloat16 --prompts 4
+    python benchmarks/answer_modes.py --model smollm2-135m --modes readout cyclic --prompts 8
 
 All on the same prompts: the ego's of the shipped dataset, with prompt v2. The baseline (a) is
 transformers' `generate`, one prompt at a time, greedy. (b) is lm-evaluation-harness's `hf` model on

@@ -1,7 +1,7 @@
 """What calibrating a model's answers does: probabilities, trigger, bits, latency and success.
 
-    python benchmarks/calibration.py [--only TEXT] [--layouts N] [--out reports/calibration] [--page
-                                     benchmarks/measured/calibration.md]
+    python benchmarks/calibration.py [--only TEXT] [--layouts N] [--out reports/calibration]
+                                     [--page benchmarks/measured/calibration.md]
 
 For each row of `ROWS` it evaluates the model on tune layouts of `SCENES`, fits L0, L1 and both
 there (`harness model calibrate`), and evaluates it on report layouts of the same scenes as it

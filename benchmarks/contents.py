@@ -1,9 +1,9 @@
 """Intent or objects? What each content of messages is worth to a planner and to models,
 and at what cost.
 
-    python benchmarks/contents.py [--limit N] [--layouts N] [--dataset D] [--only TEXT] [--out
-                                  reports/contents] [--page
-                                  benchmarks/measured/intent-or-objects.md]
+    python benchmarks/contents.py [--limit N] [--layouts N] [--dataset D] [--only TEXT]
+                                  [--out reports/contents]
+                                  [--page benchmarks/measured/intent-or-objects.md]
 
 For each row of `ROWS` it evaluates the model on report layouts of the shipped datasets, plays
 `harness study contents` on the run, and drives the same layouts in closed loop, where the time of a

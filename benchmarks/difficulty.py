@@ -11,8 +11,8 @@ one's. *Coverage*: how often the interval of a study of so many answered layouts
 of the run, and a pool of five times as many holds the run's figure, in percent; beside it the plain
 interval's.
 
-    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120] [--answered 20 30 40
-    60]
+    python benchmarks/difficulty.py [--models proxy swarm-tiny] [--layouts 120]
+                                    [--answered 20 30 40 60]
 """
 
 import argparse

@@ -3,8 +3,8 @@
 Chunks wait for a second, so that what else the machine does changes little, or do nothing. Ray is a
 cluster of two nodes of a core each, all here.
 
-    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5] [--only
-    TEXT]
+    python benchmarks/executors.py [--chunks 20] [--seconds 1] [--empty 500] [--repeats 5]
+                                   [--only TEXT]
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """What models do in the paper's scenario:
 prompts, answer modes and conditions, with n and intervals.
 
-    python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT] [--out
-                                 reports/results] [--page docs/results.md] [--details
-                                 benchmarks/measured/results.md] [--picture
-                                 docs/pictures/results.svg]
+    python benchmarks/results.py [--limit N] [--layouts N] [--device D] [--only TEXT]
+                                 [--out reports/results] [--page docs/results.md]
+                                 [--details benchmarks/measured/results.md]
+                                 [--picture docs/pictures/results.svg]
 
 It evaluates each row of `ROWS` on the report layouts of `DATASET`, one run a row, and writes
 success between the marks of the page, what the answers are like between those of the details, and

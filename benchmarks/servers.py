@@ -9,7 +9,7 @@ connections that stay open. With `--workers` so many processes do each of these,
 and has its share of the batch size. What its start takes is not timed.
 
     python benchmarks/servers.py [--servers 1] [--requests 4000] [--repeats 5] [--seconds 0.05]
-        [--at-once 20] [--batch-size 20] [--workers 1]
+                                 [--at-once 20] [--batch-size 20] [--workers 1]
 """
 
 import argparse

@@ -4,8 +4,8 @@ The model is asked what `harness eval --answer decision` asks about scenes of si
 question at a time: in this process, and by this program's own client through a `harness serve` of
 the same model, engine and number format.
 
-    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500] [--letters
-    cyclic]
+    python benchmarks/serving.py [--model swarm-tiny] [--wire systemone] [--prompts 500]
+                                 [--letters cyclic]
 """
 
 import argparse

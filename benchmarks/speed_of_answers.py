@@ -1,10 +1,10 @@
 """What does it bring to answer faster? The same answers at several latencies,
 under several conditions.
 
-    python benchmarks/speed_of_answers.py [--only TEXT] [--layouts N] [--dataset D] [--out
-                                          reports/speed] [--page
-                                          benchmarks/measured/speed-of-answers.md] [--picture
-                                          docs/pictures/speed-of-answers.svg]
+    python benchmarks/speed_of_answers.py [--only TEXT] [--layouts N] [--dataset D]
+                                          [--out reports/speed]
+                                          [--page benchmarks/measured/speed-of-answers.md]
+                                          [--picture docs/pictures/speed-of-answers.svg]
 
 For each row of `ROWS` it evaluates the model on report layouts of a suite, once at each of
 `LATENCIES_MS`. The first run asks; the others find its answers in the completion cache, and the

@@ -4,12 +4,12 @@ Plain means that highway-env's own `act` and `step` drive the same vehicles. All
 same trajectories; alone and together are compared to the last bit. EnvPool is no dependency: name a
 Python that has it.
 
-    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...] [--sizes 16 64
-                                128 512] [--frozen 8] [--envpool PYTHON] python benchmarks/worlds.py
-                                --trees     # only what a decision point costs that is frozen,
-                                together python benchmarks/worlds.py --joint 4 --scenarios
-                                all-way-crossing narrow-passage --frozen 10 # only how many states
-                                two agents can bring about together, with so many decisions each
+    python benchmarks/worlds.py [--layouts 500] [--worlds 128] [--scenarios NAME ...]
+                                [--sizes 16 64 128 512] [--frozen 8] [--envpool PYTHON]
+    python benchmarks/worlds.py --trees
+        # only what a decision point costs that is frozen, together
+    python benchmarks/worlds.py --joint 4 --scenarios all-way-crossing narrow-passage --frozen 10
+        # only how many states two agents can bring about together, with so many decisions each
 """
 
 import argparse

@@ -1,8 +1,9 @@
 """Compute the sizes of requests and replies by how messages are encoded.
 
-    json  compact JSON without a signature or headers, the paper's profiles' default etsi  CPMs, and
-    containers of our own for intents and requests, in PER; signed, with a digest of the
-    certificate, which beacons carry now and then sae   SDSMs, and the same
+    json  compact JSON without a signature or headers, the paper's profiles' default
+    etsi  CPMs, and containers of our own for intents and requests, in PER; signed, with a digest of
+          the certificate, which beacons carry now and then
+    sae   SDSMs, and the same
 
 The background's packets are then CAMs or BSMs. Under a physical radio the headers of network and
 transport count as well; those of the radio are its own.

@@ -4,14 +4,16 @@ In seconds from the start of the decision:
 
     0                     every vehicle sees the scene; the ego and its helpers infer in parallel
     inference_s[0]        the ego has its own intent. If it is sure enough, or has nobody to ask, it
-    acts now. If it is unsure, it broadcasts one request to the nearest helpers in its radius heard
-    the request was on air, and the helpers have it, each after its own link's latency if the
-    channel has one. Only now do they infer, if they infer on demand ready                 a helper
-    has the request and its own intent, and its reply can leave:
+                          acts now. If it is unsure, it broadcasts one request to the nearest
+                          helpers in its radius
+    heard                 the request was on air, and the helpers have it, each after its own link's
+                          latency if the channel has one. Only now do they infer, if they infer on
+                          demand
+    ready                 a helper has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
-    + slots               replies are on air, one after another or at once,
-    as the profile says; a slot is
-                          nominal latency + payload / bandwidth + jitter, twice over a roadside edge
+    + slots               replies are on air, one after another or at once, as the profile says; a
+                          slot is nominal latency + payload / bandwidth + jitter, twice over a
+                          roadside edge
     arrival_s[h]          the end of the helper's slot if request and reply arrived; else inf
     window_s              what has arrived by now is fused
     exchange_s            the end of the last slot: the ego also waits for a lost or late reply

@@ -8,8 +8,9 @@ octets, behind their number. The signed envelope is in OER (X.696), whole octets
 size depends on values, only on how much is listed.
 
     etsi   CAM (TS 103 900, and bit for bit EN 302 637-2), CPM (TS 103 324), GeoNetworking and BTP-B
-    sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3) both   the envelope of IEEE 1609.2 by the
-    profile of TS 103 097: a digest of the sender's certificate, and now and then the certificate
+    sae    BSM (J2735), SDSM (J3224), WSMP (IEEE 1609.3)
+    both   the envelope of IEEE 1609.2 by the profile of TS 103 097: a digest of the sender's
+           certificate, and now and then the certificate
 
 No standard has a message for an intent or for its request. Theirs are containers of our own, made
 of the standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).

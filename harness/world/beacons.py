@@ -9,18 +9,21 @@ constant speed along the heading, as real receivers do. The settings are the sce
     rule      `fixed`: 10 Hz, a BSM's. `cam` (ETSI EN 302 637-2, 6.1.3): a check, 10 times a second,
               finds the vehicle turned by 4°, 4 m farther or 0.5 m/s faster or slower than its last
               CAM says; or that one older than 1 s or, for three CAMs on end, than the last interval
-              of one that moved. Each vehicle begins at a time of its own. delay     20 ms until all
-              receivers have it, a frame: NR Mode 2 waits 17.5 ms for a slot on average. loss      8
-              %, the paper's V2X profile. That losses are independent is assumed: a shadowed link
+              of one that moved. Each vehicle begins at a time of its own.
+    delay     20 ms until all receivers have it, a frame: NR Mode 2 waits 17.5 ms for a slot on
+              average.
+    loss      8 %, the paper's V2X profile. That losses are independent is assumed: a shadowed link
               loses many beacons in a row. With `beacon_channel` a beacon of 190 bytes (3GPP TR
               36.885) is lost as on that radio's link: by where both are when it is sent, what
               stands between them, and shadowing that belongs to the layout, and not to a run's
-              seed. noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT
-              (arXiv 2203.10638). That a speed has 0.1 m/s, and that errors are new in each beacon,
-              is assumed. They are the sender's, so all receivers read the same, rounded to 1 cm, 1
-              cm/s and 1 mrad. content   pose, speed and class, and the ego's target speed, which no
-              CAM has: that is assumed. A CAM may have a turn indicator (EN 302 637-2, 7.1: in its
-              low-frequency part); none is sent here.
+              seed.
+    noise     Gaussian, 0.2 m on each axis and 0.2°: the noisy setting of V2X-ViT (arXiv
+              2203.10638). That a speed has 0.1 m/s, and that errors are new in each beacon, is
+              assumed. They are the sender's, so all receivers read the same, rounded to 1 cm, 1
+              cm/s and 1 mrad.
+    content   pose, speed and class, and the ego's target speed, which no CAM has: that is assumed.
+              A CAM may have a turn indicator (EN 302 637-2, 7.1: in its low-frequency part); none
+              is sent here.
 
 Before the start of an episode, its vehicles have driven at constant speed, and the first beacon, up
 to LEAD_S before the start, is received by everybody. Draws are keyed by layout seed, sender,
