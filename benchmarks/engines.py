@@ -49,10 +49,8 @@ def main() -> None:
         theirs = of["llama-cpp"][0]
         print(
             f"{answer:<8} n = {given.questions}, {tokens:.0f} tokens: transformers {ours:.2f} CPU "
-            "s, "
-            f"llama-cpp {theirs:.2f}, {theirs / ours:.1f} times as many (aim {aim:g}); limit "
-            f"{limit:.2f}, "
-            f"{ours / limit:.1f} times it"
+            f"s, llama-cpp {theirs:.2f}, {theirs / ours:.1f} times as many (aim {aim:g}); limit "
+            f"{limit:.2f}, {ours / limit:.1f} times it"
         )
         found[answer] = {
             "transformers": ours,

@@ -200,16 +200,14 @@ def main() -> None:
     distances = [distance(data, args.nearest) for data in everything]
     print(
         "\n| dataset | report to train, median (least) | n | train to train, median (least) | n | "
-        "ratio "
-        "[95 % CI] |\n|---|---|---|---|---|---|"
+        "ratio [95 % CI] |\n|---|---|---|---|---|---|"
     )
     for d in distances:
         low, high = d["ci"]
         print(
             f"| `{d['dataset']}` | {d['median_report']:.3f} ({d['least_report']:.3f}) | "
-            f"{d['n_report']} | "
-            f"{d['median_train']:.3f} ({d['least_train']:.3f}) | {d['n_train']} | "
-            f"{d['ratio']:.2f} [{low:.2f}, {high:.2f}] |"
+            f"{d['n_report']} | {d['median_train']:.3f} ({d['least_train']:.3f}) | {d['n_train']} "
+            f"| {d['ratio']:.2f} [{low:.2f}, {high:.2f}] |"
         )
     print(json.dumps(distances))
 

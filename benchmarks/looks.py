@@ -178,8 +178,7 @@ def main() -> None:
     given = arguments.parse_args()
     print(
         f"{given.runs} runs of {given.layouts} layouts at most, {len(looks(given.layouts))} looks; "
-        "they stop "
-        f"at a width of {100 * WIDTH:g} points, gains where they are decided"
+        f"they stop at a width of {100 * WIDTH:g} points, gains where they are decided"
     )
     heads = ("every look", "stop", "fixed", "layouts", "stopped", "planned")
     print(

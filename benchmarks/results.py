@@ -153,8 +153,7 @@ def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:
     """What the answers of every model are like, in both roles."""
     lines = [
         "| who answers | role | n | readable % | strict % | copies an example % | follows the "
-        "letter % "
-        "| distinct | commonest action % |",
+        "letter % | distinct | commonest action % |",
         "|---|---|--:|--:|--:|--:|--:|--:|---|",
     ]
     for row, it in ((row, it) for row, roles in said.items() for it in roles):

@@ -148,8 +148,7 @@ def main() -> None:
     print(
         f"{given.requests} requests, {given.servers} servers of {given.seconds * 1000:g} ms x "
         f"{given.at_once}, batch size {batch_size}, {workers} client processes on {os.cpu_count()} "
-        "cores: "
-        f"ideal {given.requests / ideal_s:.0f}/s; medians of {given.repeats}"
+        f"cores: ideal {given.requests / ideal_s:.0f}/s; medians of {given.repeats}"
     )
     for name, times in found.items():
         wall_s, cpu_s, memory_mb = (
@@ -174,8 +173,7 @@ def main() -> None:
     server_ms = result["server_cpu_ms"]
     print(
         f"answered by each: {result['answered']}; connections: {result['connections']}; a server "
-        "takes "
-        f"{server_ms:.3f} ms of CPU a request itself: {1000 / server_ms:.0f}/s at most"
+        f"takes {server_ms:.3f} ms of CPU a request itself: {1000 / server_ms:.0f}/s at most"
     )
     rows = list[Row]()
     if {"sockets", "ask"} <= result.keys():

@@ -53,9 +53,7 @@ TEMPLATES = {
         "{% set ns = namespace(n=9) %}{% for i in range(60) %}{% set ns.n = ns.n * ns.n %}{% "
         "endfor %}",
     "sums": _FOREVER.replace("%s", "{% set ns.n = ns.n + ns.n %}").replace("{% for a", 
-        "{% set ns = "
-        "namespace(n=9) %}{% "
-        "for a", 1),
+        "{% set ns = namespace(n=9) %}{% for a", 1),
     "loops": _FOREVER.replace("%s", ""),
     "loops that write": _FOREVER.replace("%s", "xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx"),
     "loops with a condition": 
@@ -81,8 +79,7 @@ TEMPLATES = {
     "a shared list as JSON": _built(*_SHARED, "{{ ns.t | tojson }}"),
     "a shared list in a list": _built(*_SHARED, "{{ ns.t in [[ns.t]] }}"),
     "shared lists compared": _built(*_SHARED, "{% set a = ns.t %}").replace("{% set a", 
-        "{% set ns.u = "
-        "ns.t %}{% set a")
+        "{% set ns.u = ns.t %}{% set a")
     + _built(*_SHARED, "").replace("ns.", "no.").replace("set ns", "set no") + "{{ ns.t == no.t }}",
     "a shared pair as a key": _built(*_PAIRS, "{{ {ns.t: 1} }}"),
     "a shared pair looked up": _built(*_PAIRS, "{{ {'a': 1}[ns.t] }}"),

@@ -19,8 +19,7 @@ unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow]
 # Texts that prompts write in the place of a helper's evidence.
 PLACEHOLDERS = (
     "max 12 words", "Max. 12 words.", 
-        "one short "
-        "sentence", "<evidence>", "...", "string", "low|medium|high",
+        "one short sentence", "<evidence>", "...", "string", "low|medium|high",
     "low|medium", "SLOWER or IDLE", "0 to 1",
 )  # fmt: skip
 ROLES = st.sampled_from(["ego", "helper"])

@@ -12,9 +12,7 @@ from harness.runs.records import Answer
 
 ANSWER = Answer(
     scene="", viewer="", role="ego", raw=
-        "I "
-        "would "
-        "wait.", finish_reason="stop", error=None, prompt_tokens=1,
+        "I would wait.", finish_reason="stop", error=None, prompt_tokens=1,
     completion_tokens=None, seconds=None, batch_size=1, label_mass=None, retries=0, cached=False, slow_s=0.0,
     prompt_sha256="", status="strict", verdict="strict", repairs=(), intent=(0.2, 0.3, 0.5), mass=1.0,
     message=None, detail="",

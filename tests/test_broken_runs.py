@@ -157,12 +157,9 @@ def test_wrong_episodes_say_what_is_wrong(
         {"prompt": {"version": "v2"}}, {"conditions": [{"name": "a", "profile": 3}]},
         {"model": {"name": 3, "engine": "x"}}, {"model": {"name": " ", "engine": "x"}},
         {"model": {"name": "m" * 301, "engine": "x"}}, {"model": {"name": 
-            "m · v2 "
-            "· json", "engine": "x"}},
+            "m · v2 · json", "engine": "x"}},
         {"prompt": {"version": "", "sha256": "x"}}, {"prompt": {"version": 
-            "v2 "
-            "· "
-            "json", "sha256": "x"}},
+            "v2 · json", "sha256": "x"}},
     ],
 )  # fmt: skip
 def test_a_wrong_manifest_says_what_is_wrong(values: dict[str, Any], run: Path) -> None:

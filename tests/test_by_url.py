@@ -28,8 +28,7 @@ from harness.world import scenarios
 KEY = "sk-of-mine-5ecret"
 OTHERS = {
     "llama-cpp-python": {"/openapi.json": {"info": {"title": 
-        "🦙 llama.cpp "
-        "Python API", "version": "0.3"}}},
+        "🦙 llama.cpp Python API", "version": "0.3"}}},
 }  # fmt: skip
 NEEDED = ("llama_cpp", "fastapi", "starlette_context", "sse_starlette", "pydantic_settings")
 
@@ -152,8 +151,7 @@ def endless(asked: Asked) -> None:
         (endless, Unanswered, r"no server answers at .* \(no whole answer within 0.3 s\)"),
         (lambda asked: asked.reply(b" " * (http.MOST_BYTES + 1)), UserError, "longer than"),
         (lambda asked: asked.reply(b'{"data": ' + b"[" * 10**5), UserError, 
-            "the answer "
-            "is no JSON"),
+            "the answer is no JSON"),
         (lambda asked: asked.reply({"data": {"id": "m"}}), UserError, "lists no model"),
     ],
 )  # fmt: skip
@@ -346,8 +344,7 @@ def test_a_model_whose_first_answers_cannot_be_read_is_told_at_once_and_goes_on(
     command = f"harness prompt check {tries} --model '{there.url}#lab/tiny:q4'"
     assert said == (
         f"harness: none of the first answers of served:lab/tiny:q4 to prompt {prompt} could be "
-        "read, and "
-        f"the run goes on; try another: `{command}`; `harness prompt list` shows all\n"
+        f"read, and the run goes on; try another: `{command}`; `harness prompt list` shows all\n"
         if tries else ""
     )  # fmt: skip
 

@@ -105,8 +105,7 @@ def test_a_card_that_no_longer_ships_says_where_it_is_and_runs_again_once_it_is_
     file = "models/qwen3-8b.toml"
     said = (
         f"model 'qwen3-8b' no longer ships; copy its card from {PAGE} to {file} in your project's "
-        "folder, "
-        "which `harness init` makes, and it runs again\n"
+        "folder, which `harness init` makes, and it runs again\n"
     )
     (project / "run.toml").write_text('[helpers]\nmodel = "proxy, qwen3-8b"\n')
     planned = ("--limit", "1", "--dry-run")

@@ -71,8 +71,7 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
     assert told(share("failed_rate_ego", 0.49)) == []
     assert told(share("failed_rate_ego", 0.5)) == [
         "Only 50.0 % of the ego's 1440 answers could be read: it drives by the fallback, and "
-        "success says "
-        "little about the model."
+        "success says little about the model."
     ]
     assert [line.split(":")[0] for line in told(
         share("failed_rate_ego", 1.0), share("failed_rate_helper", 1.0), share("failed_rate_merge", 0.984)
@@ -214,16 +213,14 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
     done = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
     assert said_of(folder.read(done.out), Kind.LIMIT) == [
         "Only 4 episodes: the interval of a rate may reach 49 points to either side.",
-        "Without a danger, success is 100.0 % under every condition in 1 layout: none changes that "
-        "half of "
-        "the balance here. In other layouts one may, by as much as the interval of its gain says.",
+        "Without a danger, success is 100.0 % under every condition in 1 layout: none changes "
+        "that half of the balance here. In other layouts one may, by as much as the interval of "
+        "its gain says.",
         "6g:messages=shuffled is a control: the ego hears what helpers say in another layout, "
-        "while a "
-        "decision's page shows what its own helpers say.",
+        "while a decision's page shows what its own helpers say.",
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
         "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop "
-        "success may "
-        "differ. harness study fidelity compares the two.",
+        "success may differ. harness study fidelity compares the two.",
     ]
 
 
@@ -237,7 +234,6 @@ def test_a_window_that_no_reply_keeps_is_said(small: Dataset, tmp_path: Path) ->
     [said] = unheard(run)
     assert said == (
         f"Under {points[-1].name}, nobody is heard: of {scheduled.value:.0f} messages that "
-        "arrived, none "
-        "came within the decision window, so that the ego decided alone."
+        "arrived, none came within the decision window, so that the ego decided alone."
     )
     assert said in said_of(run, Kind.LIMIT)

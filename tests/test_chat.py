@@ -63,8 +63,8 @@ def test_a_thought_of_an_earlier_turn_may_be_left_out() -> None:
     ("template", "said"),
     [(DROPS, "message 1 of 4, the system's"), (CUTS, "message 1 of 4"),
      (LAST, 
-         "message 2 of "
-         "4, the user's"), (TURNS.replace("messages", "messages[:3]"), "message 4 of 4"),
+         "message 2 of 4, the "
+         "user's"), (TURNS.replace("messages", "messages[:3]"), "message 4 of 4"),
      (TURNS.replace("| trim", "| upper"), "message 1 of 4"), ("", "message 1 of 4")],
 )  # fmt: skip
 def test_a_template_that_leaves_out_changes_or_moves_a_text_is_refused(

@@ -103,8 +103,7 @@ def one_line(said: Said) -> str:
         (
             ["eval", "--model", "swarm-tiny", "--workers", "2"],
             "--workers 2: rules and servers answer to several processes, and swarm-tiny is a "
-            "language model "
-            "of one; give --batch-size",
+            "language model of one; give --batch-size",
         ),
         (["eval", "--thinking"], "--thinking: proxy cannot think; leave it out"),
         (["eval", "--device", "cuda"], 
@@ -125,9 +124,7 @@ def one_line(said: Said) -> str:
         (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),
         (["prompt", "show", "v2", "--scene", "00000-0", "--viewer", "v77"], 
-            "unknown "
-            "viewer of "
-            "scene"),
+            "unknown viewer of scene"),
         (["prompt", "check", "v2", "--tokenizer", "absent.gguf"], "no tokenizer at absent.gguf"),
         (["prompt", "release", "v2"], "prompt v2 is released already; copy it to a new version"),
         (["prompt", "release", "v99"], "unknown prompt 'v99'"),
@@ -420,8 +417,7 @@ def test_help_and_lists_load_no_heavy_package(args: list[str]) -> None:
         (["6g", "6g:tau=0"], ["no-messages"], "6g 6g:tau=0 6g:loss=1 6g:tau=0,loss=1"),
         (["6g", "6g:loss=1"], ["no-messages"], "6g 6g:loss=1"),
         (["v2x", "v2x"], ["no-messages", "shuffled-messages"], 
-            "v2x v2x:loss=1 "
-            "v2x:messages=shuffled"),
+            "v2x v2x:loss=1 v2x:messages=shuffled"),
     ],
 )  # fmt: skip
 def test_a_control_stands_beside_every_condition_with_a_channel(

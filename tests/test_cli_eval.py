@@ -187,13 +187,12 @@ def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_
 @pytest.mark.slow
 def test_an_evaluation_loads_no_pandas_and_nothing_that_numpy_loads_late(tmp_path: Path) -> None:
     code = (
-        "import sys, harness.cli as c\n"
-        "sys.argv = ['harness', 'eval', '--model', 'proxy', '--limit', '1', '--out', sys.argv[1]]\n"
-        "try:\n    c.main()\nexcept SystemExit as end:\n    assert not end.code\n"
-        "late = ('scipy.special', 'pandas', 'matplotlib', 'numpy.f2py', 'numpy.testing')\n"
-        "print([name for name in late if name in sys.modules], file=sys.stderr)\n"
-        "import numpy\n"
-        "print(numpy.f2py.__name__, numpy.testing.__name__, file=sys.stderr)"
+        "import sys, harness.cli as c\nsys.argv = ['harness', 'eval', '--model', 'proxy', "
+        "'--limit', '1', '--out', sys.argv[1]]\ntry:\n    c.main()\nexcept SystemExit as end:\n    "
+        "assert not end.code\nlate = ('scipy.special', 'pandas', 'matplotlib', 'numpy.f2py', "
+        "'numpy.testing')\nprint([name for name in late if name in sys.modules], "
+        "file=sys.stderr)\nimport numpy\nprint(numpy.f2py.__name__, numpy.testing.__name__, "
+        "file=sys.stderr)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "run")],

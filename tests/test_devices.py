@@ -520,14 +520,12 @@ def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, pro
             "unknown model of device profile "
             "agx-orin 'swarm-tiny'; known: d"),
         (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), 
-            "unknown model of "
-            "device profile"),
+            "unknown model of device profile"),
         (("--device-model", "qwen3-4b"), 
             "--device-model qwen3-4b is a "
             "device's row; give --device-pro"),
         (("--device-profile", "h200", "--device-model", "llama-3.1-8b"), 
-            "states no "
-            "prefill_tokens_per_s of"),
+            "states no prefill_tokens_per_s of"),
         (("--device-profile", "agx-orin", "--device-model", "qwen3-4b", "--latency", "paper"),
          "--device-profile agx-orin says how long answers take, as --latency paper does; give "
          "one of"),

@@ -118,9 +118,7 @@ NOT_RUN = {
     "harness serve --model swarm-tiny": "as above; "
     "tests/extensions/decide/test_serving.py "
     "starts it",
-    "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision "
-    "--prompt v9"
-    " --batch-size 1": "needs that server; tests/extensions/decide/test_serving.py has one",
+    "harness eval --model systemone-example --server http://127.0.0.1:8080/v1 --answer decision --prompt v9 --batch-size 1": "needs that server; tests/extensions/decide/test_serving.py has one",
     **{
         line: "needs that server; tests/test_by_url.py has such ones"
         for line in TYPED
@@ -141,15 +139,15 @@ NOT_RUN = {
     "harness model check smollm2-135m": "needs those weights",
     "harness prompt check v10 --model smollm2-135m": "needs those weights",
     "harness eval --model smollm2-135m --limit 4": "needs those weights",
-    "harness model distill occluded-intersection --base smollm2-135m --lora --rate 5e-4 --dtype "
-    "bfloat16"
-    " --prompt v9 --samples 0,12800,0,0 --out models/mine": "needs those weights, and an hour",
-    "harness eval --model smollm2-135m --prompt v9 --answer readout --condition single-local "
-    "--condition 6g"
-    " --control shuffled-messages --limit 100 --out reports/before": "needs those weights",
-    "harness eval --model models/mine --prompt v9 --answer readout --condition single-local "
-    "--condition 6g"
-    " --control shuffled-messages --limit 100 --out reports/after": "as above",
+    "harness model distill occluded-intersection --base "
+    "smollm2-135m --lora --rate 5e-4 --dtype bfloat16 "
+    "--prompt v9 --samples 0,12800,0,0 --out models/mine": "needs those weights, and an hour",
+    "harness eval --model smollm2-135m --prompt v9 --answer readout "
+    "--condition single-local --condition 6g --control shuffled-messages "
+    "--limit 100 --out reports/before": "needs those weights",
+    "harness eval --model models/mine --prompt v9 --answer readout --condition "
+    "single-local --condition 6g --control shuffled-messages --limit 100 --out "
+    "reports/after": "as above",
     "harness compare reports/before reports/after": "needs those runs",
     "harness model check qwen3-4b": "needs those weights",
     "harness eval --model qwen3-4b": "needs those weights",
@@ -189,9 +187,7 @@ ONCE = {
 FOLLOWED = {
     "docs/answers.md": (),
     "docs/comparing.md": ("harness eval", "harness compare", "harness run history", 
-        "harness "
-        "plan "
-        "reports/"),
+        "harness plan reports/"),
     "docs/radio.md": ("harness eval", "harness radio check"),
 }  # fmt: skip
 
@@ -495,12 +491,9 @@ def test_commands_named_in_a_sentence_are_taken_and_parts_of_them_exist(page: Pa
     ("said", "whole"),
     [
         ("", False), ("--against", False), ("--sft", False), ("RUN", False), (
-            "NAME "
-            "--agents "
-            "all", False),
+            "NAME --agents all", False),
         ("SCENARIO...", False), (
-            "--over x "
-            "--grid 0,…", False), ("--latency 0.05", True), ("site", True),
+            "--over x --grid 0,…", False), ("--latency 0.05", True), ("site", True),
     ],
 )  # fmt: skip
 def test_a_name_a_form_and_a_part_are_no_command_to_type(said: str, whole: bool) -> None:

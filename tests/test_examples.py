@@ -158,13 +158,10 @@ FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
             "helper example 1 has the graph "
             "of a viewer whose role is"),
         ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "nodes": 3}}]}, 
-            "[ego.0.graph]: "
-            "nodes = 3"),
+            "[ego.0.graph]: nodes = 3"),
         ({**FILE, "ego": [{**LINE, "graph": {**SEES.plain(), "hint": "go"}}]}, "unknown key"),
         ({**FILE, "ego": [{**LINE, "reply": GO}]}, 
-            "key in prompt mine "
-            "examples.json [ego.0] "
-            "'reply'"),
+            "key in prompt mine examples.json [ego.0] 'reply'"),
         ({"ego": [LINE]}, "prompt mine examples.json has no scenario; add it"),
         ([FILE], "prompt mine examples.json is no object; give scenario, ego and helper"),
         ("{", "prompt mine examples.json is no JSON"),
@@ -187,8 +184,7 @@ def test_an_evaluation_on_a_layout_that_the_examples_show_is_refused(small: Data
         with_examples(spec_of(small), shown)
     assert str(caught.value) == (
         f"--prompt v2 has an example of layout seed {seed}, which is evaluated; leave that episode "
-        "out, or "
-        "draw the examples anew: `harness prompt examples --first-seed`"
+        "out, or draw the examples anew: `harness prompt examples --first-seed`"
     )
     others = Selection(only=f"0,2:{len(small.episodes)}").of(small)
     assert with_examples(replace(spec_of(small), source=FrozenSource(others)), shown)

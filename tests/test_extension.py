@@ -339,11 +339,9 @@ def nested(depth: int) -> Any:
         ({"a": {"type": "number", "minimum": 0}}, "nan is no bound"),
         ({"a": {"type": "number", "minimum": 0, "maximum": 10**400}}, "is no bound; give"),
         ({"a": {"type": "number", "minimum": 0, "maximum": 1e-9}}, 
-            "from 0 to 1e-09; "
-            "give a minimum below"),
+            "from 0 to 1e-09; give a minimum below"),
         ({"a": {"type": "integer", "minimum": 0, "maximum": 5000}}, 
-            "of an integer "
-            "by at most 1000"),
+            "of an integer by at most 1000"),
         ({"a": {"type": "integer", "minimum": 0, "maximum": 1.5}}, "1.5 is no bound"),
         ({"a": {"type": "array", "items": TEXT, "maxItems": 21}}, 
             "ego.a.maxItems is "

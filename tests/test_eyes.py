@@ -53,8 +53,7 @@ def question(
     return Request(
         id=f"s{n}/v1", role="ego", actions=ACTIONS, max_tokens=64, answer=answer,
         messages=({"role": "system", "content": 
-            "You "
-            "drive."}, {"role": "user", "content": text, **shown}),
+            "You drive."}, {"role": "user", "content": text, **shown}),
         image=None if picture is None else drawn(picture, vision.size_px),
     )  # fmt: skip
 

@@ -160,11 +160,10 @@ def test_a_full_disk_names_the_file_that_is_written(tmp_path: Path) -> None:
 def test_a_file_that_grows_too_large_is_named(tmp_path: Path) -> None:
     code = (
         "import resource, signal, sys\nfrom pathlib import Path\nfrom harness.core.files import "
-        "write_whole\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, "
-        "(10, 10))\n"
-        "try:\n    write_whole(Path(sys.argv[1]), 'x' * 99)\n"
-        "except OSError as error:\n    print(error.filename)\n"
+        "write_whole\nsignal.signal(signal.SIGXFSZ, "
+        "signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))\ntry:\n    "
+        "write_whole(Path(sys.argv[1]), 'x' * 99)\nexcept OSError as error:\n    "
+        "print(error.filename)\n"
     )
     out = tmp_path / "page.html"
     said = subprocess.run(

@@ -84,8 +84,7 @@ def test_what_is_left_out_takes_as_long_as_the_ego(text: str, seconds: tuple[flo
     "text",
     ["", "mine", "0.1", "ego", "ego=", "ego=x", "ego=nan", "ego=-1", "ego=inf", f"ego={LONGEST_S + 1}",
      "helper=0.1", "ego=0.1,ego=0.2", "ego=0.1,", "ego=0.1,car=0.2", 
-         "ego=0.1 "
-         "helper=0.2", "ego=0.1\x1b[2J"],
+         "ego=0.1 helper=0.2", "ego=0.1\x1b[2J"],
 )  # fmt: skip
 def test_anything_else_is_one_line(text: str, harness: Callable[..., Any]) -> None:
     code, out, err = harness("eval", "--limit", "1", "--latency", text)

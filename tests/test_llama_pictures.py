@@ -187,8 +187,7 @@ def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> R
     return Request(
         id=f"s{n}/v1", role="ego", actions=("SLOWER", "IDLE", "FASTER"), max_tokens=64, answer=answer,
         messages=({"role": "system", "content": 
-            "You "
-            "drive."}, {"role": "user", "content": text, **shown}),
+            "You drive."}, {"role": "user", "content": text, **shown}),
         image=image,
     )  # fmt: skip
 

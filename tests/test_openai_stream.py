@@ -164,8 +164,7 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
          "a piece of the stream is no part of a chat completion", 1),
         ([{"choices": "a"}], "a piece of the stream is no part of a chat completion", 1),
         ([*pieces("hel", finish_reason=None)[:2], {"error": {"message": 
-            "out "
-            "of\nmemory", "code": 500}}],
+            "out of\nmemory", "code": 500}}],
          "the stream broke off: out of memory", 2),
         ([event(pieces("x")[1])] * 90_000, "the answer is longer than 4194304 bytes", 1),
     ],

@@ -256,8 +256,7 @@ def card(**changes: object) -> Card:
 @pytest.mark.parametrize(
     "weights",
     ["package:", "package:a", "package:a/", "package:/m.gguf", "package:-r/m.gguf", 
-        "package:a "
-        "b/m.gguf",
+        "package:a b/m.gguf",
      "package:a/../m.gguf", "package:a//m.gguf", "package:a/m.bin", "package:a/b\\m.gguf",
      "package:a/\nm.gguf", "package:a @ http:/m.gguf"],
 )  # fmt: skip

@@ -147,18 +147,13 @@ def test_any_id_is_rendered_as_it_is(name: str, version: str) -> None:
 PAPER = {
     "helper": 
         "You are a neighboring vehicle assisting the ego car. From your local view, report only "
-        "the "
-              "most decision-relevant evidence for the conflict zone, summarize the visible risk, "
-              "and send "
-              "one compact semantic message with a recommended maneuver and confidence score.",
+        "the most decision-relevant evidence for the conflict zone, summarize the visible risk, "
+        "and send one compact semantic message with a recommended maneuver and confidence score.",
     "ego": 
         "You are the ego vehicle. Combine your local scene graph with the received cooperative "
-        "messages, "
-           "reason step by step over occlusion, conflict-zone risk, and message agreement, and "
-           "then output "
-           "only the final JSON action distribution over A. Prioritize safety over efficiency when "
-           "the "
-           "evidence is uncertain or conflicting.",
+        "messages, reason step by step over occlusion, conflict-zone risk, and message agreement, "
+        "and then output only the final JSON action distribution over A. Prioritize safety over "
+        "efficiency when the evidence is uncertain or conflicting.",
 }  # fmt: skip
 
 

@@ -83,12 +83,9 @@ def test_a_command_that_is_terminated_while_it_connects_says_so(
     here the connection waits, and then it comes.
     """
     waits = (
-        "import os, signal, ray\n"
-        "ray.init = lambda **options: ("
-        "signal.signal(signal.SIGTERM, lambda number, frame: exit(number)), os.kill(os.getpid(), "
-        "15))\n"
-        "from harness.__main__ import main\n"
-        "main()\n"
+        "import os, signal, ray\nray.init = lambda **options: (signal.signal(signal.SIGTERM, "
+        "lambda number, frame: exit(number)), os.kill(os.getpid(), 15))\nfrom harness.__main__ "
+        "import main\nmain()\n"
     )
     command = [*DRIVE, "--workers", "ray", "--out", "run"]
     done = subprocess.run(

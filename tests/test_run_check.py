@@ -84,8 +84,7 @@ IN_TABLES = {
         "summary.csv has success_rate 0.987 in 6g (episodes)",
     ),
     "an end of its interval": (score("success_rate", "ci_low", 0.9), 
-        "success_rate, "
-        "low, 0.9 in 6g"),
+        "success_rate, low, 0.9 in 6g"),
     "a figure over seeds": (
         score("latency_proxy_ms", "value", 20.0, "seed means"),
         "has latency_proxy_ms 20.0 in 6g (seed means)",
@@ -437,8 +436,8 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
     said = (
         "comfort: as summary.csv states, and not checked, since",
         "Its figures are made by the rules of version 1, as run.json states. It lacks "
-        "optimal_action_rate, "
-        "optimal_brier and optimal_nll_nats, and whether they were left out cannot be checked.",
+        "optimal_action_rate, optimal_brier and optimal_nll_nats, and whether they were left out "
+        "cannot be checked.",
     )
     code, out, _ = harness("run", "check", run)
     page = harness("report", run)[0], (run / "report.html").read_text()

@@ -53,9 +53,7 @@ def test_a_member_that_is_not_there_is_an_error():
     ["{{ 'a'.ljust(3000000000) }}", "{{ 'a' * 10000000000 }}", "{{ [1] * 10000000000 }}",
      "{{ 10 ** 10000000 }}",
      "{{ '%3000000000d' | format(1) }}", 
-         "{{ '%*d' | "
-         "format(3000000000, "
-         "1) }}", "{{ '%3000000000d' % 1 }}",
+         "{{ '%*d' | format(3000000000, 1) }}", "{{ '%3000000000d' % 1 }}",
      "{{ '{:3000000000}'.format(1) }}"],
 )  # fmt: skip
 def test_no_template_fills_memory(template):
@@ -146,8 +144,7 @@ def test_half_of_a_surrogate_pair_is_not_written(written: str):
 @pytest.mark.parametrize(
     "written",
     ["''.maketrans", "graph.items", "[''.upper]", "''.upper ~ 1", "graph.keys ~ ''", 
-        "['a'] | "
-        "map('upper')",
+        "['a'] | map('upper')",
      "range", "cycler(1)", "''.upper | string"],
 )  # fmt: skip
 def test_what_has_no_text_but_its_address_is_not_written(written: str, sandbox: Environment):

@@ -55,8 +55,7 @@ OLLAMA: Paths = {
         {"name": "n:latest", "digest": "fe93"},
     ]},
     "/api/show": {"template": 
-        "{{ "
-        ".Prompt }}", "parameters": "num_ctx 4096", "modified_at": "2026-01-01",
+        "{{ .Prompt }}", "parameters": "num_ctx 4096", "modified_at": "2026-01-01",
                   "details": {"parameter_size": "4B"}, "model_info": {"general.parameter_count": 4000}},
 }  # fmt: skip
 STUDIO: Paths = {
@@ -264,8 +263,7 @@ def test_a_server_that_cannot_tell_its_weights_is_doubted_once_and_where_it_matt
             cached(opened(there.url, kind), card, tmp_path / "kept").complete([request("a")])
     assert capfd.readouterr().err == (
         "harness: model 'mine': some answers come from the completion cache, and its server does "
-        "not say "
-        "which weights it has; if these have changed since, use --no-cache\n"
+        "not say which weights it has; if these have changed since, use --no-cache\n"
     )
 
 

@@ -215,9 +215,7 @@ def test_bad_input_is_one_line_before_anything_is_asked(
     [
         ('two = "small"', "suite two in {file} is no table; give it a description and datasets"),
         ("[two]\ndescription = ''\ndatasets = []", 
-            "suite two in {file}: datasets = "
-            "[]; allowed: a list of "
-         "datasets' names, one or more"),
+            "suite two in {file}: datasets = []; allowed: a list of datasets' names, one or more"),
         ("[two]\ndescription = ''", "suite two in {file} has no datasets; add it"),
         (
             "[two]\ndescription = ''\ndatasets = "

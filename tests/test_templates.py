@@ -154,12 +154,11 @@ def test_what_a_template_may_do_is_as_in_jinja(text: str) -> None:
 
 ESCAPES = [
     "{{ ''.__class__.__mro__ }}", "{{ x.__init__ }}", 
-        "{{ x | "
-        "attr('__class__') }}", "{{ x['__class__'] }}",
+        "{{ x | attr('__class__') }}", "{{ x['__class__'] }}",
     "{{ '{0.__class__}'.format(x) }}", "{{ (x | map(attribute='__class__') | list) }}",
     "{{ [x] | "
-    "map(attribute='__class__') | list "
-    "}}", "{{ lipsum.__globals__ }}", "{{ cycler.__init__.__globals__ }}",
+    "map(attribute='__class__') "
+    "| list }}", "{{ lipsum.__globals__ }}", "{{ cycler.__init__.__globals__ }}",
     "{{ self._TemplateReference__context }}", "{{ namespace.__init__.__globals__ }}", "{{ [].append(1) }}",
     "{% set ns = namespace() %}{{ ns.__attrs }}{{ ns._Namespace__attrs }}",
     "{{ environment }}", "{{ spend }}{{ read }}{{ made }}", "{{ spend(-1) }}", "{{ x | spent }}",

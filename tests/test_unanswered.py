@@ -404,9 +404,7 @@ def old(tmp_path: Path) -> Path:
     def refuse(row: Row) -> None:
         row |= {
             "error": 
-                "HTTP "
-                "404: "
-                f"{WORDS}", "raw": "", "finish_reason": "error", "status": "engine_error",
+                f"HTTP 404: {WORDS}", "raw": "", "finish_reason": "error", "status": "engine_error",
             "verdict": "failed", "intent": None, "mass": None, "message": None,
         }  # fmt: skip
 

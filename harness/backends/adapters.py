@@ -68,8 +68,7 @@ def find_adapter(card: Card) -> Path | None:
     if not (folder / CONFIG).is_file():
         raise UserError(
             f"{card.shown}: no adapter in {printable(folder)} ({CONFIG}); put its folder beside "
-            "the card, or "
-            "leave adapter out"
+            "the card, or leave adapter out"
         )
     return folder
 
@@ -85,8 +84,7 @@ def foreign(shown: str, file: Path, reason: str) -> UserError:
     """Return the refusal of an adapter that does not fit its model."""
     return UserError(
         f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that "
-        "was "
-        "trained on it"
+        "was trained on it"
     )
 
 

@@ -244,8 +244,7 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
     if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
         raise UserError(
             f"{where}: [vision] and projector go together on {card.engine}: give the name of its "
-            "mmproj "
-            "file, or leave both out"
+            "mmproj file, or leave both out"
         )
     if card.server and card.thinking == "switch" and not card.server.tells_thinking:
         raise UserError(

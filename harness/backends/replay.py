@@ -162,8 +162,7 @@ class Replay:
         if asked != (answer.prompt_sha256, answer.image_sha256 or None):
             raise UserError(
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or "
-                "dataset; "
-                "replay it with that run's --prompt, --image and --dataset"
+                "dataset; replay it with that run's --prompt, --image and --dataset"
             )
         whole = Completion(request.id, answer.raw, **{name: answer.cell(name) for name in _KEPT})
         return _turn(whole, answer.first, again) if answer.first else whole

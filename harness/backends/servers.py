@@ -190,8 +190,8 @@ class Server:
         if not readable(self.key_env):
             raise UserError(
                 f"key_env {self.key_env} is no name of a key of models, such as OPENAI_API_KEY or "
-                "VLLM_KEY, "
-                f"so it is not sent; if it holds one, set {KEYS}={self.key_env} in your environment"
+                f"VLLM_KEY, so it is not sent; if it holds one, set {KEYS}={self.key_env} in your "
+                "environment"
             )
         return key
 

@@ -111,8 +111,7 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
     if kind == "gpt2" and pre not in GGUF_PRE_TOKENIZER_SPLITS:
         raise UserError(
             f"{printable(file)} has the pre-tokeniser {printable(pre)}, which is not known here; "
-            "give the "
-            "model's tokenizer.json, or run it on llama-cpp"
+            "give the model's tokenizer.json, or run it on llama-cpp"
         )
     architecture, stated, _ = gguf.get_gguf_tokenizer(str(file))
     built, _ = gguf.convert_gguf_tokenizer(architecture, stated)

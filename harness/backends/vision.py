@@ -59,8 +59,7 @@ class Vision:
             return None
         return (
             f"its processor makes {tokens} tokens of {self.width_px} x {self.height_px} pixels, "
-            "and its card "
-            f"says {self.tokens}; fix [vision]"
+            f"and its card says {self.tokens}; fix [vision]"
         )
 
     def _whole_squares(self, square: int) -> tuple[int, int]:

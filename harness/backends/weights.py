@@ -142,8 +142,7 @@ def contradictions(card: Card) -> Iterator[str]:
     if card.licence and stated.licence and card.licence.casefold() != stated.licence.casefold():
         yield (
             f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its "
-            "file; "
-            "correct the card, or ask who made the file"
+            "file; correct the card, or ask who made the file"
         )
     if (
         card.context_tokens
@@ -152,8 +151,7 @@ def contradictions(card: Card) -> Iterator[str]:
     ):
         yield (
             f"context of {card.context_tokens} tokens by its card, {stated.context_tokens} by its "
-            "weights: "
-            "what is longer was never trained; lower context_tokens"
+            "weights: what is longer was never trained; lower context_tokens"
         )
 
 
@@ -203,8 +201,7 @@ def _download(card: Card) -> None:
     except errors.GatedRepoError:
         raise UserError(
             f"{card.shown}: {at} asks for its licence to be accepted; do so on that page, then `hf "
-            "auth "
-            "login`"
+            "auth login`"
         ) from None
     except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):
         revision = f" at {printable(card.revision)}" if card.revision else ""
@@ -216,8 +213,7 @@ def _download(card: Card) -> None:
         reason = printable(" ".join(str(error).split()).partition(". ")[0].rstrip("."), 400)
         raise UserError(
             f"{card.shown}: cannot fetch {at}: {reason}; try again, or copy the weights here and "
-            "give their "
-            "path"
+            "give their path"
         ) from None
 
 

@@ -128,8 +128,8 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         if lost:
             console().print(
                 f"{lost} of {manifest.episodes} episodes are lost before the ego's first action: "
-                "it begins "
-                "in a collision, or cannot escape one; mend the environment, or choose other seeds"
+                "it begins in a collision, or cannot escape one; mend the environment, or choose "
+                "other seeds"
             )
     if problems:
         raise typer.Exit(1)

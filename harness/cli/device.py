@@ -127,12 +127,9 @@ def show(
     if run:
         echo_text(
             f"{printable(run)}: n = {len(answers.prompt)} answers of {printable(answers.who)} for "
-            "the ego; "
-            "tokens and ms are medians, in time and J are means with 95 % intervals over episodes; "
-            "in time: "
-            f"within {window_ms:g} ms; readout: one token after the same prompts. Tokens are "
-            "counted by the "
-            "model's own tokenizer"
+            "the ego; tokens and ms are medians, in time and J are means with 95 % intervals over "
+            f"episodes; in time: within {window_ms:g} ms; readout: one token after the same "
+            "prompts. Tokens are counted by the model's own tokenizer"
         )
     _origins(device, rows)
 
@@ -218,8 +215,7 @@ def measure(
     if not meters:
         raise UserError(
             "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and "
-            "the "
-            "nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
+            "the nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
         )
     agent = Agent(
         cards.load(f"{model}:{engine}" if engine else model), versions.load(prompt), answer
@@ -253,8 +249,7 @@ def measure(
     )
     echo_text(
         f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a "
-        "meter "
-        "counts all that draws from it, other programs and idling included"
+        "meter counts all that draws from it, other programs and idling included"
     )
 
 

@@ -101,8 +101,7 @@ def command(
     if part and (out is None or save_video or tracker):
         raise UserError(
             f"--shard {part}: give --out with a folder for this shard alone, and leave "
-            "--save-video and "
-            "--tracker out"
+            "--save-video and --tracker out"
         )
     if save_video:
         for drawer in VIDEOS.values():

@@ -92,8 +92,7 @@ def command(
         if named:
             raise UserError(
                 f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of "
-                "its "
-                "datasets"
+                "its datasets"
             )
         if full:
             raise UserError("--full: repeats have a page without decisions; leave it out")
@@ -105,8 +104,7 @@ def command(
         if workers is not None:
             raise UserError(
                 f"--workers {printable(workers)}: repeats are asked from one process; leave it "
-                "out, or type "
-                "a command for each --sampling-seed"
+                "out, or type a command for each --sampling-seed"
             )
     if dry_run:
         from harness.evaluate.dry_run import count
@@ -175,14 +173,12 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
         if not agent.card.server:
             raise UserError(
                 f"--workers {printable(workers)}: rules and servers answer to several processes, "
-                "and "
-                f"{printable(agent.card.name)} is a language model of one; give --batch-size"
+                f"and {printable(agent.card.name)} is a language model of one; give --batch-size"
             )
         if isinstance(who, Ray):
             raise UserError(
                 f"--workers {printable(workers)}: {printable(agent.card.name)} is asked at "
-                "servers, by "
-                "processes of this machine; give their number"
+                "servers, by processes of this machine; give their number"
             )
 
 
@@ -199,10 +195,9 @@ def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
     if "fusion" in by_role:
         requests += f", at most {by_role['fusion']} fusion calls"
     typer.echo(
-        f"{spec.source.name}: {requests}{repeated} for the {counted['scenes']} scenes "
-        f"on the reference drivers' courses; would score {len(spec.points)} conditions × "
-        f"{len(spec.seeds)} "
-        "channel seeds; no model was called"
+        f"{spec.source.name}: {requests}{repeated} for the {counted['scenes']} scenes on the "
+        f"reference drivers' courses; would score {len(spec.points)} conditions × "
+        f"{len(spec.seeds)} channel seeds; no model was called"
     )
     echo_prompt_tokens(counted["prompt_tokens"])
     echo_cost(counted.get("cost", {}), counted.get("repeats", 1))

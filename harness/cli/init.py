@@ -49,6 +49,5 @@ def command(
         ) from None
     typer.echo(
         f"made {printable(folder)}; next: cd there, `harness eval --model swarm-tiny --prompt "
-        "mine`; "
-        "README.md says more"
+        "mine`; README.md says more"
     )

@@ -85,8 +85,7 @@ def picture_model(
     if card.vision is None:
         raise UserError(
             f"--model {printable(card.name)}: prompt {prompt.version} shows a picture, and this "
-            "model reads "
-            f"texts alone (its card has no [vision]); give another, such as {MODEL}"
+            f"model reads texts alone (its card has no [vision]); give another, such as {MODEL}"
         )
     return PictureModel(card, card.vision, processor_tokens(card) if checked else None)
 

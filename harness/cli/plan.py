@@ -56,8 +56,7 @@ def command(
     if bool(pilots) == (rate is not None):
         raise UserError(
             "a plan needs one or two finished runs as pilots, or --rate with the success that you "
-            "expect, in "
-            "percent; give one of both"
+            "expect, in percent; give one of both"
         )
     if correlation is not None:
         if rate is None:
@@ -98,15 +97,14 @@ def _show(plan: "Plan", detect: float, power: float) -> None:
     table(heads, [cells(row) for row in plan.rows])
     echo_text(
         f"layouts: so many find a difference of {detect:g} points with a chance of {power:g} %, by "
-        "a 95 % "
-        f"interval, if {plan.basis}"
+        f"a 95 % interval, if {plan.basis}"
         + ("; [..]: over other pilots of as many layouts" if costs else "")
     )
     if costs:
         echo_text(
             "requests, tokens, minutes: of all runs and conditions of the pilots, at their number "
-            "a layout; "
-            "minutes one answer after the other, known where pilots asked with --batch-size 1"
+            "a layout; minutes one answer after the other, known where pilots asked with "
+            "--batch-size 1"
         )
     else:
         echo_text("requests and tokens: `harness eval --dry-run` counts those of a dataset")

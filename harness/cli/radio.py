@@ -138,8 +138,7 @@ def check(
     if not isinstance(channel, Physical):
         raise UserError(
             f"{printable(name)} loses the same at every distance, so there is no curve to check; "
-            "give a "
-            "physical radio, such as mode4"
+            "give a physical radio, such as mode4"
         )
     _refuse_format(out)
     found = checked(channel, n, against or (), f"channel profile {profile}")

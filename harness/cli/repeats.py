@@ -25,14 +25,12 @@ def check(spec: "Spec", repeats: int) -> None:
     if not spec.settings.temperature:
         raise UserError(
             f"--repeats {repeats}: greedy answers are the same every time; give a --temperature "
-            "above 0, "
-            "such as 0.7"
+            "above 0, such as 0.7"
         )
     if spec.settings.latency == MEASURED:
         raise UserError(
             f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; "
-            "measure "
-            "once without --repeats, and give the seconds that its run.json has"
+            "measure once without --repeats, and give the seconds that its run.json has"
         )
 
 

@@ -194,8 +194,8 @@ def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     if inexact := outcomes["inexact"]:
         text.print(
             f"joint is the best found, and the best plan in {episodes - len(inexact)} of "
-            f"{episodes} "
-            f"episodes; not searched to the end, or a driver did better: {_seeds(inexact)}"
+            f"{episodes} episodes; not searched to the end, or a driver did better: "
+            f"{_seeds(inexact)}"
         )
     else:
         text.print(f"joint is the best plan, searched to the end in all {episodes} episodes")

@@ -39,8 +39,7 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     if first.settings.latency == MEASURED:
         raise UserError(
             f"--latency {MEASURED}: it needs an idle machine, which its own first runs keep busy; "
-            "measure "
-            "on one dataset, and give the seconds that its run.json has"
+            "measure on one dataset, and give the seconds that its run.json has"
         )
     for agent in first.agents:
         if not agent.can.closed_loop:
@@ -138,11 +137,9 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     text.print("references are computed from the trees; a run of uniform draws, and may differ")
     text.print(
         f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the "
-        "layout "
-        "seeds are for; 95 % intervals over episodes; gains are paired; the mean gives each family "
-        "the same "
-        "weight, and its interval is about other episodes of these families, not about other "
-        "families"
+        "layout seeds are for; 95 % intervals over episodes; gains are paired; the mean gives "
+        "each family the same weight, and its interval is about other episodes of these families, "
+        "not about other families"
     )
     for finding in findings(done, *LAST):
         text.print(finding.sentence)

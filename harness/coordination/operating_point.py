@@ -604,8 +604,7 @@ def named_point(text: str) -> OperatingPoint:
             joined = f"{key}={value.replace(':', ',')}"
             raise UserError(
                 f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings "
-                "are "
-                f"joined by commas, as in {printable(f'{name}:{joined}')}"
+                f"are joined by commas, as in {printable(f'{name}:{joined}')}"
             )
         if field in settings or field in radio:
             raise UserError(
@@ -620,8 +619,7 @@ def named_point(text: str) -> OperatingPoint:
         if key in settings and point.radio.profile is None:
             raise UserError(
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes "
-                "nothing; "
-                "leave it out"
+                "nothing; leave it out"
             )
     if "round_trip" in settings and "round_trip_s" not in settings:
         settings["round_trip_s"] = None  # `cloud` has the paper's; only one of the two may be set

@@ -152,8 +152,7 @@ class Ask(Part, frozen=True, kw_only=True):
         if self.schedule == ORACLE:
             raise ValueError(
                 f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` "
-                "plays it, and "
-                f"others are {', '.join(SCHEDULES)}"
+                f"plays it, and others are {', '.join(SCHEDULES)}"
             )
         if self.schedule not in SCHEDULES:
             raise unknown("schedule", self.schedule, SCHEDULES)

@@ -200,8 +200,7 @@ def _checked(name: str, extension: Extension) -> Extension:
     if extension.interface != INTERFACE:
         raise UserError(
             f"{what} is for version {printable(repr(extension.interface))} of `Extension`, and "
-            "this is "
-            f"version {INTERFACE}; install a version of its package for this harness"
+            f"this is version {INTERFACE}; install a version of its package for this harness"
         )
     if extension.name != name:
         raise UserError(f"{what} calls itself {printable(extension.name)}; give both the same name")
@@ -262,8 +261,7 @@ def _joined(
             if name in table or (kind == "commands" and taken(name, table)):
                 print(
                     f"harness: extension {printable(extension.name)}: {printable(name)} of its "
-                    f"{kind} is "
-                    "taken; it is left out, and all else works",
+                    f"{kind} is taken; it is left out, and all else works",
                     file=sys.stderr,
                 )
             else:

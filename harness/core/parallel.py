@@ -49,8 +49,7 @@ def workers_of(text: str) -> Workers:
         return Ray(text if match[1] else match[2])
     raise UserError(
         f"--workers {printable(text)}: give 1 to {MOST_WORKERS} processes, or ray for a Ray "
-        "cluster, "
-        "ray://HOST:10001 for one elsewhere, ray:HOST:6379 on a node of it"
+        "cluster, ray://HOST:10001 for one elsewhere, ray:HOST:6379 on a node of it"
     )
 
 
@@ -137,8 +136,7 @@ def each(
         names = ", ".join(label(inputs[place]) for place in sorted(dead))
         raise Unfinished(
             f"{printable(names)}: the worker was killed {TRIES} times, perhaps because memory ran "
-            "out; try "
-            f"fewer --workers; the other {n_done} are done"
+            f"out; try fewer --workers; the other {n_done} are done"
         )
 
 

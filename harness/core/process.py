@@ -219,8 +219,7 @@ def _lack() -> str | None:
     if limit != resource.RLIM_INFINITY and limit >> 20 < LEAST_MB:
         return (
             f"the address space is limited to {limit >> 20} MB, and {LEAST_MB} MB are the least; "
-            "raise it "
-            f"with `ulimit -v {LEAST_MB << 10}`"
+            f"raise it with `ulimit -v {LEAST_MB << 10}`"
         )
     return None
 

@@ -88,8 +88,7 @@ def card_to_copy(model: str) -> str | None:
         return None
     return (
         f"model {name!r} no longer ships; copy its card from {printable(page, 1000)} to {file} in "
-        "your "
-        "project's folder, which `harness init` makes, and it runs again"
+        "your project's folder, which `harness init` makes, and it runs again"
     )
 
 

@@ -28,8 +28,7 @@ def purpose(first: int, count: int) -> Purpose:
         ]
         raise UserError(
             f"layout seeds {first} to {first + count - 1} are for {' and '.join(present)}; keep to "
-            "one of "
-            f"{', '.join(ends)}, {FIRST['report']} and above (report)"
+            f"one of {', '.join(ends)}, {FIRST['report']} and above (report)"
         )
     return present[0]
 

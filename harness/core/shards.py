@@ -141,8 +141,7 @@ def owners(
         if missing := [name for name, part in shard_parts.items() if not part.exists()]:
             raise UserError(
                 f"{printable(folder)}, shard {config.shard}, lacks {printable(label(missing[0]))} "
-                "and "
-                f"{len(missing) - 1} parts more; type its command again, and then merge"
+                f"and {len(missing) - 1} parts more; type its command again, and then merge"
             )
         for name, part in shard_parts.items():
             if name in paths and _content(part) != _content(paths[name]):

@@ -121,8 +121,7 @@ def build(
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
             f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or "
-            "'-', "
-            "a letter or digit first"
+            "'-', a letter or digit first"
         )
     if (out / "manifest.json").exists():
         if not (out / WORK).is_dir():

@@ -126,8 +126,7 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
     if SPLITS["report"] in splits:
         yield (
             "Rows of the split `test` are of report seeds, which results are quoted on. A model "
-            "that has "
-            "learnt from them cannot be measured on them any more."
+            "that has learnt from them cannot be measured on them any more."
         )
     if splits - {SPLITS["report"]}:
         yield (
@@ -135,34 +134,28 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
         )
     yield (
         "Rows of a layout are not independent: count layouts, not rows, as n, and keep a layout on "
-        "one side "
-        "of any split. `layout_seed` says which rows belong together."
+        "one side of any split. `layout_seed` says which rows belong together."
     )
     yield (
         "A table holds every course, also such as no driver would take. A mean over rows is no "
-        "success rate: "
-        "for that, walk from `step` 0 along `next_scene`."
+        "success rate: for that, walk from `step` 0 along `next_scene`."
     )
     yield (
         "`danger_sector`, `danger_vehicle`, `safe` to `drivers` and `state` say what no car knows. "
-        "A model "
-        "that reads them is told the answer."
+        "A model that reads them is told the answer."
     )
     yield (
         "`prompt` asks the ego alone. What helpers say, and which of it a radio delivers, the "
-        "harness "
-        "simulates; no table has it."
+        "harness simulates; no table has it."
     )
     lags = " or ".join(dict.fromkeys(f"{1000 * t.lag_s:.0f}" for t in tables))
     yield (
         f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do "
-        "not say "
-        "what becomes of a slower model."
+        "not say what becomes of a slower model."
     )
     yield (
         "Scenes, traffic and drivers are of one simulator, and texts are English: nothing here "
-        "shows that a "
-        "model is safe on a road."
+        "shows that a model is safe on a road."
     )
 
 

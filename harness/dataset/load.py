@@ -298,14 +298,12 @@ def find(name: str) -> Path:
     if name in released():
         raise UserError(
             f"dataset {printable(name)} is not in this installation, which has the newest of each "
-            "family; "
-            "clone the repository, which has all"
+            "family; clone the repository, which has all"
         )
     if os.path.isfile(name):
         raise UserError(
             f"dataset {printable(name)} is a file; a dataset is a folder that `harness dataset "
-            "build` makes, "
-            "and files of other programs are not read"
+            "build` makes, and files of other programs are not read"
         )
     raise unknown("dataset", name, names, "; or give a folder made by `harness dataset build`")
 

@@ -61,8 +61,7 @@ def publish(
     if not re.fullmatch(FILE_NAME, name):
         raise UserError(
             f"suite {printable(name)} cannot name what is published; use letters, digits, '.', '_' "
-            "and '-', "
-            "a letter or digit first"
+            "and '-', a letter or digit first"
         )
     progress.more(sum(manifest.episodes for manifest in manifests))
     with making(out) as part:

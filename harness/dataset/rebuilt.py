@@ -51,9 +51,8 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
         for start in starts.keys() & theirs.keys():
             raise UserError(
                 f"dataset {printable(dataset.path)} has scene {starts[start]}, which is "
-                f"{theirs[start]} of "
-                f"{printable(other.name)}, and numbers are reported of that; build one of other "
-                "seeds"
+                f"{theirs[start]} of {printable(other.name)}, and numbers are reported of that; "
+                "build one of other seeds"
             )
 
 

@@ -92,8 +92,7 @@ def _numbers(text: str, end: int) -> set[int]:
         if not span or span.start < 0 or span.stop > end:
             raise UserError(
                 f"--only {printable(text)}: give episodes from 0 to {end - 1}, such as 3,10:20, "
-                "which is "
-                "3 and 10 to 19"
+                "which is 3 and 10 to 19"
             )
         numbers.update(span)
     return numbers

@@ -85,8 +85,7 @@ class Agent:
         ):
             raise UserError(
                 f"--prompt {self.prompt.version}: it shows a picture, and {name} reads texts alone "
-                "(its card "
-                "has no [vision]); give another model or prompt, or --image none"
+                "(its card has no [vision]); give another model or prompt, or --image none"
             )
         if self.answer not in get_args(AnswerMode):
             raise unknown("answer mode", self.answer, get_args(AnswerMode))
@@ -97,22 +96,19 @@ class Agent:
         if self.answer == "decision" and self.prompt.examples:
             raise UserError(
                 f"--answer decision: prompt {self.prompt.version} has examples, and a decision is "
-                "one "
-                "question; give a prompt without any"
+                "one question; give a prompt without any"
             )
         if self.sums not in get_args(Sums):
             raise unknown("sums", str(self.sums), get_args(Sums))
         if self.sums == "divide" and self.answer != "json":
             raise UserError(
                 f"--sums divide: {name} answers in {self.answer}, whose sums need no declaration; "
-                "leave it "
-                "out, or use --answer json"
+                "leave it out, or use --answer json"
             )
         if self.answer != "json" and self.thinking:
             raise UserError(
                 f"--answer {self.answer}: {name} thinks first, and only json leaves room for that; "
-                "use "
-                "--answer json"
+                "use --answer json"
             )
 
     @property
@@ -264,8 +260,7 @@ def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[s
         if parsed.status is not Status.STRICT or parsed.intent is None:
             raise UserError(
                 f"prompt {prompt.version} examples.json: the answer of {role} example {number} is "
-                "not as a "
-                f"model should state it ({parsed.status}: {parsed.detail}); fix it"
+                f"not as a model should state it ({parsed.status}: {parsed.detail}); fix it"
             )
         likeliest.append(actions[parsed.intent.index(max(parsed.intent))])
     return likeliest

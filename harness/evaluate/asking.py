@@ -153,10 +153,9 @@ def _say_unread(card: Card, prompt: str) -> None:
     other = WITH_EXAMPLES if prompt != WITH_EXAMPLES else "VERSION"
     command = shlex.join(["harness", "prompt", "check", other, "--model", cards.argument(card)])
     print(
-        f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could be "
-        "read, "
-        f"and the run goes on; try another: `{printable(command, 300)}`; `harness prompt list` "
-        "shows all",
+        f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could "
+        f"be read, and the run goes on; try another: `{printable(command, 300)}`; `harness prompt "
+        "list` shows all",
         file=sys.stderr,
     )
 

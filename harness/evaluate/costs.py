@@ -58,8 +58,7 @@ class Budget:
         if spent >= self.most:
             raise Unanswered(
                 f"{spent:.4g} {self.currency} of --max-cost {self.most:g} are spent; all answers "
-                "are kept, "
-                "and the same command goes on, and may spend as much again"
+                "are kept, and the same command goes on, and may spend as much again"
             )
 
 
@@ -133,8 +132,8 @@ class Metered:
             if self._unsaid:
                 raise Unanswered(
                     f"{printable(self._model)} does not say how many tokens its answers take, so "
-                    "--max-cost "
-                    "cannot hold; all answers are kept, and the same command without it goes on"
+                    "--max-cost cannot hold; all answers are kept, and the same command without "
+                    "it goes on"
                 )
         completions = self._backend.complete(requests)
         counted = [

@@ -44,8 +44,7 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
             if getattr(row, rate) is None:
                 raise UserError(
                     f"{flag} states no {rate} of {printable(row.model)}, so it cannot time "
-                    "answers; "
-                    "give another device, or another --device-model"
+                    "answers; give another device, or another --device-model"
                 )
         rows.append(row)
     return rows

@@ -62,8 +62,7 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
     if any(each.speeds for each in (ego, *helpers)):
         raise UserError(
             "a replay of a run with a device profile has that run's times; give --device-profile "
-            "anew, or "
-            "--latency"
+            "anew, or --latency"
         )
     basis = " + ".join(dict.fromkeys(each.basis for each in helpers))
     return replace(
@@ -96,9 +95,8 @@ def declared(text: str) -> Latency:
     if not (roles_once and one_each and all(0 <= s <= LONGEST_S for s in (*ego, *helper, *fusion))):
         raise UserError(
             f"--latency {printable(text)!r}: give {', '.join(NAMES)}, or by role the seconds of "
-            "one "
-            f"answer, 0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed; a role left out has "
-            "its time)"
+            f"one answer, 0 to {LONGEST_S:g}, such as {EXAMPLE} (ego is needed; a role left out "
+            "has its time)"
         )
     several = tuple(helper) if len(helper) > 1 else ()
     return Latency(

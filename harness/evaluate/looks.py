@@ -78,8 +78,7 @@ class Until:
         if missing := [name for name in conditions if name not in run.conditions]:
             raise UserError(
                 f"{where} has no condition {printable(missing[0])}; give --condition with those "
-                "that it has: "
-                f"{printable(', '.join(run.conditions), 60)}"
+                f"that it has: {printable(', '.join(run.conditions), 60)}"
             )
         if lacking := sum(number not in run.grid.episodes for number in numbers):
             raise UserError(

@@ -74,8 +74,7 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
             if not unchanged(name, recorded):
                 raise UserError(
                     f"{printable(run.path)}: {what} {printable(name)} has changed since; restore "
-                    "it or run "
-                    "again"
+                    "it or run again"
                 )
     return points
 

@@ -233,8 +233,8 @@ def of_card(run: Run) -> Iterator[str]:
     if here_s != latency.ego_s:
         yield (
             f"Its latency of {latency.ego_s:g} s is that of a card in run.json; the card "
-            f"{printable(name)} "
-            f"that is here states {'none' if here_s is None else f'{here_s:g} s'}."
+            f"{printable(name)} that is here states "
+            f"{'none' if here_s is None else f'{here_s:g} s'}."
         )
 
 

@@ -123,8 +123,7 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     if settings.letters and not {settings.answer, mode} & {*BARE}:
         raise UserError(
             f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; "
-            "leave it "
-            "out, or give --answer readout"
+            "leave it out, or give --answer readout"
         )
     helper_cards = (
         [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]

@@ -318,8 +318,7 @@ def _begin_driving(
     if spec.settings.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
             f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; "
-            "measure on "
-            "one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
+            "measure on one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
     identity, latency = _stated_in_worker(spec, begun, workers)
     return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.record())

@@ -100,8 +100,7 @@ def as_asked(
     except KeyError as error:
         raise UserError(
             f"answers.jsonl has an answer in scene {printable(scene.id)} that heard "
-            f"{printable(error)}, "
-            "who is not there; make the run again"
+            f"{printable(error)}, who is not there; make the run again"
         ) from None
     return scene if graph is None else scene.changed(graphs={**scene.graphs, answer.viewer: graph})
 

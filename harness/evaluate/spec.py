@@ -152,13 +152,11 @@ class Spec:
             if self.ego in drivers:
                 raise UserError(
                     f"--model {printable(self.ego.card.name)}: it is a driver, which asks no "
-                    "helpers; give "
-                    "another model, or leave the helpers' options out"
+                    "helpers; give another model, or leave the helpers' options out"
                 )
             raise UserError(
                 f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for "
-                "an ego "
-                "only; give other models"
+                "an ego only; give other models"
             )
         if (latency := self.settings.latency) not in (None, *NAMES):
             times = len(declared(latency).helpers_s)
@@ -185,8 +183,7 @@ class Spec:
                 ]
                 raise UserError(
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights "
-                    "here "
-                    f"(engines {' and '.join(engines)} have); leave it out"
+                    f"here (engines {' and '.join(engines)} have); leave it out"
                 )
 
     def _check_device(self) -> None:
@@ -200,8 +197,7 @@ class Spec:
         if self.settings.latency is not None:
             raise UserError(
                 f"--device-profile {printable(self.device_profile.name)} says how long answers "
-                "take, as "
-                f"--latency {printable(self.settings.latency)} does; give one of the two"
+                f"take, as --latency {printable(self.settings.latency)} does; give one of the two"
             )
         rows_of(self.device_profile, self.settings.device_model, self.agents)
 
@@ -287,9 +283,8 @@ class Spec:
         if shown := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
             raise UserError(
                 f"--prompt {prompt.version} has an example of layout seed {shown[0]}, which is "
-                "evaluated; "
-                "leave that episode out, or draw the examples anew: `harness prompt examples "
-                "--first-seed`"
+                "evaluated; leave that episode out, or draw the examples anew: `harness prompt "
+                "examples --first-seed`"
             )
         for role in ROLES:
             example_actions(prompt, role, self.actions)
@@ -339,8 +334,7 @@ class Spec:
                 return
         raise UserError(
             f"{shown}: prompt {self.ego.prompt.version} shows no objects in its text, so the ego "
-            "would be "
-            "asked the same question again; give another --prompt"
+            "would be asked the same question again; give another --prompt"
         )
 
     @property
@@ -353,8 +347,7 @@ class Spec:
             if prompt.helper_answer != form:
                 return (
                     f"prompt {version} fuses messages with a {form}, those of {prompt.version} "
-                    "have a "
-                    f"{prompt.helper_answer}; use another --helper-prompt"
+                    f"have a {prompt.helper_answer}; use another --helper-prompt"
                 )
         return None
 

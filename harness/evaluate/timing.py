@@ -71,8 +71,7 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
         name = printable(spec.ego.card.name)
         raise UserError(
             f"--latency {MEASURED}: no answer of {name} could be timed in {len(scenes)} scenes; "
-            "see what "
-            f"`harness model check` says, or declare times such as {EXAMPLE}"
+            f"see what `harness model check` says, or declare times such as {EXAMPLE}"
         )
     ego_s, helper_s, fusion_s = (
         sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge")

@@ -85,8 +85,7 @@ def _check(example: Example, role: str, what: str) -> None:
     if not FIRST["train"] <= seed < FIRST["report"]:
         raise UserError(
             f"{what} is of layout seed {seed}; examples come from train seeds alone, "
-            f"{FIRST['train']} to "
-            f"{FIRST['report'] - 1}: `harness prompt examples` draws such"
+            f"{FIRST['train']} to {FIRST['report'] - 1}: `harness prompt examples` draws such"
         )
     if example.graph.role != role:
         raise UserError(f"{what} has the graph of a viewer whose role is {example.graph.role}")

@@ -122,8 +122,7 @@ def _text(schema: Mapping[str, Any], what: str) -> dict[str, Any]:
     if not good or len(set(choices)) < len(choices):
         raise UserError(
             f"{what}.enum: give 1 to {MOST_CHOICES} different texts of up to 80 printable "
-            "characters without "
-            "quotes and backslashes, and no maxLength"
+            "characters without quotes and backslashes, and no maxLength"
         )
     return {"enum": choices}
 
@@ -135,16 +134,14 @@ def _bounds(schema: Mapping[str, Any], what: str) -> dict[str, Any]:
         if type(bound) not in kinds or not abs(bound) <= LARGEST:
             raise UserError(
                 f"{what}: {printable(bound, 40)} is no bound; give minimum and maximum, "
-                f"{schema['type']}s "
-                f"from {-LARGEST:.0f} to {LARGEST:.0f}"
+                f"{schema['type']}s from {-LARGEST:.0f} to {LARGEST:.0f}"
             )
     if not most - least >= LEAST_RANGE or (
         schema["type"] == "integer" and most - least > MOST_WHOLE
     ):
         raise UserError(
             f"{what}: from {least} to {most}; give a minimum below the maximum, of an integer by "
-            "at most "
-            f"{MOST_WHOLE}"
+            f"at most {MOST_WHOLE}"
         )
     return {"minimum": least, "maximum": most}
 

@@ -231,8 +231,7 @@ class Prompt:
             ]
         needs = (
             "it needs the blocks system and user, and may use graph, actions, objects, more, "
-            "conflicts, "
-            "messages, words"
+            "conflicts, messages, words"
         )
         if letter or "question" not in template.blocks:
             return self._rendered(graph.role, variables, blocks, needs)
@@ -322,8 +321,7 @@ def load(version: str, where: Path | None = None) -> Prompt:
     if version in released and released[version] != digest(texts):
         raise UserError(
             f"prompt {version} was released and its text has changed; restore it, or copy it to a "
-            "new "
-            f"version (its digest is pinned in {printable(base / 'released.toml')})"
+            f"new version (its digest is pinned in {printable(base / 'released.toml')})"
         )
     return made(version, texts, version in released)
 

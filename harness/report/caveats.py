@@ -58,10 +58,8 @@ def looked_at(run: Run) -> Iterator[str]:
     )
     yield (
         f"{how} {what} in every condition. It was looked at {amount(len(looks.at), 'time')}: "
-        "intervals of "
-        "success and of its gain hold at every look; all others are for a number of layouts fixed "
-        "before, "
-        "and too narrow."
+        "intervals of success and of its gain hold at every look; all others are for a number of "
+        "layouts fixed before, and too narrow."
     )
 
 
@@ -117,9 +115,8 @@ def saturated(run: Run) -> Iterator[str]:
             layouts = amount(max(score.n for score in scores if score), "layout")
             yield (
                 f"{where}, success is {same} under every condition in {layouts}: none changes that "
-                "half of "
-                "the balance here. In other layouts one may, by as much as the interval of its "
-                "gain says."
+                "half of the balance here. In other layouts one may, by as much as the interval "
+                "of its gain says."
             )
 
 
@@ -195,8 +192,7 @@ def unmeasured(run: Run) -> Iterator[str]:
         older = "dataset" if run.world == "frozen" else "run"
         yield (
             f"Time to collision and post-encroachment time are unknown: this {older} is older than "
-            "these "
-            "measures."
+            "these measures."
         )
 
 
@@ -242,10 +238,9 @@ def by_letter(run: Run) -> Iterator[str]:
         if share and follows and (share.value or 0.0) > MOST_SHARE:
             yield (
                 f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the "
-                "letter and "
-                f"not the action: one letter is the likeliest in every order in {_hits(follows)} "
-                "of "
-                f"{follows.n}. The average over the orders cancels that, and adds no judgement."
+                "letter and not the action: one letter is the likeliest in every order in "
+                f"{_hits(follows)} of {follows.n}. The average over the orders cancels that, and "
+                "adds no judgement."
             )
 
 
@@ -261,8 +256,7 @@ def unheard(run: Run) -> Iterator[str]:
         if arrived and not on_time[conditions == place].any():
             yield (
                 f"Under {printable(name)}, nobody is heard: of {arrived} messages that arrived, "
-                "none came "
-                "within the decision window, so that the ego decided alone."
+                "none came within the decision window, so that the ego decided alone."
             )
 
 
@@ -284,8 +278,7 @@ def lost_at_once(run: Run) -> Iterator[str]:
     if lost:
         yield (
             f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first "
-            "action, in a "
-            "collision that no answer could prevent."
+            "action, in a collision that no answer could prevent."
         )
 
 
@@ -297,8 +290,7 @@ def moved_system(run: Run) -> Iterator[str]:
     for name in dict.fromkeys(str(model["name"]) for model in models if model.get("system")):
         yield (
             f"{printable(name, 30)} reads the system text at the beginning of the first user turn: "
-            "its chat "
-            "template has no place for a system message."
+            "its chat template has no place for a system message."
         )
 
 

@@ -64,10 +64,8 @@ def ignores_input(run: Run) -> Iterator[str]:
         like = f" Without messages it drives as {_like(run, common)}." if common.all_read else ""
         yield (
             f"The model ignores its input: {common.likeliest} in {common.count} of the ego's "
-            f"{common.n} "
-            f"readable answers, and its probability moves by {common.moves:.3f} (standard "
-            "deviation) between "
-            f"them.{like}"
+            f"{common.n} readable answers, and its probability moves by {common.moves:.3f} "
+            f"(standard deviation) between them.{like}"
         )
 
 
@@ -90,8 +88,7 @@ def in_a_line(run: Run) -> Iterator[str]:
     if common and not common.constant:
         yield (
             f"ego answers: {common.likeliest} in {100 * common.count / common.n:.0f} % of "
-            f"{common.n}; its "
-            f"probability moves by {common.moves:.2f} (standard deviation)"
+            f"{common.n}; its probability moves by {common.moves:.2f} (standard deviation)"
         )
 
 

@@ -221,8 +221,7 @@ def uneven(runs: Runs) -> str | None:
     )
     return (
         f"The runs have different episodes × seeds ({each}): a success rate is over the run's own, "
-        "and two "
-        "runs are compared on those that both have."
+        "and two runs are compared on those that both have."
     )
 
 

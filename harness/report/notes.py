@@ -85,8 +85,7 @@ def energy(run: Shown) -> Iterator[str]:
             joules = PLAIN.interval(total.value, total.low, total.high)
             yield (
                 f"{printable(name)}: {joules} J per decision, of which the helpers' inference "
-                "takes "
-                f"{helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
+                f"takes {helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
             )
 
 

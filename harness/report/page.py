@@ -91,8 +91,7 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
         if what not in lacked:
             raise UserError(
                 f"{printable(out)} is kept: a new page would lack its {what} ({why}); name another "
-                "file with "
-                f"{option}, or delete it"
+                f"file with {option}, or delete it"
             )
 
 

@@ -67,10 +67,8 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "overview",
             f"{IN_WORDS[lead].capitalize()} and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. "
-            "Rings: what "
-            "the paper reports, with other scenes and another model. A reply that arrives after "
-            "the "
-            "decision window is not fused."
+            "Rings: what the paper reports, with other scenes and another model. A reply that "
+            "arrives after the decision window is not fused."
             + sentences(references, scenario, runs.dataset is not None),
             charts.success_latency(rows, rates, windows_ms, IN_WORDS[lead]),
         )
@@ -80,8 +78,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "answers",
             "How answers were read",
             "Share of each role's answers by status. Strict: the text fits the schema as it is. "
-            "Recovered: "
-            "it was read after repairs. All others failed and gave no distribution.",
+            "Recovered: it was read after repairs. All others failed and gave no distribution.",
             charts.statuses(rows),
         )
     if rows := joined(reliability):
@@ -90,15 +87,11 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "probabilities",
             "Is the policy as often right as it is sure?",
             "Decisions in which exactly one action is optimal, so that success is possible after "
-            "no other, "
-            "are grouped by the probability of the likeliest action in the fused policy, in "
-            f"{BINS} bins of equal mass; each point shows how often that action was the optimal "
-            "one. The "
-            "mean distance from the dashed line is the ECE; above the line the policy is less sure "
-            "than it "
-            f"could be. Conditions with fewer than {LEAST} such decisions are left out. All seeds; "
-            "95 % "
-            "intervals over episodes.",
+            "no other, are grouped by the probability of the likeliest action in the fused "
+            f"policy, in {BINS} bins of equal mass; each point shows how often that action was "
+            "the optimal one. The mean distance from the dashed line is the ECE; above the line "
+            f"the policy is less sure than it could be. Conditions with fewer than {LEAST} such "
+            "decisions are left out. All seeds; 95 % intervals over episodes.",
             charts.shares(
                 rows,
                 "certainty",
@@ -113,8 +106,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "answers",
             "Entropy of the ego's own answers",
             "Number of the ego's own answers by entropy, for those that could be read. Dashed: τ, "
-            "above "
-            "which the ego asks helpers.",
+            "above which the ego asks helpers.",
             charts.bars(rows, "entropy_nats", ENTROPY, "answers", ENTROPY_NATS, rules=tau_nats),
         )
     if rows := joined(errors):
@@ -123,12 +115,9 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "probabilities",
             "Entropy against error",
             "Share of decisions whose action was unsafe, by the entropy of the ego's own intent "
-            "before "
-            "fusion. If high entropy predicts errors, the line of the condition without V2V rises "
-            "to the "
-            "right. How far the other lines lie below it is what the helpers correct. All seeds; "
-            "95 % "
-            "intervals over episodes.",
+            "before fusion. If high entropy predicts errors, the line of the condition without "
+            "V2V rises to the right. How far the other lines lie below it is what the helpers "
+            "correct. All seeds; 95 % intervals over episodes.",
             charts.shares(rows, "entropy_nats", ENTROPY, "share unsafe", rules=tau_nats),
         )
     if rows := joined(tokens):
@@ -137,8 +126,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "answers",
             "Length of prompts",
             "Number of prompts by length, in tokens as the engine counted them. Shaded: the "
-            "paper's budget "
-            "of 200 to 400 tokens.",
+            "paper's budget of 200 to 400 tokens.",
             charts.bars(
                 rows,
                 "tokens",
@@ -155,8 +143,8 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "communication",
             "Replies on time, late and lost",
             "Scheduled replies, all seeds. On time: the reply arrived within the decision window "
-            "and was "
-            "fused. Late: it arrived after the window. Lost: the request or the reply was lost.",
+            "and was fused. Late: it arrived after the window. Lost: the request or the reply was "
+            "lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )
     if rows := joined(energies):
@@ -165,12 +153,10 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "communication",
             "Energy of a decision",
             "Joules of inference on the declared device and of the radios, as means over "
-            "decisions; the "
-            "interval is that of the total, over episodes. All helpers in the radius infer from "
-            "the start, "
-            "asked or not; with on_demand=true those alone that are asked. If the radios' part is "
-            "too small "
-            "to see, cooperation costs energy because helpers infer, not because they transmit.",
+            "decisions; the interval is that of the total, over episodes. All helpers in the "
+            "radius infer from the start, asked or not; with on_demand=true those alone that are "
+            "asked. If the radios' part is too small to see, cooperation costs energy because "
+            "helpers infer, not because they transmit.",
             charts.stacked(
                 rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"
             ),
@@ -181,8 +167,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "communication",
             "When replies arrive",
             "Number of replies by arrival time, for those that were not lost; all seeds. Dashed: "
-            "the end of "
-            "the decision window.",
+            "the end of the decision window.",
             charts.bars(
                 rows,
                 "arrival_ms",

@@ -90,8 +90,7 @@ def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: in
             kinds = " with a danger, and without" * (success.metric != SUCCESS)
             raise UserError(
                 f"{sides.names}: {amount(n, 'layout')} cannot show how far layouts differ; give "
-                "pilots of "
-                f"two or more{kinds}"
+                f"pilots of two or more{kinds}"
             )
         finds = float(spread.difference(layouts or n, power)[0])
         cost = sides.cost.times(needed[0])
@@ -115,8 +114,7 @@ def _gains(path: Path) -> _Sides:
     if BASELINE not in run.conditions or len(run.conditions) < 2:
         raise UserError(
             f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no "
-            "gain; "
-            "give a second run, of another model or prompt, or a run with both"
+            "gain; give a second run, of another model or prompt, or a run with both"
         )
     by_condition = dict(
         zip(run.conditions, of_ends(METRICS[SUCCESS], run.grid, run.episodes), strict=True)

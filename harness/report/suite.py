@@ -142,8 +142,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
         [
             f"{suite.description}. {len(suite.runs)} families × "
             f"{amount(len(suite.manifest.seeds), 'channel seed')}; figures are means over "
-            "families, with "
-            "95 % intervals over episodes."
+            "families, with 95 % intervals over episodes."
         ],
         [_families(lines, place, lead_of(suite)), _metrics(suite)],
         warnings=[finding.sentence for finding in findings(suite, Kind.VOID)],
@@ -179,27 +178,21 @@ def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
     ]
     gains = (
         f"; below it the gain over {BASELINE}, paired by episode. ✓ and ✗ mark a gain and a loss "
-        "beyond "
-        "chance: p of the gain, from its interval, is at most 0.05 after Holm's correction, which "
-        "is for all "
-        "families and conditions of this table, and for the means for all conditions"
+        "beyond chance: p of the gain, from its interval, is at most 0.05 after Holm's "
+        "correction, which is for all families and conditions of this table, and for the means "
+        "for all conditions"
     )
     note = (
-        f"{IN_WORDS[lead].capitalize()} with its 95 % interval"
-        f"{gains * any(cell.gain for cell in mean.cells.values())}. The "
-        "mean gives each family the same weight, however many episodes it has. Its interval is "
-        "combined from "
-        "the intervals of the families (Zou and Donner 2008), and that of a gain is of the "
-        "episodes of all "
-        "families together. It is about other episodes of these families, not about other "
-        "families. "
-        "Dashed lines and the last columns: references, which need no model, in "
-        "the same episodes; constant always takes the action that did best in the family's tune "
-        "layouts, and "
-        "uniform takes every action equally often, computed from the trees; a run of this name "
-        "draws its "
-        "actions. Below each family: the number of episodes, and what its layout "
-        "seeds are for; quote only numbers of report seeds."
+        f"{IN_WORDS[lead].capitalize()} with its 95 % "
+        f"interval{gains * any(cell.gain for cell in mean.cells.values())}. The mean gives each "
+        "family the same weight, however many episodes it has. Its interval is combined from the "
+        "intervals of the families (Zou and Donner 2008), and that of a gain is of the episodes "
+        "of all families together. It is about other episodes of these families, not about other "
+        "families. Dashed lines and the last columns: references, which need no model, in the "
+        "same episodes; constant always takes the action that did best in the family's tune "
+        "layouts, and uniform takes every action equally often, computed from the trees; a run of "
+        "this name draws its actions. Below each family: the number of episodes, and what its "
+        "layout seeds are for; quote only numbers of report seeds."
     )
     heads = ["family", *conditions, "0 to 100 %", *mean.drivers]
     return Table("Families × conditions", heads, rows, note, left=True, total=True)

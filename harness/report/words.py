@@ -76,10 +76,8 @@ def headline(run: Run | SuiteRun) -> str:
     changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
     return (
         f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} "
-        "against "
-        f"{base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of both is "
-        f"{value}, "
-        f"{clear}."
+        f"against {base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of "
+        f"both is {value}, {clear}."
     )
 
 

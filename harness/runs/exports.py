@@ -59,9 +59,8 @@ class Exports(Plugins[Export]):
         if not (named and all(isinstance(text, str) for text in texts)):
             raise UserError(
                 f"plug-in {printable(name)!r} ({self.group}) has a help, doing or needs that is no "
-                "text, or "
-                "options that are no table of Option; repair or uninstall the package that "
-                "registers it"
+                "text, or options that are no table of Option; repair or uninstall the package "
+                "that registers it"
             )
         return format
 

@@ -134,12 +134,10 @@ class Metrics(Plugins[Metric]):
         if metric.name != name or not name.isidentifier() or len(functions) != 1 or metric.primary:
             raise UserError(
                 f"plug-in {printable(name)!r} ({self.group}) is the metric "
-                f"{printable(metric.name)!r} with "
-                f"{len(functions)} functions{', a primary one' * metric.primary}; give it the name "
-                "of its "
-                "entry point, of letters, digits and _, and one function, of decisions or of "
-                "episodes; a "
-                "package's metric is not primary"
+                f"{printable(metric.name)!r} with {len(functions)} "
+                f"functions{', a primary one' * metric.primary}; give it the name of its entry "
+                "point, of letters, digits and _, and one function, of decisions or of episodes; "
+                "a package's metric is not primary"
             )
         for field, allowed in _STATED.items():
             stated = getattr(metric, field)

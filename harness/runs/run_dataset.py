@@ -37,15 +37,12 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
         sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]
         raise UserError(
             f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made "
-            "on "
-            f"(sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
+            f"on (sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
         )
     raise UserError(
         f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither "
-        "at "
-        f"{printable(stated.path)}, seen from here or from a folder above the run, nor known by "
-        "its name; "
-        f"{repair}"
+        f"at {printable(stated.path)}, seen from here or from a folder above the run, nor known by "
+        f"its name; {repair}"
     )
 
 

@@ -60,8 +60,7 @@ class HelperSettings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
-            "Repeatable. "
-            "Default: the ego's model.",
+            "Repeatable. Default: the ego's model.",
             HELPERS,
             listed=True,
         ),
@@ -82,9 +81,8 @@ class HelperSettings(Struct, frozen=True, kw_only=True):
 UntilWidth = Annotated[
     float | None,
     option(
-        "Stop as soon as the 95 % interval of success is so narrow, in points, in every condition; "
-        "it is "
-        "one that holds at every look.",
+        "Stop as soon as the 95 % interval of success is so narrow, in points, in every "
+        "condition; it is one that holds at every look.",
         EPISODES,
     ),
 ]
@@ -118,8 +116,7 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
         str | None,
         option(
             "Use only episodes whose danger comes from this sector, such as left; none means "
-            "episodes "
-            "without a danger.",
+            "episodes without a danger.",
             EPISODES,
         ),
     ] = None
@@ -141,8 +138,7 @@ class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="cl
         str | None,
         option(
             "Scenario to drive; NAME:beacon_loss=0.3 changes its beacons. Default: "
-            "occluded-intersection, "
-            "with the scenes of occluded-intersection-v3."
+            "occluded-intersection, with the scenes of occluded-intersection-v3."
         ),
     ] = None
     episodes: Annotated[
@@ -181,11 +177,9 @@ class Settings(Struct, frozen=True, kw_only=True):
     model: Annotated[
         str,
         option(
-            "Model: a card name (`harness model list` shows them), a checkpoint directory, a .gguf "
-            "file, a "
-            "hub id, the URL of a server such as http://127.0.0.1:8080/v1, or replay:RUN, which "
-            "scores the "
-            "stored answers of a run again.",
+            "Model: a card name (`harness model list` shows them), a checkpoint directory, a "
+            ".gguf file, a hub id, the URL of a server such as http://127.0.0.1:8080/v1, or "
+            "replay:RUN, which scores the stored answers of a run again.",
             same=OPENED,
         ),
     ] = "proxy"
@@ -193,8 +187,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Engine to run the model on, such as llama-cpp, if its card names several. Default: "
-            "its main "
-            "one.",
+            "its main one.",
             ENGINE,
             same=OPENED,
             compared=False,
@@ -222,8 +215,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         tuple[str, ...],
         option(
             "Condition to score: an operating point such as single-local, v2x or 6g, or one with "
-            "changed "
-            "settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points.",
+            "changed settings: 6g:consensus=ego-prompt. Repeatable. Default: all operating points.",
             same=OPENED,
             compared=False,
         ),
@@ -232,10 +224,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         tuple[str, ...],
         option(
             "Beside each condition with a channel, also score a control. shuffled-messages: the "
-            "ego hears "
-            "the helpers of another layout. no-messages: every message is lost. blind: the helpers "
-            "see "
-            "nothing. Repeatable.",
+            "ego hears the helpers of another layout. no-messages: every message is lost. blind: "
+            "the helpers see nothing. Repeatable.",
             CONDITIONS,
             "frozen",
             same=OPENED,
@@ -246,10 +236,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         tuple[str, ...],
         option(
             "Beside each condition with a channel, also score it under attack: liar:share=1/3 "
-            "makes a third "
-            "of the helpers lie; liar+spoof combines two attacks. `harness study trust --help` "
-            "lists them. "
-            "Repeatable.",
+            "makes a third of the helpers lie; liar+spoof combines two attacks. `harness study "
+            "trust --help` lists them. Repeatable.",
             CONDITIONS,
             same=OPENED,
             compared=False,
@@ -259,10 +247,9 @@ class Settings(Struct, frozen=True, kw_only=True):
         str,
         option(
             "How the model answers. json: free text with a JSON object. constrained: decoding "
-            "allows only "
-            "what fits the schema. readout: the intent is read from the probabilities of one "
-            "letter per "
-            "action. decision: the same of a typed question, which decision models answer.",
+            "allows only what fits the schema. readout: the intent is read from the probabilities "
+            "of one letter per action. decision: the same of a typed question, which decision "
+            "models answer.",
             same=OPENED,
         ),
     ] = "json"
@@ -273,8 +260,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         str,
         option(
             "Which picture an image prompt shows: own (the viewer's), blank, another (another "
-            "scene's), or "
-            "none (text only).",
+            "scene's), or none (text only).",
             ANSWERS,
             same=OPENED,
         ),
@@ -283,10 +269,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "How the letters of a readout or decision are read. raw: once. cyclic: averaged over "
-            "as many "
-            "orders of the list as there are actions, so that none is preferred. Default: the "
-            "card's, or "
-            "cyclic.",
+            "as many orders of the list as there are actions, so that none is preferred. Default: "
+            "the card's, or cyclic.",
             ANSWERS,
             same=OPENED,
         ),
@@ -295,8 +279,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         bool,
         option(
             "Ask each readout or decision once more with the list of actions reversed, and count "
-            "how often "
-            "the likeliest action changes. It changes no decision.",
+            "how often the likeliest action changes. It changes no decision.",
             ANSWERS,
             same=OPENED,
         ),
@@ -305,9 +288,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         str,
         option(
             "What becomes of an answer in json whose only fault is that its numbers do not sum to "
-            "1. "
-            "refuse: it failed. divide: they are divided by their sum, and the summary counts it "
-            "as divided.",
+            "1. refuse: it failed. divide: they are divided by their sum, and the summary counts "
+            "it as divided.",
             ANSWERS,
             same=OPENED,
         ),
@@ -324,9 +306,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     server: Annotated[
         tuple[str, ...],
         option(
-            "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the card's. "
-            "Repeat it "
-            "to spread the requests over several servers.",
+            "Base URL of a server of the model, such as http://gpu-1:8000/v1; replaces the "
+            "card's. Repeat it to spread the requests over several servers.",
             ENGINE,
             same=NOTHING,
         ),
@@ -335,8 +316,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Where the model runs: cpu, cuda or cuda:N; with llama-cpp cpu or gpu. Default: a GPU "
-            "if there "
-            "is one.",
+            "if there is one.",
             ENGINE,
             same=NOTHING,
         ),
@@ -357,10 +337,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Inference time of one answer: paper (145 ms), card (what the card states), measured "
-            "(batch 1 on "
-            "this machine, which must be idle), or seconds: ego=0.2,helper=0.1,fusion=0.3. "
-            "Default: card, or "
-            "paper if the card states none.",
+            "(batch 1 on this machine, which must be idle), or seconds: "
+            "ego=0.2,helper=0.1,fusion=0.3. Default: card, or paper if the card states none.",
             LATENCY,
         ),
     ] = None
@@ -368,8 +346,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Computer in every vehicle, such as agx-orin (`harness model device list`). It times "
-            "each answer "
-            "by its tokens; use it instead of --latency.",
+            "each answer by its tokens; use it instead of --latency.",
             LATENCY,
             same=OPENED,
             compared=False,
@@ -378,9 +355,8 @@ class Settings(Struct, frozen=True, kw_only=True):
     device_model: Annotated[
         str | None,
         option(
-            "With --device-profile: model whose row of the profile times all answers. Default: the "
-            "model "
-            "that gave the answer.",
+            "With --device-profile: model whose row of the profile times all answers. Default: "
+            "the model that gave the answer.",
             LATENCY,
             compared=False,
         ),
@@ -388,11 +364,9 @@ class Settings(Struct, frozen=True, kw_only=True):
     ask: Annotated[
         str,
         option(
-            "Which helpers answer. used: those whose answer some condition uses. all: every helper "
-            "in every "
-            "scene, which gives the same decisions and lets other conditions be scored later "
-            "without the "
-            "model.",
+            "Which helpers answer. used: those whose answer some condition uses. all: every "
+            "helper in every scene, which gives the same decisions and lets other conditions be "
+            "scored later without the model.",
             HELPERS,
             compared=False,
         ),
@@ -401,10 +375,8 @@ class Settings(Struct, frozen=True, kw_only=True):
         str | None,
         option(
             "Which of equally likely actions the ego takes. drawn: one by chance, with the same "
-            "draws for "
-            "every condition, prompt and model. first: the most careful. Default: drawn, or as in "
-            "the run "
-            "that is replayed.",
+            "draws for every condition, prompt and model. first: the most careful. Default: "
+            "drawn, or as in the run that is replayed.",
             CONDITIONS,
         ),
     ] = None
@@ -668,8 +640,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     if not file.exists():
         raise UserError(
             f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, "
-            "which runs "
-            "have since 0.3; for another, type the command in its run.json"
+            "which runs have since 0.3; for another, type the command in its run.json"
         )
     tables = _placed(toml(file, where), world, where)
     settings = changed(_as_driven(convert(tables, Settings, where), file.parent), given)
@@ -700,8 +671,7 @@ def _check_extensions(settings: Settings, where: str) -> None:
         if name not in known:
             raise UserError(
                 f"{where}: {printable(name)} is a setting of an extension that is not installed; "
-                "install "
-                "that, or leave the setting out"
+                "install that, or leave the setting out"
             )
         kind = known[name].kind
         if type(value) is not kind and not (kind is float and type(value) is int):

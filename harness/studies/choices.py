@@ -150,8 +150,7 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
         raise UserError(
             f"--condition {shown}: consensus {consensus} is no function of who is heard now, so "
-            "that "
-            "the oracle would be none; give linear, or another without memory"
+            "that the oracle would be none; give linear, or another without memory"
         )
     for setting, honest in (("messages", "own"), ("attack", ""), ("content", INTENT)):
         if point.setting(setting) != honest:
@@ -179,8 +178,7 @@ def choices(
     if len(members) > MOST_SETS:
         raise UserError(
             f"--condition {printable(point.name)}: {len(members)} sets of helpers, {MOST_SETS} at "
-            "most; "
-            "give a smaller max_helpers"
+            "most; give a smaller max_helpers"
         )
     sets = np.array([[h in of for h in range(helpers)] for of in members]).reshape(
         len(members), helpers

@@ -60,32 +60,22 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
         [text for result in results for text in headline(result)],
         [
             f"{'; '.join(map(_counted, results))}; channel seeds {', '.join(map(str, seeds))}. "
-            "Stored "
-            f"answers are coordinated again with the same random draws at {len(results[0].points)} "
-            "points "
-            "with every content, so differences are paired by episode. 95 % intervals are over "
-            "episodes; a "
-            "mean gives each family the same weight and is about these families alone. Clear: p at "
-            "most "
-            f"{LEVEL:g} by Holm's method for all comparisons of a model with intents.",
+            "Stored answers are coordinated again with the same random draws at "
+            f"{len(results[0].points)} points with every content, so differences are paired by "
+            "episode. 95 % intervals are over episodes; a mean gives each family the same weight "
+            f"and is about these families alone. Clear: p at most {LEVEL:g} by Holm's method for "
+            "all comparisons of a model with intents.",
             "Bits are of all requests and replies; they add no load to a radio. All that the ego "
-            "knows was "
-            "seen at the decision's start, so its age when the ego acts is the decision's latency. "
-            "Frozen "
-            f"scenes let each action begin {' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after "
-            "its "
-            "decision, whatever it took. Off lag are decisions that would begin in another frame: "
-            "where a "
-            "content has more of them, its success is of an ego that is faster than this one; "
-            "harness drive "
+            "knows was seen at the decision's start, so its age when the ego acts is the "
+            "decision's latency. Frozen scenes let each action begin "
+            f"{' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after its decision, whatever it "
+            "took. Off lag are decisions that would begin in another frame: where a content has "
+            "more of them, its success is of an ego that is faster than this one; harness drive "
             "counts that time.",
-            "No message can tell what nobody sees: the last table of each model has success by how "
-            "many "
-            "helpers have the danger in sight at the first decision. Where costs are drawn, a line "
-            "joins the "
-            "points of a content that no cheaper one beats. Crosses are the paper's values, of "
-            "intents and "
-            "plain success.",
+            "No message can tell what nobody sees: the last table of each model has success by "
+            "how many helpers have the danger in sight at the first decision. Where costs are "
+            "drawn, a line joins the points of a content that no cheaper one beats. Crosses are "
+            "the paper's values, of intents and plain success.",
         ],
         [table for result in results for table in _tables(result, by_group)],
         {"points": points, "groups": by_group},
@@ -125,8 +115,7 @@ def headline(result: Result) -> list[str]:
         f"clearly better than intents: {_clear(result, True)}; clearly worse: "
         f"{_clear(result, False)}.",
         f"{name}, {result.words}, bits of an episode, and time until the ego acts: "
-        f"{', '.join(costs)}; "
-        f"n = {_episodes(result.model)} episodes.",
+        f"{', '.join(costs)}; n = {_episodes(result.model)} episodes.",
     ]
 
 
@@ -231,8 +220,7 @@ def _at_base(result: Result) -> Table:
         ),
         rows,
         "Over intents: in points, bold where it is clear. kbit: of all requests and replies of an "
-        "episode. "
-        "Age: of what the ego knows when it acts. Late: decisions longer than the window.",
+        "episode. Age: of what the ego knows when it acts. Late: decisions longer than the window.",
         terminal=(0, 1, 2, 4, 5, 6),
     )
 
@@ -264,8 +252,8 @@ def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> T
         ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"),
         rows,
         f"Of the settings of {' and '.join(SPENDING)} that cost no more than intents with the "
-        "condition as "
-        "it is, the best of each content; chosen on these episodes, which flatters it.",
+        "condition as it is, the best of each content; chosen on these episodes, which flatters "
+        "it.",
     )
 
 
@@ -308,8 +296,7 @@ def _along(result: Result, panel: Panel) -> Table:
     )
     note = (
         "Differences are in points, bold where they are clear. The paper's value is of intents and "
-        "of plain "
-        "success, in scenes of its own."
+        "of plain success, in scenes of its own."
     )
     return Table(
         f"{result.model.name}, {panel.name}: {result.words}", heads, rows, note, folded=True

@@ -126,8 +126,7 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     if not figures:
         raise UserError(
             f"{printable(run.path)} has no answer that was asked alone and timed; run it with "
-            "--batch-size 1 "
-            "--no-cache"
+            "--batch-size 1 --no-cache"
         )
     return figures
 

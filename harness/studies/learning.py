@@ -48,8 +48,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
     if purposes(first, count) != [wanted]:
         raise UserError(
             f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} "
-            "layouts, which "
-            "`harness dataset build --seed` makes"
+            "layouts, which `harness dataset build --seed` makes"
         )
     rebuilt.refuse(stored.dataset, [run.dataset for run in reported])
     return (

@@ -300,12 +300,10 @@ def repeats_study(repeats: Repeats) -> Study:
         [
             f"{k} repeats × {amount(len(first.seeds), 'channel seed')} of "
             f"{amount(len(repeats.runs[0].grid.episodes), 'episode')} at temperature "
-            f"{first.settings.temperature:g}. Each repeat is a whole run with its own "
-            "sampling seed, and with the same episodes and channel seeds, so they differ only in "
-            "the "
+            f"{first.settings.temperature:g}. Each repeat is a whole run with its own sampling "
+            "seed, and with the same episodes and channel seeds, so they differ only in the "
             "random draws of the model's answers. 95 % intervals are over episodes. All figures "
-            "are in "
-            "repeats.csv."
+            "are in repeats.csv."
         ],
         list(_tables(repeats)),
         {"repeats": pd.DataFrame(rows)},
@@ -369,16 +367,12 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
             for c in repeats.conditions
         ],
         "A decision flips if two repeats that both reached a decision point chose different "
-        "actions "
-        "there. The first column is the share of such pairs; the second is the share of the n "
-        "decision "
-        "points at which all repeats that reached them chose the same action. Points that only one "
-        "repeat "
-        "reached count in neither. Variance between episodes is the intraclass correlation of "
-        "success, "
-        "ICC(1): 100 % if repeats change nothing, about 0 if knowing the episode does not help to "
-        "predict "
-        f"its repeats, a dash if all outcomes are the same; n is {episodes} episodes.",
+        "actions there. The first column is the share of such pairs; the second is the share of "
+        "the n decision points at which all repeats that reached them chose the same action. "
+        "Points that only one repeat reached count in neither. Variance between episodes is the "
+        "intraclass correlation of success, ICC(1): 100 % if repeats change nothing, about 0 if "
+        "knowing the episode does not help to predict its repeats, a dash if all outcomes are "
+        f"the same; n is {episodes} episodes.",
         terminal=range(5),
     )
     passes, anys = ([f"{name}{j}" for j in range(2, k + 1)] for name in ("pass^", "any@"))
@@ -387,10 +381,8 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
         "Episodes",
         heads,
         [(c, *cells(c, SUCCESS, *passes, *anys)) for c in repeats.conditions],
-        f"Of j repeats drawn from the {k} without replacement, pass^j: all succeed, and any@j: one "
-        "or more "
-        "succeeds; in "
-        f"percent of n = {episodes} episodes.",
+        f"Of j repeats drawn from the {k} without replacement, pass^j: all succeed, and any@j: "
+        f"one or more succeeds; in percent of n = {episodes} episodes.",
         terminal=(0, 1, k, len(heads) - 1),
     )
     yield Table(
@@ -401,12 +393,10 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
             for name in (STATED, SAMPLED, DOUBT)
             if (e := repeats.estimate(ALL, name))
         ],
-        "Stated: the mean entropy of the distributions in the answers. Sampled: the entropy, over "
-        f"repeats, of the most probable action, with the correction of Miller and Madow. From {k} "
-        "repeats "
-        "it is a rough estimate, and too small on average. Points with fewer than two answers that "
-        "could "
-        "be read are left out.",
+        "Stated: the mean entropy of the distributions in the answers. Sampled: the entropy, "
+        "over repeats, of the most probable action, with the correction of Miller and Madow. "
+        f"From {k} repeats it is a rough estimate, and too small on average. Points with fewer "
+        "than two answers that could be read are left out.",
     )
     if points := repeats.wavering(MOST_POINTS):
         yield Table(
@@ -422,8 +412,7 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
                 for point in points
             ],
             f"Over all repeats and channel seeds. harness report {repeats.runs[0].path.name}, "
-            "typed in this "
-            "folder, shows the prompts and answers.",
+            "typed in this folder, shows the prompts and answers.",
         )
 
 
@@ -447,8 +436,7 @@ def _flip_sentence(repeats: Repeats) -> str:
     everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
         f"Asked again at temperature {m.settings.temperature:g}, {m.variant} decides differently "
-        "in "
-        f"{shown(flips)} % of decisions under {c} (n = {flips.n} decision points). "
+        f"in {shown(flips)} % of decisions under {c} (n = {flips.n} decision points). "
         f"{shown(once)} % of its episodes succeed, {shown(everywhere)} % in all {k} repeats and "
         f"{shown(anywhere)} % in at least one (n = {once.n} episodes)."
     )
@@ -479,6 +467,6 @@ def _entropy_sentence(repeats: Repeats) -> Iterator[str]:
         verdict = "less than its repeats show"
     yield (
         f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: over repeats, the "
-        "most probable "
-        f"action has {nats(sampled)} nats (difference {nats(more)}; n = {more.n} decision points)."
+        f"most probable action has {nats(sampled)} nats (difference {nats(more)}; n = {more.n} "
+        "decision points)."
     )

@@ -260,8 +260,7 @@ class ReplayedRun:
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
             f"{name}: left out episodes that reach one of {n} decision points without a stored "
-            "answer; "
-            "without --no-model the model is asked there"
+            "answer; without --no-model the model is asked there"
         )
         return tuple(filter(None, (lost, left_out if n else "")))
 
@@ -330,8 +329,7 @@ class ReplayedRun:
         if not self._asks:
             raise UserError(
                 f"--no-model: {printable(self.run.path)} may lack answers to other sets of "
-                "messages, which "
-                "a fusion call needs; leave it out"
+                "messages, which a fusion call needs; leave it out"
             )
         with self._writing():
             return self._asker.fusion_call(scenes, codes, rewrites)

@@ -477,14 +477,12 @@ def schedule_study(
         [sentence for run in compared for sentence in headline(run)],
         [
             "Decisions are made again from stored answers with the same random draws, channel "
-            "seeds "
-            f"{', '.join(map(str, seeds))}; n is {first.regret.n} episodes, differences are paired "
-            "by "
-            "episode, and 95 % intervals are over episodes; those of shares and areas come from a "
-            "bootstrap. The oracle knows how every course ends: it is a bound and no schedule.",
+            f"seeds {', '.join(map(str, seeds))}; n is {first.regret.n} episodes, differences are "
+            "paired by episode, and 95 % intervals are over episodes; those of shares and areas "
+            "come from a bootstrap. The oracle knows how every course ends: it is a bound and no "
+            "schedule.",
             "After a schedule's name stand the most helpers that it asks, and the threshold above "
-            "which "
-            "it asks. "
+            "which it asks. "
             + chosen
             + f" A line of the figure shows, of the settings within a budget, the one {best}.",
         ],
@@ -520,10 +518,8 @@ def headline(compared: Compared) -> list[str]:
     )
     sentences = [
         f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points "
-        "above that "
-        f"of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), with "
-        f"{bound:.1f} "
-        f"instead of {compared.paper.means['messages']:.1f} messages per episode."
+        f"above that of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), "
+        f"with {bound:.1f} instead of {compared.paper.means['messages']:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
@@ -537,8 +533,7 @@ def headline(compared: Compared) -> list[str]:
         )
         sentences.append(
             f"{within_budget}no schedule clearly has the most {words}: it is {shown(best.success)} "
-            "%, and "
-            f"these cannot be told apart there: {some_of([first, *close])}."
+            f"%, and these cannot be told apart there: {some_of([first, *close])}."
             if close
             else f"{within_budget}{first} has the most {words}, {shown(best.success)} %, a "
             "difference of "
@@ -616,15 +611,12 @@ def _table(run: Compared) -> Table:
         heads,
         rows,
         "Messages, milliseconds on air and joules are per episode, latency is per decision. Over "
-        "paper's: "
-        f"{words} less that of the paper's schedule, in points; over random: less that of the "
-        "schedule "
-        "random with as many messages. Gap: from the paper's schedule to the oracle. Area: "
-        f"{words} averaged over budgets from no message to always asking all; over joules, from "
-        "the joules "
-        "of asking nobody. p comes from the interval and is corrected by Holm's method for all "
-        "schedules of "
-        "the table; bold: 0.05 or less. All settings are in settings.csv.",
+        f"paper's: {words} less that of the paper's schedule, in points; over random: less that "
+        "of the schedule random with as many messages. Gap: from the paper's schedule to the "
+        f"oracle. Area: {words} averaged over budgets from no message to always asking all; over "
+        "joules, from the joules of asking nobody. p comes from the interval and is corrected by "
+        "Holm's method for all schedules of the table; bold: 0.05 or less. All settings are in "
+        "settings.csv.",
         terminal=[n for n, head in enumerate(heads[: heads.index("p")]) if head != plain],
     )
 

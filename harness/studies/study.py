@@ -172,8 +172,7 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     ]:
         raise UserError(
             f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another "
-            "folder with "
-            "--out, or delete it"
+            "folder with --out, or delete it"
         )
 
 

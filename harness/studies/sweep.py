@@ -41,10 +41,8 @@ HEADS = {
 }  # fmt: skip
 PAIRED = (
     "Stored answers, scored again at other operating points. All points share their random draws, "
-    "so a "
-    "difference shows the setting and not the draws. 95 % intervals are over episodes, those of "
-    "the "
-    "calibrated proxy over seeds; conditions.csv has all figures with their n."
+    "so a difference shows the setting and not the draws. 95 % intervals are over episodes, those "
+    "of the calibrated proxy over seeds; conditions.csv has all figures with their n."
 )
 
 
@@ -72,8 +70,7 @@ def settings(
             if axis.worded and some in ((), (NONE,)):
                 raise UserError(
                     f"--over {axis.name}: {printable(condition)} allows none of its usual values; "
-                    "give "
-                    "others with --grid, or another --condition"
+                    "give others with --grid, or another --condition"
                 )
             if axis.field is None and (most := max(map(float, some))) > vehicles:
                 raise UserError(
@@ -159,8 +156,7 @@ def panels_over(
     if len(grids) > len(axes):
         raise UserError(
             f"--grid: {len(grids)} given for {len(axes)} of --over; give one for each --over, in "
-            "the same "
-            "order"
+            "the same order"
         )
     values = [None if text is None else grid(axis, text) for axis, text in zip_longest(axes, grids)]
     parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]

@@ -293,9 +293,8 @@ def run_bench(
         asked_again = f"{condition}{',' if ':' in condition else ':'}consensus={EGO_PROMPT}"
         raise UserError(
             "harness study trust: give a condition without attack, and rules that are arithmetic; "
-            "a fusion "
-            f"call is attacked by `harness eval --condition {printable(asked_again)} --attack "
-            "injection`"
+            f"a fusion call is attacked by `harness eval --condition {printable(asked_again)} "
+            "--attack injection`"
         )
     attacks = attacks or [str(name) for name in usual_at(AXES["attack"], point) if name != NONE]
     if not attacks:
@@ -402,13 +401,11 @@ def trust_study(bench: Bench) -> Study:
         f"Consensus rules under attack: {bench.name} on {bench.source}",
         headline(bench),
         [
-            f"n = {crossed(n, len(bench.seeds))} under {bench.condition}. All cells have "
-            "the same episodes, channel draws and attackers, so differences are paired by episode; "
-            "95 % "
+            f"n = {crossed(n, len(bench.seeds))} under {bench.condition}. All cells have the same "
+            "episodes, channel draws and attackers, so differences are paired by episode; 95 % "
             "intervals are over episodes. Price in peace: the difference in "
             f"{bench.counting.words} from linear while nobody attacks, in points. All figures are "
-            "in "
-            "figures.csv."
+            "in figures.csv."
         ],
         [table for share in bench.shares for table in _tables(bench, share)]
         + [*_detections(bench)],
@@ -465,17 +462,14 @@ def headline(bench: Bench) -> list[str]:
     if bench.unfused:
         return [
             f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego "
-            "that never "
-            "asks.",
-            f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: "
-            f"{words} is {shown(bench.success(BASE, worst, share))} %. No rule fuses anything, "
-            "since "
+            "that never asks.",
+            f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: {words} is "
+            f"{shown(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
     sentences = [
         f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and "
-        f"{shown(alone)} % with "
-        "an ego that never asks.",
+        f"{shown(alone)} % with an ego that never asks.",
         f"If {100 * share:.0f} % of the helpers attack, {_worst(bench, share)}",
         f"On average over all {len(bench.attacks)} attacks, {_best(bench, share)}",
     ]
@@ -488,8 +482,7 @@ def headline(bench: Bench) -> list[str]:
         ]
         sentences.append(
             f"Rules that lose {LOSES:g} points or less to a liar at a spoofed place, and cost "
-            f"{COSTS:g} "
-            f"point or less in peace: {', '.join(robust) or 'none'}."
+            f"{COSTS:g} point or less in peace: {', '.join(robust) or 'none'}."
         )
     return sentences
 
@@ -503,8 +496,7 @@ def _worst(bench: Bench, share: float) -> str:
         return f"{worst} harms the linear pool most: {left}."
     return (
         f"no attack clearly harms the linear pool most: {left} at the least, and these attacks "
-        "cannot be "
-        f"told apart there: {some_of([worst, *close])}."
+        f"cannot be told apart there: {some_of([worst, *close])}."
     )
 
 
@@ -522,8 +514,7 @@ def _best(bench: Bench, share: float) -> str:
         )
     return (
         f"no rule clearly has the most: it is {most} % (linear: {linear}), and these rules cannot "
-        "be told "
-        f"apart there: {some_of([best, *close])}."
+        f"be told apart there: {some_of([best, *close])}."
     )
 
 
@@ -564,10 +555,9 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
         ("attack", *bench.rules),
         rows,
         "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 "
-        "after Holm's "
-        "correction over the grid. For comparison, a linear pool that knows the attackers and does "
-        "not hear "
-        f"them succeeds in {shown(bench.success(BASE, EXCLUDED, share))} %.",
+        "after Holm's correction over the grid. For comparison, a linear pool that knows the "
+        "attackers and does not hear them succeeds in "
+        f"{shown(bench.success(BASE, EXCLUDED, share))} %.",
     )
 
 
@@ -600,8 +590,7 @@ def _detections(bench: Bench) -> Iterator[Table]:
                 ),
                 rows,
                 "Counted over messages that were heard. An attack that leaves a message unchanged "
-                "cannot be "
-                "found in it. The rule's parameters were chosen on tune layouts.",
+                "cannot be found in it. The rule's parameters were chosen on tune layouts.",
             )
 
 

@@ -32,8 +32,7 @@ def refuse_agents(scenario: Scenario, what: str) -> None:
     if share := agent_share(scenario):
         raise UserError(
             f"{printable(scenario.name)}: agent_share is {share:g}, and {what} has one ego that "
-            "decides; "
-            "leave it out, or use `harness drive`"
+            "decides; leave it out, or use `harness drive`"
         )
 
 

@@ -191,8 +191,7 @@ def test_what_a_rules_page_leaves_out_is_said_in_one_line(opened, report, index)
     page = opened(report.parent / ONE / "report.html", f"#scene={index['scenes'][1][0]}")
     assert page.get_by_text("Not in this page").inner_text() == (
         "Not in this page: the camera pictures; the prompts, which the model does not read. "
-        "harness view "
-        "shows them; harness report RUN --full writes a page that has them."
+        "harness view shows them; harness report RUN --full writes a page that has them."
     )
     assert page.locator(".cameras, .answer details").count() == 0
     assert page.get_by_text("its text is not available").count() == 0

@@ -193,9 +193,8 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
         assert "128 tokens with agrees, as its processor says\n" in harness(*args, "agrees")[1]
         assert harness(*args, "differs") == (
             1, 
-                "model 'differs': its processor makes 128 tokens of 448 x 224 pixels, and its card "
-                "says 98; "
-            "fix [vision]\n", "",
+                "model 'differs': its processor makes 128 tokens of 448 x 224 pixels, and its "
+                "card says 98; fix [vision]\n", "",
         )  # fmt: skip
 
 
@@ -207,9 +206,8 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
     ("args", "said"),
     [
         (("show", "v7", "--scene", "00001-0", "--model", "qwen3-4b"), 
-            "--model qwen3-4b: "
-            "prompt v7 shows a "
-         "picture, and this model reads texts alone (its card has no [vision]); give another"),
+            "--model qwen3-4b: prompt v7 shows a picture, and this model reads texts alone (its "
+            "card has no [vision]); give another"),
         (("check", "v8", "--model", "proxy"), "--model proxy: prompt v8 shows a picture"),
         (("check", "v2", "--model", "proxy"), 
             "--model proxy: it reads no "

@@ -122,9 +122,7 @@ def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[.
     ("typed", "meant"),
     [
         ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", 
-            "`harness "
-            "study "
-            "sweep`"),
+            "`harness study sweep`"),
         ("study swep", "`harness study sweep`"), ("models", "`harness model`"),
         ("chanel", "`harness radio`"),
     ],

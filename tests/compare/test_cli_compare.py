@@ -184,9 +184,7 @@ def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harne
     n = len(scenes)
     for part in (
         "B: ", "proxy · prompt v2 · constrained", 
-            "4 episodes × 2 "
-            "channel seeds of "
-            "small", "differ in answer",
+            "4 episodes × 2 channel seeds of small", "differ in answer",
         "answer: json → constrained", "success_rate % 100.0 75.0 -25.0 [-100.0, +59.9] 1.000",
         "success: 0 gained, 2 lost of 8 episodes × seeds",
         "lost: 1 late", f"answers: ego strict → failed: {n} of {n}",

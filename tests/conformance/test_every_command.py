@@ -227,13 +227,12 @@ PLAIN: dict[str, str] = {
     "prompt compare a": "v2", "prompt compare b": "v4", "init folder": "new",
     "dataset build name": "occluded-intersection",
     "dataset scenario show name": "do-not-pass", "dataset scenario drive name": "do-not-pass",
-    "dataset "
-    "scenario audit "
+    "dataset scenario audit "
     "name": "do-not-pass", "radio show name": "6g", "radio check name": "mode4",
     "edition": "small", "commit": "0" * 40, "benchmark seeds names": "narrow-passage",
     "model check name": "proxy", "model pull name": "proxy", "model device show name": "laptop-cpu",
-    "model device "
-    "check name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
+    "model device check "
+    "name": "laptop-cpu", "model parity model": "models/evil-weights", "port": "0",
     "serve "
     "model": "mine", "budget": "1", "limit": "1", "episodes": "1", "seeds": "0:1", "workers": "1",
     "layouts": "20",
@@ -245,16 +244,11 @@ PLAIN: dict[str, str] = {
     "run video out": "written/video.gif", "dataset show out": "written/scene.svg",
     "prompt show out": "written.png",
     "eval workers": "", 
-        "dataset scenario "
-        "audit layouts": "2", "prompt check dataset": "base/dataset",
+        "dataset scenario audit layouts": "2", "prompt check dataset": "base/dataset",
     "study grid model": "proxy,mine", "study trust run": "reports/served", 
-        "study "
-        "paper "
-        "episodes": "10",
+        "study paper episodes": "10",
     "sweep_episodes": "10", 
-        "study "
-        "schedule "
-        "learn out": "written.toml", "run export out": "written/file",
+        "study schedule learn out": "written.toml", "run export out": "written/file",
     "report out": "written/page.html",
 }  # fmt: skip
 # whatever they are given

@@ -157,10 +157,8 @@ def test_a_chunk_that_kills_its_worker_is_named_and_the_same_command_goes_on(
     assert (code, out) == (2, "")
     assert said == (
         "harness: episodes 2 to 3: the worker was killed 3 times, perhaps because memory ran out; "
-        "try "
-        "fewer --workers; the other 2 are done; run keeps what is done; type the same command to "
-        "continue: "
-        f"harness {' '.join(line)}\n"
+        "try fewer --workers; the other 2 are done; run keeps what is done; type the same command "
+        f"to continue: harness {' '.join(line)}\n"
     )
     kept = {part.name for part in (tmp_path / "run/.work").glob("episodes-*")}
     assert kept == {"episodes-000000-000001", "episodes-000004-000004"}

@@ -451,14 +451,12 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
 ) -> None:
     """Runs have it, whether it did something or not."""
     code = (
-        "from harness.coordination.operating_point import OperatingPoint, named_point\n"
-        "from harness.core.errors import UserError\n"
-        "print(OperatingPoint.from_dict({'name': '6g', 'profile': '6g', 'calibration': "
-        "''}).record() == "
-        "OperatingPoint.from_dict({'name': '6g', 'profile': '6g'}).record())\n"
-        "for ask in (lambda: OperatingPoint.from_dict({'name': '6g', 'calibration': 'l1'}), "
-        "lambda: named_point('6g:calibration=l1')):\n"
-        "    try:\n        ask()\n    except UserError as error:\n        print(error)\n"
+        "from harness.coordination.operating_point import OperatingPoint, named_point\nfrom "
+        "harness.core.errors import UserError\nprint(OperatingPoint.from_dict({'name': '6g', "
+        "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
+        "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
+        "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1')):\n    try:\n        "
+        "ask()\n    except UserError as error:\n        print(error)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,

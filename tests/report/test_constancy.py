@@ -38,10 +38,8 @@ def test_a_model_that_always_answers_the_same_drives_as_a_driver(
     n = sum(answer.role == "ego" for answer in folder.read(tmp_path / "run").answers)
     assert sentence == (
         f"The model ignores its input: {action} is the likeliest action in {n} of the ego's {n} "
-        "readable "
-        "answers, and its probability moves by 0.000 (standard deviation) between them. Without "
-        "messages it "
-        f"drives as the driver `{driver}`, which needs no model."
+        "readable answers, and its probability moves by 0.000 (standard deviation) between them. "
+        f"Without messages it drives as the driver `{driver}`, which needs no model."
     )
 
 

@@ -382,8 +382,7 @@ def test_the_headline_is_one_sentence_with_the_best_condition_and_the_one_withou
     )
     assert headline(found) == (
         "Under 6g, rule-of-thumb clears 94.0 % of the episodes; under single-local, 68.0 %: +26.0 "
-        "[+12.5, "
-        "+39.5] points, a clear difference."
+        "[+12.5, +39.5] points, a clear difference."
     )
     told = [(figure["value"], figure["interval"]) for figure in figures(found)]
     assert told == [

@@ -54,8 +54,7 @@ def open(card: Card, **_: Any) -> "Sparrow":
     except Exception as error:  # the file may be anything
         raise UserError(
             f"{card.shown}: {printable(file)} is no model of sparrow-decider ({one_line(error)}); "
-            "give "
-            "another"
+            "give another"
         ) from None
     return Sparrow(model, file)
 

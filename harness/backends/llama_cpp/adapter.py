@@ -61,8 +61,7 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
         except OSError as error:
             raise UserError(
                 f"{card.shown}: its adapter cannot be written: {printable(error)}; "
-                "SWARMDRIVE_CACHE names "
-                "another folder"
+                "SWARMDRIVE_CACHE names another folder"
             ) from None
     return file
 

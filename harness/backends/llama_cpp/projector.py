@@ -103,8 +103,8 @@ class Projector:
         if count != vision.tokens:
             raise UserError(
                 f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, "
-                "and its "
-                f"card's [vision] {vision.tokens}; fix the card, or give the model's own projector"
+                f"and its card's [vision] {vision.tokens}; fix the card, or give the model's own "
+                "projector"
             )
 
     def tokens(self, image: Image) -> list[int]:

@@ -327,15 +327,13 @@ class ServerPool:
         if self._settings.any_may_answer and model.listed is None:
             raise UserError(
                 f"model {self._name!r}: server {url} lists no {weights} at {url}/models, so it may "
-                "have "
-                "another model than others; fix weights in the card, or what is served"
+                "have another model than others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
             first = f"server {printable(self._first.url)} has {_shown(self.model, model)}"
             raise UserError(
                 f"model {self._name!r}: {first}, and server {url} {_shown(model, self.model)}; "
-                "serve "
-                "the same model, by the same version"
+                "serve the same model, by the same version"
             )
 
 

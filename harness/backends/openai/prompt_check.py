@@ -63,10 +63,8 @@ class PromptCheck:
             return None
         return (
             f"counts {few_tokens} tokens in a prompt of {few} characters and {many_tokens} in one "
-            f"of {many}; "
-            "it may cut prompts, or count only what it did not have in its cache: look at its "
-            "context "
-            "length and log"
+            f"of {many}; it may cut prompts, or count only what it did not have in its cache: look "
+            "at its context length and log"
         )
 
     async def _ask(self, base: str, asked: dict[str, Any]) -> None:
@@ -84,9 +82,8 @@ class PromptCheck:
         if lacking is not None:
             way = "" if self._card.system else f'; or give its card system = "{FIRST_USER}"'
             raise UserError(
-                f"{self._card.shown}: the chat template at {printable(base)} leaves out or "
-                f"changes the {printable(lacking['role'])}'s text, so the model would not read "
-                "what it is "
+                f"{self._card.shown}: the chat template at {printable(base)} leaves out or changes "
+                f"the {printable(lacking['role'])}'s text, so the model would not read what it is "
                 f"asked; start the server with the template that the model was trained with{way}"
             )
 

@@ -24,8 +24,7 @@ class Unpacker:
         if self._zlib is None and self._coding not in ("", "identity"):
             raise Packed(
                 f"the answer is compressed (Content-Encoding: {printable(coding, 40)}), though it "
-                "was asked "
-                "for as it is; have the server, or the proxy before it, leave it so"
+                "was asked for as it is; have the server, or the proxy before it, leave it so"
             )
 
     def take(self, data: bytes, most: int) -> bytes:

@@ -99,14 +99,12 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     if len(tokenizer) > rows:
         raise UserError(
             f"{shown}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give "
-            "both from "
-            "one checkpoint"
+            "both from one checkpoint"
         )
     if not tokenizer.chat_template:
         raise UserError(
             f"{shown} has no chat template; use its instruct version, or put a chat_template.jinja "
-            "beside "
-            "its config.json"
+            "beside its config.json"
         )
     return tokenizer, model
 
@@ -140,8 +138,7 @@ def _check_config(card: Card, where: Path) -> None:
                 if is_count and isinstance(stated, int) and stated > MOST_LAYERS:
                     raise UserError(
                         f"{shown}: {printable(key)} in its config.json is {printable(stated)}, and "
-                        "at most "
-                        f"{MOST_LAYERS}; {fetching(card)}"
+                        f"at most {MOST_LAYERS}; {fetching(card)}"
                     )
 
 

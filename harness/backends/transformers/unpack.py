@@ -49,8 +49,7 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
     except OSError as error:
         raise UserError(
             f"{shown}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a "
-            "weight in "
-            f"{printable(to.parent)}; SWARMDRIVE_CACHE names another folder"
+            f"weight in {printable(to.parent)}; SWARMDRIVE_CACHE names another folder"
         ) from None
     return to
 
@@ -88,8 +87,7 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
         absent = sorted(report["missing_keys"])
         raise UserError(
             f"{shown} lacks {len(absent)} of its weights ({printable(absent[0])}); download the "
-            "file again, "
-            "or run it on llama-cpp"
+            "file again, or run it on llama-cpp"
         )
     model.hf_quantizer = None
     if hasattr(model.config, "quantization_config"):

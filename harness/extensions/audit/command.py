@@ -36,8 +36,7 @@ def command(
     if scenario.is_environment:
         raise UserError(
             f"{printable(name)} is an environment without a known danger, so there is nothing to "
-            "audit; "
-            "give a scenario"
+            "audit; give a scenario"
         )
     from harness.extensions.audit.tells import audit
     from harness.world import scenarios

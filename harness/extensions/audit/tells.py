@@ -133,8 +133,7 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
         if count < FOLDS:
             raise UserError(
                 f"{count} of {len(layouts)} layouts of {scenario.name} {what}; an audit needs "
-                f"{FOLDS}, "
-                "give more with --layouts"
+                f"{FOLDS}, give more with --layouts"
             )
     hidden = [0] * scenario.parameters.decisions
     for there, points in layouts:
@@ -151,8 +150,7 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
     if not rows:
         raise UserError(
             f"scenario {scenario.name} hides no danger: most are in sight from the start, so there "
-            "is "
-            "nothing to audit"
+            "is nothing to audit"
         )
     layout, step, danger, values = zip(*rows, strict=True)
     table = np.array([list(row.values()) for row in values], dtype=float)
@@ -287,8 +285,7 @@ class OfDatasets:
         return (
             "Whether there is a hidden danger can be told from what the ego sees with an AUC of "
             f"{auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n(`harness dataset scenario audit`, "
-            "n = "
-            f"{auc.n} layouts; .50 is a guess)."
+            f"n = {auc.n} layouts; .50 is a guess)."
         )
 
 

@@ -140,29 +140,22 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     about = (
         f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
         f"{amount(layouts, 'layout')} × {amount(len(suite.manifest.seeds), 'channel seed')} in "
-        "all, with "
-        f"95 % intervals over layouts. The edition's digest is {edition.digest}."
+        f"all, with 95 % intervals over layouts. The edition's digest is {edition.digest}."
     )
     note = (
         f"Rank: one more than the number of entries that are clearly better under {by}, whose "
-        "difference, "
-        "paired by layout, has a 95 % interval above 0. Entries of one rank are not shown to be "
-        "equal, and "
-        "the intervals are not corrected for the number of pairs. A dash: it sees what no vehicle "
-        "can see, "
-        "and is no contestant. Who made a file is in their own words. Computed again here: whether "
-        "the "
-        "figures that the file states follow from the answers in it; this page has those that do. "
-        "It does "
-        "not show that the model named wrote the answers, nor that it never saw these layouts, "
-        "whose seeds "
-        "are public."
+        "difference, paired by layout, has a 95 % interval above 0. Entries of one rank are not "
+        "shown to be equal, and the intervals are not corrected for the number of pairs. A dash: "
+        "it sees what no vehicle can see, and is no contestant. Who made a file is in their own "
+        "words. Computed again here: whether the figures that the file states follow from the "
+        "answers in it; this page has those that do. It does not show that the model named wrote "
+        "the answers, nor that it never saw these layouts, whose seeds are public."
     )
     if edition.gains == pinned.KIND:
         note += (
             " Gains and ranks are by the intervals that this edition pins, in which each half of "
-            "each family "
-            "has one of its own: those of all layouts together, as in v2v-safety-1.1, are narrower."
+            "each family has one of its own: those of all layouts together, as in v2v-safety-1.1, "
+            "are narrower."
         )
     table = Table(f"Entries by {lead} under {by}", heads, rows, note, left=True)
     caveats = [f"Left out: {visible(reason)}" for reason in left_out]

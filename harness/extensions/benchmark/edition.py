@@ -126,8 +126,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             if wrong := next(mistakes, None):
                 raise UserError(
                     f"{printable(run.path)} is no run of {printable(self.name)}: {wrong}; make one "
-                    "with "
-                    f"`harness benchmark run {printable(self.name)}`"
+                    f"with `harness benchmark run {printable(self.name)}`"
                 )
             by_dataset[str(getattr(run.manifest.world, "name", ""))] = run
         if missing := [name for name in self.datasets if name not in by_dataset]:

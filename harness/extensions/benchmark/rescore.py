@@ -68,8 +68,8 @@ class Here:
         ]:
             raise UserError(
                 f"this installation computes {len(wrong)} figures of {edition.name} otherwise than "
-                "it pins, "
-                f"such as {printable(wrong[0])}; install a release that has that edition as it was"
+                f"it pins, such as {printable(wrong[0])}; install a release that has that edition "
+                "as it was"
             )
         self._checked.add(edition.digest)
 

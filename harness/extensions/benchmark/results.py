@@ -158,8 +158,7 @@ def _archive(file: Path) -> Iterator[ZipFile]:
         reason = getattr(error, "strerror", None) or error
         raise UserError(
             f"{printable(file)} is no file of results ({printable(reason)}); give one that "
-            "`harness "
-            "benchmark run` or `pack` wrote"
+            "`harness benchmark run` or `pack` wrote"
         ) from None
 
 

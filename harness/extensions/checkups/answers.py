@@ -50,8 +50,7 @@ class Looks:
             return None
         return (
             "ignores pictures: the same answers to a frame and to a blank one, and as many prompt "
-            "tokens as "
-            "without any"
+            "tokens as without any"
         )
 
 

@@ -245,9 +245,8 @@ def _show_findings(result: "Findings | None") -> None:
         return
     typer.echo(
         f"letters      {100 * result.letter_share:.0f} % of a read-out follows the letter; the "
-        "likeliest "
-        f"action does in {result.follows_letter} of {result.n} questions; mass on the letters "
-        f"{result.label_mass:.2f}"
+        f"likeliest action does in {result.follows_letter} of {result.n} questions; mass on the "
+        f"letters {result.label_mass:.2f}"
     )
     shown = ", ".join(
         f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in result.pairs

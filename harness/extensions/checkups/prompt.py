@@ -86,14 +86,12 @@ def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
     if not capabilities(card.engine).language_model:
         raise UserError(
             f"--model {printable(card.name)}: it reads no prompt; give a language model (`harness "
-            "model "
-            "list`)"
+            "model list`)"
         )
     if reason := unfit(prompt, questions.scenario()):
         raise UserError(
             f"--model: prompt {prompt.version} {reason}; the fixed questions are of that scenario; "
-            "leave "
-            "--model out"
+            "leave --model out"
         )
     return card
 

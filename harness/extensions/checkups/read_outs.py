@@ -84,17 +84,14 @@ class Findings(Struct, frozen=True):
             found = f"with letters read {self.letters} it does not" if reads else "it does not"
             yield (
                 f"{found} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, "
-                "moved its "
-                f"answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model check, "
-                "answer "
-                f"{self.answer}, prompt {self.prompt})."
+                f"moved its answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model "
+                f"check, answer {self.answer}, prompt {self.prompt})."
             )
         # A model that learnt one order of the letters is read in that order.
         if self.letters == "cyclic" and self.letter_share > MOST_SHARE:
             yield (
                 f"its likeliest action follows the letter in {self.follows_letter} of {self.n} "
-                "questions "
-                "(model check); --letters cyclic averages that out."
+                "questions (model check); --letters cyclic averages that out."
             )
 
 

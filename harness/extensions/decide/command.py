@@ -47,8 +47,7 @@ def command(
     if token is None and not local:
         raise UserError(
             f"--host {printable(host)}: other machines reach it; give a --token, or set {TOKEN}, "
-            "or leave "
-            "--host out"
+            "or leave --host out"
         )
     if token is not None and not (token.isascii() and token.isprintable() and " " not in token):
         raise UserError("--token: it has characters that no key has; give letters and digits")

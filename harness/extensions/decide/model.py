@@ -32,8 +32,7 @@ def served(card: Card, letters: Any = None) -> Agent:
     if not ("decision" in can.answer_modes and can.closed_loop):
         raise UserError(
             f"{card.shown}: its engine {card.engine} reads scenes or recorded answers, and no "
-            "question of "
-            "others, so it cannot be served; give a language model or a decision model"
+            "question of others, so it cannot be served; give a language model or a decision model"
         )
     return Agent(card, versions.load(_PROMPT), "decision", letters=letters)
 

@@ -143,11 +143,9 @@ def headline(ledger: "pd.DataFrame") -> list[str]:
     counts = tally(ledger)
     sentences = [
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss "
-        "it, "
-        f"{counts['unclear']} unclear (the interval reaches the aim); {counts['predicted']} of the "
-        f"{counts['total']} are predictions: no parameter of the proxy was chosen on them, as on "
-        "the "
-        "others (*)."
+        f"it, {counts['unclear']} unclear (the interval reaches the aim); {counts['predicted']} of "
+        f"the {counts['total']} are predictions: no parameter of the proxy was chosen on them, as "
+        "on the others (*)."
     ]
     for verdict, title in (("misses", "Missed"), ("unclear", "Unclear")):
         rows = ledger[ledger.verdict == verdict].to_dict("records")

@@ -77,26 +77,19 @@ def run_paper(
         headline(numbers),
         [
             f"Intents of a calibrated proxy (version {proxy['proxy_model_version']}) go through "
-            "the same "
-            "trigger, channel, consensus and scoring as a language model's. It was "
+            "the same trigger, channel, consensus and scoring as a language model's. It was "
             f"{proxy['calibration_label']}. No condition has a success probability of its own to "
-            "draw "
-            "from, and no parameter depends on a panel or a grid point. So the study shows that "
-            "one "
-            "mechanism explains the numbers. It is no evidence that a language model would give "
-            "them.",
+            "draw from, and no parameter depends on a panel or a grid point. So the study shows "
+            "that one mechanism explains the numbers. It is no evidence that a language model "
+            "would give them.",
             f"95 % intervals are over {len(seeds)} seed means of {episodes[CORE]} episodes each, "
             f"{episodes['size']} at a grid point of figure B, whose points share their random "
-            "draws. Draws "
-            "are stratified, so an interval shows how far other seeds of this proxy would move a "
-            "mean; "
-            "plain draws, like the paper's, scatter more.",
+            "draws. Draws are stratified, so an interval shows how far other seeds of this proxy "
+            "would move a mean; plain draws, like the paper's, scatter more.",
             equation_2(weights),
             "Crosses and bars in the figures are the paper's values and ranges, and shaded is the "
-            "band "
-            "that it calls best. The cloud's latency is the paper's figure: nothing here simulates "
-            "a "
-            "cloud.",
+            "band that it calls best. The cloud's latency is the paper's figure: nothing here "
+            "simulates a cloud.",
         ],
         [
             *tables(numbers),
@@ -143,9 +136,7 @@ def equation_2(weights: "pd.DataFrame") -> str:
     )
     return (
         f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, "
-        "and in "
-        f"{without} % with equal ones. The distances are declared so that the witness decides: "
-        "this is no "
-        f"evidence for the equation. For a run: harness study sweep RUN --over {WEIGHTS} --grid "
-        f"1,{EQUAL_M:g}"
+        f"and in {without} % with equal ones. The distances are declared so that the witness "
+        "decides: this is no evidence for the equation. For a run: harness study sweep RUN --over "
+        f"{WEIGHTS} --grid 1,{EQUAL_M:g}"
     )

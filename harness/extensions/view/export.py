@@ -39,12 +39,10 @@ HEADS = (
 OF_STUDIES = ("study", "kind", "of", "written")
 NOTE = (
     "Success, with its 95 % interval over episodes, is that of the run's best condition that no "
-    "warning of "
-    "its page is about. The gain is paired by episode. Unsafe episodes end in a collision or off "
-    "the road, "
-    "under the same condition. n is the number of episodes. The best of several conditions looks "
-    "better "
-    "than it is, and runs of other episodes are not to be compared by this table."
+    "warning of its page is about. The gain is paired by episode. Unsafe episodes end in a "
+    "collision or off the road, under the same condition. n is the number of episodes. The best of "
+    "several conditions looks better than it is, and runs of other episodes are not to be compared "
+    "by this table."
 )
 
 

@@ -118,10 +118,8 @@ def write(groups: Sequence[Group], out: Path) -> None:
     place, labels = beside(out), dict.fromkeys(entry(group.metric).label for group in groups)
     about = (
         "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or "
-        "answers that a "
-        "value is the mean of. Only runs in one table compare, since they have the same scenes; a "
-        "run with "
-        "fewer episodes has other scenes."
+        "answers that a value is the mean of. Only runs in one table compare, since they have the "
+        "same scenes; a run with fewer episodes has other scenes."
     )
     tables = [_table(group, place) for group in groups]
     title = f"{' or '.join(labels)} over runs"

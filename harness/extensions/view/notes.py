@@ -62,8 +62,7 @@ def write(run: Path, scene: str, text: str, before: str) -> None:
     if note_on(every, scene).date != before:
         raise UserError(
             f"{printable(scene)} has another note than this form began with; go back, copy your "
-            "text, and "
-            "open the notes again"
+            "text, and open the notes again"
         )
     kept = [note for note in every if note.scene != scene]
     text = "\n".join(text.split("\r\n")).strip()

@@ -73,8 +73,7 @@ def gate(
     if not match or not math.isfinite(number):
         raise UserError(
             f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP "
-            "NUMBER "
-            f"with OP one of {' '.join(OPERATORS)}, such as {example!r}"
+            f"NUMBER with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
     names = names or [name for name, m in METRICS.items() if m.compared]
     if match["metric"] not in names:
@@ -112,9 +111,8 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
                 # A gate that passes because nothing is known would guard nothing.
                 raise UserError(
                     f"--fail-if {printable(gate.text)!r}: {printable(condition.condition)} has no "
-                    "such "
-                    "number in these runs; name a condition or a metric that has, or compare more "
-                    "episodes"
+                    "such number in these runs; name a condition or a metric that has, or compare "
+                    "more episodes"
                 )
             # Means over seeds carry rounding errors, which decide no gate.
             if OPERATORS[gate.op](round(value, 9), gate.number):

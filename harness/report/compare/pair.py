@@ -140,8 +140,7 @@ def pair(a: Path, b: Path) -> Pair:
     if first.world != second.world:
         raise UserError(
             f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a "
-            "kind, or "
-            "see `harness study fidelity`"
+            "kind, or see `harness study fidelity`"
         )
     side_a, side_b = _side(first), _side(second)
     if first.manifest.world.pinned != second.manifest.world.pinned:

@@ -247,19 +247,14 @@ def many(comparison: Comparison) -> str:
     p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
     hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
-        "p comes from the interval: it is 1 minus the confidence level at which the interval would "
-        "just "
-        f"touch 0. Holm's method corrects that of the primary metrics, {len(p_values)} "
-        "differences: the "
-        f"chance that one or more of them is at most {LEVEL} without a real difference is "
-        f"{100 * LEVEL:.0f} "
-        f"% at most. {sum(p <= LEVEL for p in p_values)} are at most {LEVEL}: {SIGNS[BETTER]} "
-        "better, "
-        f"{SIGNS[WORSE]} worse. The other {len(tested) - len(p_values)} are exploratory and not "
-        "corrected: "
-        f"{hints} are at most {LEVEL} ({SIGNS[HINT]}), and "
-        f"{LEVEL * (len(tested) - len(p_values)):.0f} would "
-        "be by chance alone. Intervals and gates are not corrected"
+        "p comes from the interval: it is 1 minus the confidence level at which the interval "
+        f"would just touch 0. Holm's method corrects that of the primary metrics, {len(p_values)} "
+        f"differences: the chance that one or more of them is at most {LEVEL} without a real "
+        f"difference is {100 * LEVEL:.0f} % at most. {sum(p <= LEVEL for p in p_values)} are at "
+        f"most {LEVEL}: {SIGNS[BETTER]} better, {SIGNS[WORSE]} worse. The other "
+        f"{len(tested) - len(p_values)} are exploratory and not corrected: {hints} are at most "
+        f"{LEVEL} ({SIGNS[HINT]}), and {LEVEL * (len(tested) - len(p_values)):.0f} would be by "
+        "chance alone. Intervals and gates are not corrected"
     )
 
 
@@ -374,8 +369,7 @@ def answers_held(held: AnswersHeld) -> str:
     if not held.same:
         return (
             f"none can be compared: each of the {held.other} questions that both runs have was "
-            "asked "
-            "otherwise (prompt, messages or picture)"
+            "asked otherwise (prompt, messages or picture)"
         )
     text = f"{len(held.changed)} of {held.same} to the same questions changed"
     if held.changed:

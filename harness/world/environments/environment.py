@@ -90,8 +90,7 @@ def _only_allowed(name: str, env_id: str, changed: Mapping[str, Any]) -> None:
         if not any(f"{module}.".startswith(f"{known}.") for known in (OWN_PACKAGE, *_allowed())):
             raise UserError(
                 f"{shown(name)} would import the module {printable(module, 40)}; if you trust it, "
-                "set "
-                f"{IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
+                f"set {IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
             )
 
 
@@ -187,8 +186,7 @@ def _create(name: str) -> Any:
     if not isinstance(env, AbstractEnv):
         raise UserError(
             f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class "
-            "must be a "
-            "subclass of highway_env's AbstractEnv"
+            "must be a subclass of highway_env's AbstractEnv"
         )
     for key, value in changed.items():
         if key not in env.config:
@@ -274,8 +272,7 @@ def lane_of(v: Any) -> Lane:
         who = v.spawn.id if hasattr(v, "spawn") else "the ego"
         raise UserError(
             f"environment: {who}, a {type(v).__name__} at {x_m:.1f}, {y_m:.1f} m, has no lane; "
-            "make every "
-            "vehicle with the road, and on one of its lanes"
+            "make every vehicle with the road, and on one of its lanes"
         ) from None
     return str(begin), str(end), int(number or 0)
 

@@ -34,8 +34,7 @@ def examine(scenario: Scenario, seed: int) -> None:
         except Exception as error:
             raise UserError(
                 f"{name} cannot be copied: {raised(error)}; keep files, locks and the like out of "
-                "its "
-                "attributes"
+                "its attributes"
             ) from None
         world.take(action)
         world.advance(world.frame + world.period)
@@ -44,8 +43,7 @@ def examine(scenario: Scenario, seed: int) -> None:
         if _places(world.env) != expected:
             raise UserError(
                 f"{name}: frame by frame its traffic is another than by its step(); what its "
-                "step() changes "
-                "must come after super().step()"
+                "step() changes must come after super().step()"
             )
 
 

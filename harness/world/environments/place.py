@@ -132,14 +132,12 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
         ):
             raise UserError(
                 f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a "
-                "number "
-                f"above 0, at most {MOST_HZ}, in its config"
+                f"number above 0, at most {MOST_HZ}, in its config"
             )
     if hz % decisions_hz:
         raise UserError(
             f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of "
-            "policy_frequency "
-            f"{decisions_hz:g}; set one in its config"
+            f"policy_frequency {decisions_hz:g}; set one in its config"
         )
     period_s = 1 / decisions_hz
     # A tree has about a hundred decision points: three actions lead to 2.4 new ones each, five to

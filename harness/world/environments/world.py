@@ -69,8 +69,7 @@ class EnvironmentWorld(World):
         if not set(here.routes.keys(lane_of(ego), ego.route)).intersection(here.road.ways):
             raise UserError(
                 f"{shown(name)}: the ego starts on another road in seed {seed} than in seed 0; fix "
-                "it in its "
-                "config"
+                "it in its config"
             )
         layout = Layout((), _buildings(env, here.road.origin_m), None, None)
         p = cast("Parameters", scenario.parameters)
@@ -197,8 +196,7 @@ class EnvironmentWorld(World):
         if id(self.everybody[0]) not in present:
             raise UserError(
                 f"{shown(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep "
-                "it in "
-                "self.road.vehicles, collidable and solid"
+                "it in self.road.vehicles, collidable and solid"
             )
         self.everybody = [v for v in self.everybody if id(v) in present]
         known = {id(v) for v in self.everybody}

@@ -238,14 +238,10 @@ HOSTILE: dict[str, tuple[Change, str]] = {
         "larger"),
     "nothing but blanks": (
         lambda files: files.update({"small/answers.jsonl": b" " * (16 << 20)}), 
-            "would "
-            "unpack to "
-            "16 MB",
+            "would unpack to 16 MB",
     ),
     "runs of another edition": (with_contents(runs=["small", "theirs"]), 
-        "unknown "
-        "dataset of "
-        "mine-1"),
+        "unknown dataset of mine-1"),
     "no contents": (lambda files: files.update({CONTENTS: b"{"}), "is no file of results"),
     "another format": (with_contents(format="swarmdrive-results/9"), "its format is not"),
     "another edition": (with_contents(edition="theirs-1"), "unknown edition 'theirs-1'"),
@@ -253,9 +249,7 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "no run": (lambda files: files.update({"small/run.json": b"{}"}), "has format"),
     "other seeds": (with_run(seeds=[5, 6]), "its seeds: (5, 6), not (0, 1)"),
     "another prompt": (with_run(prompt={"version": "v9", "sha256": "0" * 64}), 
-        "none of "
-        "its "
-        "prompts"),
+        "none of its prompts"),
     "another latency": (with_run(latency_source="card"), "its latency: card, not paper"),
     "an engine that nobody has": (with_model(engine="evil"), "evil"),
     "answers that are missing": (drop, "holds no answer for"),

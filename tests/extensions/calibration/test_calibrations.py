@@ -200,8 +200,7 @@ def test_report_layouts_and_a_name_that_is_taken_are_refused(
     assert code == 2
     assert error == (
         "harness: held-out: calibration is fitted on tune seeds, and these are layout seeds 200000 "
-        "to 200000 "
-        "(report)\n"
+        "to 200000 (report)\n"
     )
     assert not Path("y.toml").exists()
     taken = harness(

@@ -269,33 +269,21 @@ PNG = (
         ("systemone", {"state": None, "questions": {"a": choice()}}, "at `$.state`"),
         ("systemone", {"state": "s", "questions": {"a": {"type": "box"}}}, "Invalid value 'box'"),
         ("systemone", {"state": "s", "questions": {"a": choice(1)}}, 
-            "'a' has 1 "
-            "options; give 2 "
-            "to 255"),
+            "'a' has 1 options; give 2 to 255"),
         ("systemone", {"state": "s", "questions": {"a": choice(256)}}, 
-            "'a' has 256 "
-            "options; give 2 to "
-            "255"),
+            "'a' has 256 options; give 2 to 255"),
         ("systemone", {"state": "s", "questions": {str(n): choice() for n in range(65)}}, 
-            "length "
-            "<= 64"),
+            "length <= 64"),
         ("systemone", {"state": "s", "questions": {"a": choice()}, "model": "m"}, 
-            "there is "
-            "no model "
-            "'m'"),
+            "there is no model 'm'"),
         ("systemone", {"state": "s", "questions": {"a": choice()}, "images": [PNG]}, 
-            "reads "
-            "texts "
-            "alone"),
+            "reads texts alone"),
         ("systemone", {"state": "s", "questions": {"a": choice()}, "images": ["file:///etc/passwd"]},
          "reads texts alone"),
         ("systemone", {"state": nested(33), "questions": {"a": choice()}}, 
-            "nested more "
-            "than 32 deep"),
+            "nested more than 32 deep"),
         ("systemone", {"state": [" " * 300_000], "questions": {"a": choice()}}, 
-            "give "
-            "262144 at "
-            "most"),
+            "give 262144 at most"),
         ("decisions", {"input": [{"role": "user", "content": [{"type": "input_json", "data": nested(33)}]}],
                        "questions": [{"type": "predicate", "instructions": "i"}]}, "32 deep"),
         ("decisions", {"input": "s", "questions": []}, "length >= 1"),
@@ -716,13 +704,9 @@ def test_a_model_that_sees_is_shown_a_picture() -> None:
             "--host 0.0.0.0: other "
             "machines reach it;"),
         (["--model", "sparrow-robot", "--host", "::"], 
-            "--host ::: other "
-            "machines reach it; give "
-            "a"),
+            "--host ::: other machines reach it; give a"),
         (["--model", "sparrow-robot", "--token", "short"], 
-            "--token: it has 5 "
-            "characters; give 8 or "
-            "more"),
+            "--token: it has 5 characters; give 8 or more"),
         (["--model", "sparrow-robot", "--token", "a b c d e f"], "--token: it has characters that"),
         (["--model", "sparrow-robot", "--batch-size", "0"], "batch size 0; allowed: 1 or more"),
         (["--model", "sparrow-robot", "--letters", "cyclic"], "sparrow-robot reads no letters"),

@@ -169,8 +169,7 @@ def test_cells_that_do_not_differ_have_no_half_that_matters() -> None:
     [said] = headline(made_up(of))
     assert said == (
         "Under 6g, success of the 4 combinations is 66.7 to 66.7 %; 0 of 3 effects are more than "
-        "chance "
-        "explains (n = 3)."
+        "chance explains (n = 3)."
     )
 
 
@@ -262,8 +261,7 @@ def test_letters_are_those_of_the_agents_that_read_out(
     assert code == 2
     assert err == (
         "harness: --letters cyclic: proxy answers in json; leave it out, or give a language model "
-        "and "
-        "--answer readout\n"
+        "and --answer readout\n"
     )
 
 

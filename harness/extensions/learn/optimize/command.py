@@ -204,8 +204,7 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
     if not ego.can.language_model:
         raise UserError(
             f"--model {printable(ego.card.name)}: it reads the scene and no prompt, so that no "
-            "wording "
-            "changes what it does; give a language model (`harness model list`)"
+            "wording changes what it does; give a language model (`harness model list`)"
         )
     for scenario in scenarios:
         if reason := unfit(ego.prompt, scenario):
@@ -243,13 +242,11 @@ def _show_counted(counted: dict[str, Any], engine: str) -> None:
         marks = ", ".join(f"{name} ({n})" for name, n in counted["choices"].items())
         typer.echo(
             f"{marks}: {counted['wordings']} wordings, {counted['wordings_in_a_round']} of them in "
-            "a "
-            "round of the search"
+            "a round of the search"
         )
     typer.echo(
         f"search ({printable(engine)}): at most {counted['budget']} questions; a wording takes up "
-        "to "
-        f"{counted['questions_a_wording']} on the tune layouts"
+        f"to {counted['questions_a_wording']} on the tune layouts"
     )
     typer.echo(
         f"certificate: up to {counted['certificate_questions']} questions on report layouts, both "

@@ -28,9 +28,8 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
     if purposes(first, count) != [wanted]:
         raise UserError(
             f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune "
-            "seeds "
-            f"({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report "
-            f"seeds (from {FIRST['report']})"
+            f"seeds ({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report seeds (from "
+            f"{FIRST['report']})"
         )
 
 
@@ -52,14 +51,12 @@ def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSour
         if source.scenario.name != scenario.name:
             raise UserError(
                 f"--tune {printable(name)}: it is of {source.scenario.name}, and not of "
-                f"{scenario.name} as "
-                "--dataset is; give one of the same scenario"
+                f"{scenario.name} as --dataset is; give one of the same scenario"
             )
         if not set(manifest.trees_sha256).isdisjoint(other.trees_sha256):
             raise UserError(
                 f"--tune {printable(name)}: it has a layout of {printable(other.name)}, where the "
-                "winner is "
-                "certified; build one of other seeds"
+                "winner is certified; build one of other seeds"
             )
         rebuilt.refuse(source.dataset)
     return sources

@@ -115,8 +115,7 @@ def search(
     except Spent:
         raise UserError(
             f"--budget {plan.budget}: the base alone takes more on {len(tuning.layouts)} tune "
-            "layouts; "
-            "give more, or fewer --layouts"
+            "layouts; give more, or fewer --layouts"
         ) from None
     with suppress(Spent):
         engine(tuning)
@@ -226,8 +225,7 @@ def _study(
     if not runs:
         headline = [
             f"None is better than {base.version} for {agent.name} on the tune layouts, so no "
-            "version was "
-            "written and no report layout was read.",
+            "version was written and no report layout was read.",
             f"{searched}.",
         ]
         return Study(
@@ -262,8 +260,7 @@ def _study(
     verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
     headline = [
         f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on "
-        "report "
-        f"layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
+        f"report layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
         f"{', '.join(map(_seeds, report))}, read once, after the search).",
         f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
         f"{100 * _mean(tuning, first):.1f} %. {searched}; the best is: "
@@ -315,11 +312,9 @@ def _study(
 def _about(plan: Search) -> str:
     return (
         f"Engine: {plan.engine}. Condition: {plan.tune[0].points[0].name}. Score on tune layouts: "
-        "success, "
-        "balanced over layouts with and without a danger where there are both, then the worth of "
-        "what is "
-        "stated (the tree's probability of success if later actions are drawn evenly), then the "
-        "shorter text."
+        "success, balanced over layouts with and without a danger where there are both, then the "
+        "worth of what is stated (the tree's probability of success if later actions are drawn "
+        "evenly), then the shorter text."
     )
 
 
@@ -366,11 +361,10 @@ def _tried_table(tried: Sequence[Mapping[str, Any]]) -> Table:
             )
             for row in tried
         ],
-        "Success is balanced where there are layouts with and without a danger. A wording that was "
-        "worse on "
-        "half of the layouts was not played on the rest. These layouts chose, so that the best "
-        "one's figure "
-        "flatters it. Characters are those of the ego's prompt in the first decision point.",
+        "Success is balanced where there are layouts with and without a danger. A wording that "
+        "was worse on half of the layouts was not played on the rest. These layouts chose, so "
+        "that the best one's figure flatters it. Characters are those of the ego's prompt in the "
+        "first decision point.",
         terminal=range(5),
         most=12,
     )

@@ -105,16 +105,14 @@ def distill(
     if purpose(first_seed, layouts) != "train":
         raise UserError(
             f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train "
-            "seeds "
-            f"alone, {FIRST['train']} to {FIRST['report'] - 1}"
+            f"seeds alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
     learnt = {each: tuple(v for v in versions if not prompts.unfit(v, each)) for each in driven}
     for each, some in learnt.items():
         if not some:
             raise UserError(
                 f"--prompt {printable(' '.join(prompt))}: none is for {each.name}; give "
-                f"{each.prompt}, or "
-                "one of your own"
+                f"{each.prompt}, or one of your own"
             )
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each
     # prompt.
@@ -220,8 +218,7 @@ def _counts(text: str, least: int) -> list[int]:
     ):
         raise UserError(
             f"--samples {printable(text)}: give four whole numbers, such as {SAMPLES}, {least} or "
-            "more each, "
-            "or 0 to leave a stage out"
+            "more each, or 0 to leave a stage out"
         )
     return counts
 
@@ -280,6 +277,6 @@ def _published(text: str) -> "Card":
     except UserError:
         raise UserError(
             f"--base {printable(text)}: it runs on {engine} alone and has no weights that can be "
-            "taught; "
-            "give a model that runs on transformers, such as smollm2-135m (`harness model list`)"
+            "taught; give a model that runs on transformers, such as smollm2-135m (`harness model "
+            "list`)"
         ) from None

@@ -173,9 +173,8 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     )
     held_out = "\n".join(
         f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
-        f"{row['questions']} "
-        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
-        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
+        f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
+        f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
         for row in facts["held_out"]
     )
     return f"""# {name}

@@ -36,8 +36,7 @@ class Lessons:
 
     help = (
         "Write chats to fine-tune on as JSON Lines; their answers are those that the decision "
-        "trees show to "
-        "be right."
+        "trees show to be right."
     )
     doing = "writing chats"
     needs = ()

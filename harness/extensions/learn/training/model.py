@@ -34,10 +34,9 @@ TEMPLATE = (
 )
 SEEING_TEMPLATE = TEMPLATE.replace(
     "{{ m.content }}",
-    "{% if m.content is string %}{{ m.content }}{% else %}{% for part in m.content %}"
-    f"{{% if part.type == 'image' %}}{BEGINS}{PICTURE}{ENDS}{{% else %}}{{{{ part.text }}}}{{% "
-    f"endif %}}"
-    "{% endfor %}{% endif %}",
+    f"{{% if m.content is string %}}{{{{ m.content }}}}{{% else %}}{{% for part in m.content "
+    f"%}}{{% if part.type == 'image' %}}{BEGINS}{PICTURE}{ENDS}{{% else %}}{{{{ part.text }}}}{{% "
+    f"endif %}}{{% endfor %}}{{% endif %}}",
 )
 VISION = Vision(512, 256, patch_px=16, merge=2)  # as Qwen3-VL's
 LAYERS, HIDDEN, HEADS, HEAD = 4, 96, 3, 32
@@ -141,8 +140,7 @@ def take_over(model: Any, base: Path) -> None:
     except (OSError, KeyError, ValueError, SafetensorError) as error:
         raise UserError(
             f"--base {printable(base)}: {printable(str(error), 160)}; give the folder of a model "
-            "that "
-            "`harness model distill` made of text prompts"
+            "that `harness model distill` made of text prompts"
         ) from None
 
 

@@ -50,8 +50,7 @@ def write(
     if not isinstance(run.manifest.world, FrozenScenes):
         raise UserError(
             f"{option}: {printable(run.path)} was driven, and only frozen scenes know what each "
-            "action leads "
-            "to; give a run of `harness eval`"
+            "action leads to; give a run of `harness eval`"
         )
     if not report_seeds_too:
         what = f"{option} {printable(path)}: {printable(run.path)}"
@@ -71,10 +70,9 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
     least, most = min(seeds), max(seeds)
     if most >= FIRST["report"]:
         raise UserError(
-            f"{what} has {stated(least, most - least + 1)}, and a model that "
-            "learns from them can no longer be measured on them; make a run on a dataset of train "
-            "seeds, "
-            f"`harness dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
+            f"{what} has {stated(least, most - least + 1)}, and a model that learns from them can "
+            "no longer be measured on them; make a run on a dataset of train seeds, `harness "
+            f"dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
         )
 
 
@@ -136,8 +134,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
         if prompt.image and agent["image"] != "none":
             raise UserError(
                 f"{printable(run.path)} showed pictures by prompt {printable(version)}, and the "
-                "file "
-                "holds texts alone; give a run with --image none, or of another prompt"
+                "file holds texts alone; give a run with --image none, or of another prompt"
             )
         prompts[version] = prompt
     dataset = dataset_of(run, folder)

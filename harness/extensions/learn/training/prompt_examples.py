@@ -42,8 +42,7 @@ def examples(
         if purposes(seed, 1) != ["train"]:
             raise UserError(
                 f"--first-seed {first_seed}: layout seed {seed} is no train seed; give "
-                f"{FIRST['train']} to "
-                f"{FIRST['report'] - 1}"
+                f"{FIRST['train']} to {FIRST['report'] - 1}"
             )
         if points := decision_points(scenario, seed, 0):
             picked = {

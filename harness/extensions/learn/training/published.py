@@ -146,11 +146,9 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     )
     held_out = "\n".join(
         f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
-        f"{row['questions']} "
-        f"| {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} "
-        f"| {row['value']:.3f} | {row['value_of_the_mean']:.3f} | "
-        f"{row['value_of_the_likeliest']:.3f} "
-        f"| {_shares(row['likeliest'])} |"
+        f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
+        f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} | "
+        f"{row['value_of_the_likeliest']:.3f} | {_shares(row['likeliest'])} |"
         for row in facts["held_out"]
     )
     kind = (

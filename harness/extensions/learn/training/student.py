@@ -163,9 +163,8 @@ class Student:
         if not heard:
             raise UserError(
                 f"--samples: {self.plan.samples['messages']} sequences of the stage messages take "
-                "too few "
-                "scenes: no message reaches the ego in them; give more, or a scenario with more "
-                "helpers"
+                "too few scenes: no message reaches the ego in them; give more, or a scenario "
+                "with more helpers"
             )
         return heard
 

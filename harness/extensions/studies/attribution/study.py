@@ -82,8 +82,7 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
         if agent.sees:
             raise UserError(
                 f"{name} was shown pictures by prompt {agent.prompt.version}, and no object can be "
-                "left out "
-                "of one; give a run with --image none, or of another prompt"
+                "left out of one; give a run with --image none, or of another prompt"
             )
     if condition not in stored.points:
         raise unknown("condition", condition, stored.points)
@@ -299,15 +298,13 @@ def headline(table: Sequence[Row]) -> str:
     if close:
         return (
             f"What moves answers most is not clear: {figure(most.shift, SHIFT)} of the probability "
-            "moves to "
-            f"other actions at the most (n = {most.shift.n}), and the intervals of these overlap: "
-            f"{some_of([_what(row) for row in (most, *close)])}."
+            f"moves to other actions at the most (n = {most.shift.n}), and the intervals of these "
+            f"overlap: {some_of([_what(row) for row in (most, *close)])}."
         )
     return (
         f"The {_what(most)} moves answers most: without it, {figure(most.shift, SHIFT)} of the "
         f"probability moves to other actions, and {figure(most.flips)} % of the most probable "
-        "actions "
-        f"change (n = {most.shift.n})."
+        f"actions change (n = {most.shift.n})."
     )
 
 
@@ -342,14 +339,11 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
         [headline(table)],
         [
             f"{result.decision_points} of the {result.of} decision points of {result.condition}, "
-            "drawn with "
-            f"sample seed {result.sample_seed}, each as likely as any other; 95 % intervals are "
-            "over "
-            "episodes. Of: the prompt that it is left out of; fusion: a message that came in time. "
-            "Shift: "
-            "total variation distance of the answers or policies; flips: another action is most "
-            "probable; "
-            "failed: the answer without it could not be read."
+            f"drawn with sample seed {result.sample_seed}, each as likely as any other; 95 % "
+            "intervals are over episodes. Of: the prompt that it is left out of; fusion: a "
+            "message that came in time. Shift: total variation distance of the answers or "
+            "policies; flips: another action is most probable; failed: the answer without it "
+            "could not be read."
         ],
         [
             Table(

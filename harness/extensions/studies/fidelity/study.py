@@ -83,8 +83,7 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
     if both.empty:
         raise UserError(
             "the runs have no episode in common; give runs of the same model, prompt and answer "
-            "mode, with "
-            "the same conditions, seeds and layouts (harness drive --first-seed)"
+            "mode, with the same conditions, seeds and layouts (harness drive --first-seed)"
         )
     rows = pd.DataFrame(_rows(both))
     return Fidelity(rows, both, *_rank(rows))
@@ -160,17 +159,13 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
         headline(result),
         [
             "On frozen scenes, success is looked up: the outcome of each action was found in "
-            "advance, by "
-            "driving on with a planner that sees everything. The same models, under the same "
-            "conditions "
-            "and seeds, also drove the same layouts in closed loop. There an action takes effect "
-            "as late "
-            "as its decision took, and each action changes what comes next.",
+            "advance, by driving on with a planner that sees everything. The same models, under "
+            "the same conditions and seeds, also drove the same layouts in closed loop. There an "
+            "action takes effect as late as its decision took, and each action changes what comes "
+            "next.",
             "Paired by episode, condition and channel seed; n is the number of episodes, each "
-            "averaged "
-            "over its seeds; 95 % intervals are over episodes. A point below the figure's dashed "
-            "line "
-            "succeeds less often in closed loop.",
+            "averaged over its seeds; 95 % intervals are over episodes. A point below the "
+            "figure's dashed line succeeds less often in closed loop.",
         ],
         [
             Table(
@@ -218,8 +213,8 @@ def headline(result: Fidelity) -> list[str]:
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)
     sentences = [
         f"Largest difference, frozen minus closed loop: {points:+z.1f} points [{low:+z.1f}, "
-        f"{high:+z.1f}], "
-        f"{worst['model']} {worst['prompt']} under {worst['condition']}, n = {worst['n']} episodes."
+        f"{high:+z.1f}], {worst['model']} {worst['prompt']} under {worst['condition']}, n = "
+        f"{worst['n']} episodes."
     ]
     if not np.isnan(result.rank):
         models = f"{result.ranked} models and conditions"
@@ -227,8 +222,7 @@ def headline(result: Fidelity) -> list[str]:
     elif result.ranked < LEAST_RANKED:
         sentences.append(
             f"No rank correlation: {result.ranked} different models and conditions are too few; at "
-            "least "
-            f"{LEAST_RANKED} are needed."
+            f"least {LEAST_RANKED} are needed."
         )
     return sentences
 

@@ -318,14 +318,12 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
         [
             f"Varied: {factors}. n = {crossed(len(episodes), len(spec.seeds))} "
             f"({', '.join(map(str, spec.seeds))}), the same for all combinations, so differences "
-            "are "
-            "paired by episode; 95 % intervals are over episodes. All figures are in cells.csv and "
-            "effects.csv; each combination's run is in cells/. The inference time is declared, or "
-            "measured before the run; each run.json says which.",
+            "are paired by episode; 95 % intervals are over episodes. All figures are in "
+            "cells.csv and effects.csv; each combination's run is in cells/. The inference time "
+            "is declared, or measured before the run; each run.json says which.",
             "The figure joins the combinations that no other beats in success without taking "
-            "longer (◆). "
-            "The best of many looks better than it is: choose on one set of seeds, and report on "
-            "another.",
+            "longer (◆). The best of many looks better than it is: choose on one set of seeds, "
+            "and report on another.",
         ],
         [
             *(_cells(grid, c, out, c == last) for c in reversed(grid.conditions)),
@@ -393,10 +391,9 @@ def _range(grid: Grid, condition: str) -> str:
     effects = [effect for effect in grid.effects if effect.condition == condition]
     return (
         f"Under {condition}, {grid.counting.words} of the {len(rates)} combinations is "
-        f"{min(rates):.1f} to "
-        f"{max(rates):.1f} %; {sum(e.clear for e in effects)} of {len(effects)} effects are more "
-        "than chance "
-        f"explains (n = {grid.success(grid.cells[0], condition).n})."
+        f"{min(rates):.1f} to {max(rates):.1f} %; {sum(e.clear for e in effects)} of "
+        f"{len(effects)} effects are more than chance explains (n = "
+        f"{grid.success(grid.cells[0], condition).n})."
     )
 
 
@@ -408,12 +405,9 @@ def _halves(grid: Grid, h: Halves) -> str:
         verdict = "the choice of the helpers matters more"
     return (
         f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains "
-        f"{shown(h.ego)} % of the "
-        f"differences in {grid.counting.words} between the {len(grid.cells)} combinations, the "
-        "choice among "
-        f"{grid.columns} helpers {shown(h.helpers)} %, both together {shown(h.together)} % (n = "
-        f"{h.ego.n} "
-        "episodes)."
+        f"{shown(h.ego)} % of the differences in {grid.counting.words} between the "
+        f"{len(grid.cells)} combinations, the choice among {grid.columns} helpers "
+        f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
     )
 
 
@@ -480,11 +474,9 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
         ("effect", "points, 95 % CI", "p"),
         rows,
         f"An effect is the difference in {grid.counting.words} when one factor changes, averaged "
-        "over all "
-        "other factors. An interaction (×) is half the difference between the effects of one "
-        "factor at two "
-        "levels of the other. p comes from the interval and is corrected by Holm's method for all "
-        f"{len(grid.effects)} effects; bold: 0.05 or less.",
+        "over all other factors. An interaction (×) is half the difference between the effects "
+        "of one factor at two levels of the other. p comes from the interval and is corrected by "
+        f"Holm's method for all {len(grid.effects)} effects; bold: 0.05 or less.",
         terminal=range(3) if terminal else (),
         most=MOST_EFFECTS,
     )

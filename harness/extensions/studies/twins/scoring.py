@@ -105,8 +105,7 @@ def headline(table: Sequence[Row]) -> str:
     names = [f"{row.twin.name}, {row.role}" for row in (least, *close)]
     return (
         f"{text} No pair clearly holds least often: it is {shown}, and the intervals of these "
-        "overlap: "
-        f"{some_of([f'({name})' for name in names])}."
+        f"overlap: {some_of([f'({name})' for name in names])}."
     )
 
 

@@ -60,29 +60,23 @@ def twins_study(
         [headline(rows), *(judged(verdict, "-") for verdict in verdicts)],
         [
             "The model is asked each question twice: as it is, and as its twin, which puts the "
-            "same "
-            "situation otherwise. So what must hold of both answers is known without knowing the "
-            "right "
-            f"one. {questions.count()} decision points of {len(questions.dataset.episodes)} "
-            "episodes; n is "
-            "the number of questions that the twin changes; 95 % intervals are over episodes. If "
-            "either "
-            "answer could not be parsed (failed), nothing holds, and there is no distance."
+            "same situation otherwise. So what must hold of both answers is known without knowing "
+            f"the right one. {questions.count()} decision points of "
+            f"{len(questions.dataset.episodes)} episodes; n is the number of questions that the "
+            "twin changes; 95 % intervals are over episodes. If either answer could not be parsed "
+            "(failed), nothing holds, and there is no distance."
         ],
         [
             Table(
                 "What holds",
                 HEADS,
                 [_cells(questions, row) for row in rows],
-                "A question is one viewer at one decision point. Invariant: the share of questions "
-                "for which "
-                "what must hold does hold. same: both answers have the same most probable action "
-                "(for a "
-                "mirrored twin, after swapping left and right back). TV <= x: the distributions "
-                "are no "
-                "farther apart than x. TV: total variation distance, half the sum of the absolute "
-                "differences, 0 to 1. Constant answer: what an ego "
-                "holds that always gives the same answer, and so reads nothing.",
+                "A question is one viewer at one decision point. Invariant: the share of "
+                "questions for which what must hold does hold. same: both answers have the same "
+                "most probable action (for a mirrored twin, after swapping left and right back). "
+                "TV <= x: the distributions are no farther apart than x. TV: total variation "
+                "distance, half the sum of the absolute differences, 0 to 1. Constant answer: "
+                "what an ego holds that always gives the same answer, and so reads nothing.",
                 terminal=range(7),
             )
         ],
