@@ -12,6 +12,7 @@ from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.vision import Vision
 from harness.coordination.operating_point import named_point
+from harness.coordination.parts import PLAIN, Question
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, Scene, load
@@ -22,6 +23,7 @@ from harness.evaluate.pictures import GREY, another
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.world.perception.camera import frame
+from harness.world.scene_graph import SceneGraph
 
 QWEN3 = Vision(512, 256, patch_px=16, merge=2, least_px=65536, most_px=16777216)
 SEES = replace(cards.load("qwen3-4b"), vision=QWEN3)
@@ -37,8 +39,18 @@ def spec(dataset: Dataset, image: Any = "own", version: str = "v7", vision: Visi
     return replace(spec_of(dataset), ego=Agent(card, prompts.load(version), image=image))
 
 
-def asked(of: Spec, scene: Scene, blind: bool = False) -> dict[str, Request]:
-    return {r.id.partition("/")[2]: r for r in requests(of, [scene], blind)}
+class Unseen(Question):
+    """Asked of who is shown nothing."""
+
+    def shown(self, graph: SceneGraph) -> SceneGraph:
+        return graph.blinded()
+
+
+UNSEEN = Unseen("unseen", pictured=False)
+
+
+def asked(of: Spec, scene: Scene, question: Question = PLAIN) -> dict[str, Request]:
+    return {r.id.partition("/")[2]: r for r in requests(of, [scene], question)}
 
 
 # -- pictures of a question
@@ -63,11 +75,11 @@ def test_a_model_is_shown_pictures_of_its_own_size(crossing: Dataset):
     }
 
 
-def test_a_blank_picture_says_nothing_and_a_blind_helper_gets_one(crossing: Dataset):
+def test_a_blank_picture_says_nothing_and_a_question_without_one_has_it(crossing: Dataset):
     scene = crossing.scenes(crossing.forest.ids[:1])[0]
     blank = [
         *asked(spec(crossing, "blank"), scene).values(),
-        *asked(spec(crossing), scene, True).values(),
+        *asked(spec(crossing), scene, UNSEEN).values(),
     ]
     assert len(blank) == 4 + 3
     for request in blank:

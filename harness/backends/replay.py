@@ -16,7 +16,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
 from harness.runs.folder import Run, read
-from harness.runs.records import BLIND, Answer, FirstTurn, Latency
+from harness.runs.records import ASKED, Answer, FirstTurn, Latency
 from harness.runs.unanswered import why
 
 # An answer has the same fields, but no row knows its server (docs/decisions/0051).
@@ -85,10 +85,11 @@ class Replay:
         manifest, shown = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
-            # A run answers the first step of each of its episodes; only blind answers may be
-            # missing, and those of helpers that no condition asked.
+            # A run answers the first step of each of its episodes; only those to other questions
+            # may be missing, and those of helpers that no condition asked.
             unasked = role == "helper" and manifest.settings.ask == "used"
-            first_step = _step(request.id) == "0" and not unasked and not request.id.endswith(BLIND)
+            plain = ASKED not in request.id.rpartition("/")[2]
+            first_step = _step(request.id) == "0" and plain and not unasked
             # a changed parser may ask for a repair that the run did not
             again = request.id.endswith(AGAIN)
             foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id

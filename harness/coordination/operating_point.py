@@ -12,11 +12,12 @@ from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
 from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
-from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, TRUTH, Content
+from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
     FUSION,
+    PLAIN,
     RELAY,
     Ask,
     Cloud,
@@ -24,6 +25,7 @@ from harness.coordination.parts import (
     Guard,
     Kept,
     Part,
+    Question,
     Radio,
     wrong,
 )
@@ -34,7 +36,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
-from harness.core.extensions import part_of, setting_of_extension
+from harness.core.extensions import OfExtension, part_of, setting_of_extension
 from harness.core.pairs import pairs
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
@@ -93,17 +95,24 @@ def settings_alone() -> Collection[str]:
     return {*core, *chain(*of_extensions)}
 
 
+@cache
+def questions() -> Mapping[str, Question]:
+    """Return what helpers may be asked, by name; the plain question has an empty one."""
+    others = chain(*(kind.questions for kind in more_parts().values()))
+    return {"": PLAIN, **{question.name: question for question in others}}
+
+
 class Rewrites(NamedTuple):
     """How a fusion call shows messages."""
 
-    blind: bool = False  # whether they come from helpers that are shown nothing
+    question: str = ""  # the name of what helpers are asked; empty for the plain question
     # the attack that changes attackers' messages (`attacks.in_question`); empty for none
     attack: str = ""
     defences: tuple[str, ...] = ()  # the defences that change every message
     graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
     # what the prompt shows of messages: all of each, its words alone, or nothing
     shows: Literal["message", "words", ""] = "message"
-    shuffled: bool = False  # whether they come from another layout
+    elsewhere: bool = False  # whether they come from other scenes
 
 
 AS_SENT = Rewrites()
@@ -150,8 +159,6 @@ class OperatingPoint:
             raise wrong("round_trip", self.cloud.round_trip, allowed)
         for part in self.more:
             part.check_with(self)
-        if self.content.graph == TRUTH and self.ask.messages == "shuffled":
-            raise wrong("messages", "shuffled", f"own or blind where {holds}")
         if self.content.asks_again and self.radio.edge == FUSION:
             raise wrong(
                 "edge",
@@ -212,8 +219,6 @@ class OperatingPoint:
             self.cloud.round_trip or self.cloud.round_trip_s is not None
         ):
             raise wrong("rounds", self.fusion.rounds, "1 where the ego's model runs in a cloud")
-        if self.ask.messages != "own":
-            raise wrong("messages", self.ask.messages, f"own where {holds}")
         if self.ask.on_demand:
             raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
         if self.radio.edge == FUSION:
@@ -290,7 +295,7 @@ class OperatingPoint:
         """
         name = settings.pop("name", self.name)
         by_part: dict[str, dict[str, Any]] = {}
-        for key, value in settings.items():
+        for key, value in without_gone(settings).items():
             by_part.setdefault(part_of_settings()[key], {})[key] = value
         try:
             parts = {
@@ -488,10 +493,17 @@ class OperatingPoint:
         by_rule = self.content == CONTENTS[INTENT]
         return f"consensus is {EGO_PROMPT}" if by_rule else f"content is {self.ask.content}"
 
-    @property
-    def blind_helpers(self) -> bool:
-        """Whether the helpers that are asked are shown nothing."""
-        return self.radio.profile is not None and self.ask.messages == "blind"
+    @cached_property
+    def question(self) -> Question:
+        """What helpers are asked."""
+        if self.radio.profile is None:
+            return PLAIN
+        return next((part.question for part in self.more if part.question != PLAIN), PLAIN)
+
+    @cached_property
+    def elsewhere(self) -> Part | None:
+        """The part by which messages come from other scenes; None if they are helpers' own."""
+        return next((part for part in self.more if part.elsewhere), None)
 
     @property
     def rewrites(self) -> "Rewrites":
@@ -501,9 +513,8 @@ class OperatingPoint:
         shows: Literal["message", "words", ""] = "words" if self.content.words else whole
         graph = self.content.graph
         attack = in_question(self.guard.attack, bool(shows), bool(graph))
-        return Rewrites(
-            self.blind_helpers, attack, defences, graph, shows, self.ask.messages == "shuffled"
-        )
+        elsewhere = self.elsewhere is not None
+        return Rewrites(self.question.name, attack, defences, graph, shows, elsewhere)
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))
@@ -542,14 +553,21 @@ def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     kept: dict[str, Any] = {}
     for key, value in settings.items():
-        gone = key not in part_of_settings() and setting_of_extension(key)
+        gone = _gone(key)
         if not gone:
             kept[key] = value
         elif ("" if value is None else str(value)) != gone.idle:
-            raise UserError(
-                f"setting {key}={printable(value)} of a condition is {part_of(gone.extension)}"
-            )
+            raise UserError(_lacks(key, value, gone))
     return kept
+
+
+def _gone(setting: str) -> OfExtension | None:
+    """Return whose a setting is, if it is of an extension that is not installed; else None."""
+    return None if setting in part_of_settings() else setting_of_extension(setting)
+
+
+def _lacks(setting: str, value: object, gone: OfExtension) -> str:
+    return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"
 
 
 def _error_of(name: str, error: ValueError) -> UserError:
@@ -595,12 +613,14 @@ def named_point(text: str) -> OperatingPoint:
         key, _, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
         if field not in typed_settings() and field not in channel_settings:
-            without_gone({field: value})
+            if gone := _gone(field):
+                raise UserError(_lacks(field, value, gone))
             allowed = (*typed_settings(), *SHORT, *channel_settings)
             raise unknown(
                 f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3"
             )
-        if ":" in value and field != "attack":
+        after_colon = value.partition(":")[2].partition("=")[0]
+        if after_colon in SHORT or after_colon in (*typed_settings(), *channel_settings):
             joined = f"{key}={value.replace(':', ',')}"
             raise UserError(
                 f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings "

@@ -6,8 +6,10 @@ Each part checks itself and raises ValueError with the setting, its value and wh
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
+import numpy as np
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.attacks import attacks_of
@@ -24,9 +26,10 @@ from harness.radio.profiles import CHANNELS
 if TYPE_CHECKING:
     from harness.coordination.intents import Intents
     from harness.coordination.operating_point import OperatingPoint
+    from harness.core.arrays import Ints
+    from harness.world.scene_graph import SceneGraph
 
 FALLBACKS = ("uniform", "brake")
-MESSAGES = ("own", "shuffled", "blind")
 DEFENCES = ("quoted", "schema", "majority")
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
@@ -46,6 +49,23 @@ class Kept(NamedTuple):
     file: Any = None  # path of its file, if it has one
 
 
+@dataclass(frozen=True)
+class Question:
+    """What a helper is asked; plainly, what it intends, with what it sees before it."""
+
+    # ends the key of its answers, behind a `~`, and is their role; empty for the plain one
+    name: str = ""
+    words: str = "are asked"  # of helpers that are asked so, behind "that"
+    pictured: bool = True  # whether it shows what a camera sees
+
+    def shown(self, graph: "SceneGraph") -> "SceneGraph":
+        """Return the scene graph that it shows of a helper's own."""
+        return graph
+
+
+PLAIN = Question()
+
+
 class RunFacts(Protocol):
     """What a part is told of the run in which its condition is played."""
 
@@ -61,6 +81,14 @@ class RunFacts(Protocol):
     def ego_alone(self) -> bool:
         """Whether the model answers only for the ego."""
 
+    @property
+    def frozen(self) -> bool:
+        """Whether its scenes are frozen."""
+
+    @property
+    def device_profile(self) -> Any:
+        """The device on which energy is counted; None if it is not."""
+
 
 class Part(Struct, frozen=True, kw_only=True):
     """Settings that are checked as they are made;
@@ -75,6 +103,9 @@ class Part(Struct, frozen=True, kw_only=True):
     # its settings that name something, and what returns the names that there are; empty names
     # nothing
     named: ClassVar[Mapping[str, Callable[[], Collection[str]]]] = {}
+    questions: ClassVar[tuple[Question, ...]] = ()  # what helpers may be asked by it
+    # what the ego hears under a control, by its setting, such as `messages=blind`
+    controls: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -101,6 +132,24 @@ class Part(Struct, frozen=True, kw_only=True):
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
         """Return what a run keeps of what it names, by folder and by name."""
         return {}
+
+    @property
+    def question(self) -> Question:
+        """What helpers are asked."""
+        return PLAIN
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether messages come from other scenes."""
+        return False
+
+    def sources(self, episodes: "Ints", seeds: "Ints") -> "Ints":
+        """Return the decision whose helpers each decision hears, (n,), by these places; its own.
+
+        Asked where messages come from elsewhere. All are of one step, with the number of their
+        episode and the seed of their draws, (n,).
+        """
+        return np.arange(len(episodes))
 
     def before(self, intents: "Intents") -> "Intents":
         """Return what vehicles intend, (n, ...), as it is before anything is made of it;
@@ -138,15 +187,9 @@ class Ask(Part, frozen=True, kw_only=True):
     ] = 400.0
     # whether a helper infers only when it is asked, not in parallel with the ego
     on_demand: Flag = False
-    # What the ego hears: its `own` helpers, or as a control helpers of another layout (`shuffled`)
-    # or helpers that are shown nothing (`blind`). A gain that remains under a control is not from
-    # what helpers see.
-    messages: Text = "own"
     content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
 
     def check(self) -> None:
-        if self.messages not in MESSAGES:
-            raise unknown("messages", self.messages, MESSAGES)
         if self.content not in CONTENTS:
             raise unknown("content", self.content, CONTENTS)
         if self.schedule == ORACLE:

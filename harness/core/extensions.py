@@ -26,6 +26,8 @@ COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdr
 # The same by setting of a condition, with the value that does nothing in brackets; nothing for an
 # empty one.
 SETTINGS = "swarmdrive.settings"
+# And by control, with the setting of a condition that it is in brackets.
+CONTROLS = "swarmdrive.controls"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
@@ -115,6 +117,12 @@ def setting_of_extension(name: str) -> OfExtension | None:
         return None
     package, _, idle = str(entry.value).partition(" ")
     return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
+
+
+def control_settings() -> dict[str, str]:
+    """Return the setting, such as `messages=blind`, of each control by name, by the metadata."""
+    values = {name: str(entry.value).partition(" ")[2] for name, entry in entries(CONTROLS).items()}
+    return {name: setting.strip("[]") for name, setting in values.items()}
 
 
 def part_of(extension: str) -> str:

@@ -18,11 +18,13 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Request, Role, Served, served, window
+from harness.backends.base import Backend, Completion, Request, Served, served, window
+from harness.backends.base import Role as AskedRole
 from harness.backends.card import Card
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
+from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import Unanswered, printable
 from harness.core.files import canonical_bytes, sha256_bytes
@@ -44,9 +46,16 @@ from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
-from harness.runs.records import BLIND, REWRITTEN, Answer, Latency
-from harness.runs.records import Role as RecordedRole
-from harness.runs.unanswered import HELPERS, Tally
+from harness.runs.records import (
+    ASKED,
+    REWRITTEN,
+    Answer,
+    Latency,
+    Role,
+    asked_key,
+    is_helper,
+)
+from harness.runs.unanswered import Tally
 from harness.world.perception.graph import truth_graph
 from harness.world.scene_graph import SceneGraph
 
@@ -62,9 +71,12 @@ Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
 
 
 def requests(
-    spec: Spec, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None
+    spec: Spec,
+    scenes: Sequence[Scene],
+    question: Question = PLAIN,
+    places: Places | None = None,
 ) -> Iterator[Request]:
-    """Yield the requests of scenes, the ego's first; with `blind` only those of blind helpers.
+    """Yield the requests of scenes, the ego's first; only helpers are asked another `question`.
 
     With `places`, only those of the viewers at these places of each scene, the ego at 0.
     """
@@ -79,16 +91,16 @@ def requests(
         words = scenario.prompt_words
         truth = truth_graph(scenario, scene.state) if privileged else None
         for place, viewer in enumerate(spec.viewers(scene)):
-            if (blind and not place) or (asked is not None and place not in asked):
+            of_ego = not place
+            if (of_ego and question != PLAIN) or (asked is not None and place not in asked):
                 continue
-            graph, index = scene.graphs[viewer], spec.agent(scene.place(place))
-            if blind:
-                graph = graph.blinded()
+            graph, index = question.shown(scene.graphs[viewer]), spec.agent(scene.place(place))
             agent = agents[index]
+            image = picture(spec, index, scene, viewer, question.pictured) if sees else None
             yield blank(index, graph.role).alike(
-                id=_id(scene, viewer, blind),
+                id=_id(scene, viewer, question),
                 **agent.chats(graph, actions, words),
-                image=picture(spec, index, scene, viewer, blind) if sees else None,
+                image=image,
                 view=graph,
                 truth=truth if agent.card.privileged else None,
                 scenario=scenario,
@@ -103,11 +115,11 @@ def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Plac
     return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
 
 
-def _id(scene: Scene, viewer: str, blind: bool) -> str:
-    return f"{scene.id}/{viewer}{BLIND}" if blind else f"{scene.id}/{viewer}"
+def _id(scene: Scene, viewer: str, question: Question) -> str:
+    return f"{scene.id}/{asked_key(viewer, question.name)}"
 
 
-def _blank(spec: Spec, index: int, role: Role) -> Request:
+def _blank(spec: Spec, index: int, role: AskedRole) -> Request:
     """Return a request to an agent in a role, without what differs between such requests."""
     agent = spec.agents[index]
     sampled: dict[str, Any] = {}
@@ -164,8 +176,9 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     """Parse a completion into an answer."""
     raw = completion.text
     scene, _, viewers = request.id.partition("/")
-    viewer, *heard = viewers.split("+")
-    role: RecordedRole = "merge" if heard else "blind" if viewer.endswith(BLIND) else request.role
+    key, *heard = viewers.split("+")
+    viewer, _, question = key.partition(ASKED)
+    role: Role = "merge" if heard else question or request.role
     parsed = parse(
         raw,
         **request.shape._asdict(),
@@ -177,7 +190,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     )
     return Answer(
         scene=scene,
-        viewer=viewer.removesuffix(BLIND),
+        viewer=viewer,
         heard=tuple(heard),
         role=role,
         raw=raw,
@@ -293,7 +306,7 @@ class Asker:
             there = (request.id for request in missing if request.id in new_answers)
             self.answers |= {name: new_answers[name] for name in there}
         tally = Tally(new_answers.values())
-        if tally.missing - set(HELPERS):
+        if not all(map(is_helper, tally.missing)):
             raise Unanswered(str(tally))
 
     def settle(self) -> None:
@@ -383,65 +396,75 @@ class Asker:
         self._ask_at(scenes)
         return self.laid_out(scenes)
 
-    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
-        """Return intents where helpers are shown nothing; NaN for those of scenes not in `at`."""
+    def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
+        """Return intents where helpers are asked another question;
+        NaN for those of scenes not in `at`.
+        """
         if self.spec.asks_all:
-            self._ask_at([scenes[n] for n in at.tolist()], blind=True)
-        return self.laid_out(scenes, blind=True)
+            self._ask_at([scenes[n] for n in at.tolist()], question=question)
+        return self.laid_out(scenes, question)
 
-    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+    def helpers(
+        self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
+    ) -> Intents:
         """Ask the helpers wanted, (n, H),
         and return the intents of the scenes where any is wanted.
         """
         scenes, places = wanted_in(scenes, wanted)
-        self._ask_at(scenes, places, blind)
-        return self.laid_out(scenes, blind, 1 + wanted.shape[1])
+        self._ask_at(scenes, places, question)
+        return self.laid_out(scenes, question, 1 + wanted.shape[1])
 
     def lacks(
-        self, scenes: Sequence[Scene], blind: bool = False, places: Places | None = None
+        self,
+        scenes: Sequence[Scene],
+        question: Question = PLAIN,
+        places: Places | None = None,
     ) -> list[bool]:
         """For each scene, whether an answer of these viewers is missing;
-        with `blind`, a blind helper's.
+        to another `question`, a helper's.
         """
-        return list(self._lacking(scenes, self.answers, blind, places))
+        return list(self._lacking(scenes, self.answers, question, places))
 
     def _ask_at(
-        self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False
+        self,
+        scenes: Sequence[Scene],
+        places: Places | None = None,
+        question: Question = PLAIN,
     ) -> None:
         """Ask what is missing of the viewers at these places of each scene;
         None for all of them.
         """
-        if not any(self._lacking(scenes, self.answers, blind, places)):
+        if not any(self._lacking(scenes, self.answers, question, places)):
             return
         # Only the prompts of scenes whose answers were not all given are rendered.
-        lacks = list(self._lacking(scenes, self._given, blind, places))
+        lacks = list(self._lacking(scenes, self._given, question, places))
         scenes = list(compress(scenes, lacks))
         asked = None if places is None else list(compress(places, lacks))
-        self.answer(list(requests(self.spec, scenes, blind, asked)))
+        self.answer(list(requests(self.spec, scenes, question, asked)))
 
     def _lacking(
         self,
         scenes: Sequence[Scene],
         available: Container[str],
-        blind: bool = False,
+        question: Question = PLAIN,
         places: Places | None = None,
     ) -> Iterator[bool]:
+        first = 0 if question == PLAIN else 1  # only helpers are asked another question
         for scene, asked in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
-                _id(scene, viewer, blind) not in available
+                _id(scene, viewer, question) not in available
                 for place, viewer in viewers
-                if place >= blind and (asked is None or place in asked)
+                if place >= first and (asked is None or place in asked)
             )
 
-    def laid_out(self, scenes: Sequence[Scene], blind: bool = False, width: int = 1) -> Intents:
+    def laid_out(
+        self, scenes: Sequence[Scene], question: Question = PLAIN, width: int = 1
+    ) -> Intents:
         """Return the answers so far as arrays of at least `width` vehicles;
         NaN without an intent.
         """
-        answers = [
-            [self.answers.get(_id(s, v, blind and n > 0)) for n, v in enumerate(s.viewers)]
-            for s in scenes
-        ]
+        answers = [self._answers_in(scene, question) for scene in scenes]
         width = max(width, *map(len, answers))
         unknown = (math.nan,) * len(self.spec.actions)
         p, distances_m, ranges_m, bits, texts_b, unasked = [], [], [], [], [], []
@@ -484,6 +507,12 @@ class Asker:
             own_bits=own_bits,
             own_text_bytes=own_text_bytes,
         )
+
+    def _answers_in(self, scene: Scene, question: Question) -> list[Answer | None]:
+        """Return the answers so far in a scene, the ego's first, which is asked the plain one."""
+        ego, *helpers = scene.viewers
+        ids = [_id(scene, ego, PLAIN), *(_id(scene, viewer, question) for viewer in helpers)]
+        return [self.answers.get(name) for name in ids]
 
     def _models(self, scene: Scene, width: int) -> list[int]:
         """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
@@ -592,8 +621,8 @@ def _heard_sets(
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():
         at, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
-        at, source = divmod(at, len(scenes)) if rewrites.shuffled else (at, at)
-        name, viewers = scenes[source].id if rewrites.shuffled else "", scenes[source].viewers
+        at, source = divmod(at, len(scenes)) if rewrites.elsewhere else (at, at)
+        name, viewers = scenes[source].id if rewrites.elsewhere else "", scenes[source].viewers
         yield scenes[at], [key_of(viewers[1 + h], rewrites, h in attacking, name) for h in heard]
 
 

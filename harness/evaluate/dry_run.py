@@ -8,6 +8,7 @@ from typing import Any
 
 from harness.backends.tokens import counter, summarize_counts
 from harness.coordination.operating_point import Rewrites
+from harness.coordination.parts import PLAIN
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.asking import EGO, fusion_id, requests
 from harness.evaluate.fusion import key_of
@@ -27,10 +28,11 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     sizes: dict[str, list[int]] = {}
     asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
     intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
-    sighted = spec.asks_all or any(not point.blind_helpers for point in intents)
-    blind = any(point.blind_helpers for point in (spec.points if spec.asks_all else intents))
-    own = requests(spec, scenes, places=None if sighted else [EGO] * len(scenes))
-    for request in chain(own, requests(spec, scenes, blind=True) if blind else ()):
+    plain = spec.asks_all or any(point.question == PLAIN for point in intents)
+    own = requests(spec, scenes, places=None if plain else [EGO] * len(scenes))
+    asking = spec.points if spec.asks_all else intents
+    others = {point.question for point in asking if point.question != PLAIN}
+    for request in chain(own, *(requests(spec, scenes, question) for question in others)):
         asked[request.role] += 1
         card, tokens = spec.agents[request.agent].card, None
         if tokens_of:
@@ -83,7 +85,7 @@ def lacking(
 def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
     """Yield the ids of the fusion calls that a scene needs at most.
 
-    Where messages are shuffled, each condition and seed may hear another layout,
+    Where messages come from elsewhere, each condition and seed may hear another layout,
     whose id stands open.
     """
     most, sources = dict[Rewrites, int](), dict[Rewrites, list[str]]()
@@ -93,7 +95,7 @@ def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
             most[rewrites] = max(point.ask.max_helpers, most.get(rewrites, 0))
             open_ids = [f"{point.name}-{seed}" for seed in spec.seeds]
             sources[rewrites] = (
-                [*sources.get(rewrites, ()), *open_ids] if rewrites.shuffled else [""]
+                [*sources.get(rewrites, ()), *open_ids] if rewrites.elsewhere else [""]
             )
     helpers = scene.viewers[1:]
     for rewrites, others in most.items():

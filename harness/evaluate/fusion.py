@@ -22,9 +22,9 @@ from harness.coordination.operating_point import Rewrites
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.evaluate.repair import as_text
-from harness.runs.records import BLIND, REWRITTEN, Answer
+from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
-FROM = "from:"  # in a key, before the id of the scene that a shuffled message comes from
+FROM = "from:"  # in a key, before the id of the other scene that a message comes from
 WORDS = "words"  # in a key, after what the graph is extended by: the prompt shows the messages, too
 
 
@@ -93,7 +93,8 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
         changed.append(TEXT)
     if source:
         changed.append(FROM + source)
-    return helper + BLIND * rewrites.blind + (REWRITTEN + "&".join(changed) if changed else "")
+    key = asked_key(helper, rewrites.question)
+    return key + (REWRITTEN + "&".join(changed) if changed else "")
 
 
 def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools) -> list[str]:
@@ -178,7 +179,7 @@ def messages_of(
             message["evidence"] = as_text(message["evidence"] or "")
             if TEXT in holds:
                 message = {"evidence": " ".join(message["evidence"].split())}
-            messages.append({"sender": key.removesuffix(BLIND), **message})
+            messages.append({"sender": key.partition(ASKED)[0], **message})
     return messages
 
 

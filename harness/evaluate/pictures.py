@@ -17,17 +17,19 @@ from harness.world.perception.camera import Sight
 GREY = 127
 
 
-def picture(spec: Spec, index: int, scene: Scene, viewer: str, blind: bool = False) -> Image | None:
+def picture(
+    spec: Spec, index: int, scene: Scene, viewer: str, pictured: bool = True
+) -> Image | None:
     """Return the picture that a viewer's agent is shown; None if its prompts show none.
 
-    `index` says which agent answers. A `blind` viewer is shown nothing, and its picture is blank.
+    `index` says which agent answers. It is blank for a viewer that is not to be shown what it sees.
     Raises UserError if there is no other scene to take a picture from.
     """
     agent = spec.agents[index]
     vision = agent.card.vision
     if not agent.sees or vision is None:
         return None
-    if blind or agent.image == "blank":
+    if not pictured or agent.image == "blank":
         return blank(vision.size_px)
     if agent.image == "another":
         place = scene.viewers.index(viewer)

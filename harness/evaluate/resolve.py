@@ -11,6 +11,7 @@ from harness.backends import cards
 from harness.backends.base import BARE
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError, in_range, unknown
+from harness.core.extensions import control_settings
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
@@ -29,11 +30,7 @@ from harness.world.scenarios import DEFAULT
 if TYPE_CHECKING:
     from harness.evaluate.live_world import LiveSource
 
-CONTROLS = {
-    "shuffled-messages": "messages=shuffled",
-    "no-messages": "loss=1",
-    "blind": "messages=blind",
-}
+NO_MESSAGES = {"no-messages": "loss=1"}
 
 
 def spec(settings: Settings, source: Source) -> Spec:
@@ -165,10 +162,11 @@ def points(
     and of those with a channel the controls and attacks.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
-    if wrong := [control for control in controls if control not in CONTROLS]:
-        raise unknown("--control", wrong[0], CONTROLS)
+    known = {**NO_MESSAGES, **control_settings()} if controls else {}
+    if wrong := [control for control in controls if control not in known]:
+        raise unknown("--control", wrong[0], known)
     beside = dict.fromkeys(
-        (*(CONTROLS[control] for control in controls), *(f"attack={a}" for a in attacks))
+        (*(known[control] for control in controls), *(f"attack={a}" for a in attacks))
     )
     derived = [
         named_point(point.name + ("," if ":" in point.name else ":") + setting)

@@ -7,12 +7,13 @@ from msgspec import structs
 
 from harness.coordination.attacks import ATTACKS, attacks_of
 from harness.coordination.contents import OBJECTS, TRUTH
+from harness.coordination.operating_point import questions
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene, by_seat
 from harness.evaluate.fusion import changes_of, source_of
-from harness.runs.records import BLIND, REWRITTEN, Answer
+from harness.runs.records import ASKED, REWRITTEN, Answer
 from harness.world.perception.graph import truth_graphs
 from harness.world.perception.shared import Heard, invented, merged
 from harness.world.scenario import Scenario
@@ -68,9 +69,8 @@ def _without_ego(graph: SceneGraph) -> SceneGraph:
 
 def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
-    sender = key.partition(REWRITTEN)[0]
-    graph = scene.graphs[sender.removesuffix(BLIND)]
-    graph = graph.blinded() if sender.endswith(BLIND) else graph
+    sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
+    graph = questions()[question].shown(scene.graphs[sender])
     named = [name for name in changes_of(key) if name.partition(":")[0] in ATTACKS]
     for attack in attacks_of("+".join(named)):
         graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
@@ -82,16 +82,17 @@ def as_asked(
 ) -> Scene:
     """Return a decision point as it was shown to who gave an answer.
 
-    A blind helper saw nothing; an ego that was asked again may have had the objects of others, of
-    the scene `source` (`fusion.source_of`) if their messages were shuffled.
+    A helper may have been asked another question; an ego that was asked again may have had the
+    objects of others, of the scene `source` (`fusion.source_of`) if messages came from elsewhere.
 
     Raises:
         UserError: the answer names a sender or an attack that there is not,
             as only a stranger's can.
     """
-    if answer.role == "blind":
+    if answer.question:
+        shown = questions()[answer.question].shown
         return scene.changed(
-            graphs={viewer: graph.blinded() for viewer, graph in scene.graphs.items()}
+            graphs={viewer: shown(graph) for viewer, graph in scene.graphs.items()}
         )
     try:
         [graph] = shared_graphs(

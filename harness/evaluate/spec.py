@@ -291,10 +291,6 @@ class Spec:
 
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego
-        if point.ask.messages == "shuffled" and self.source.kind != "frozen":
-            raise UserError(
-                f"{shown}: messages={point.ask.messages} is for frozen scenes; use harness eval"
-            )
         if point.content.plan and not self.several_decide:
             raise UserError(NO_PLANS.format(printable(point.name)))
         for part in point.more:
@@ -302,11 +298,6 @@ class Spec:
                 raise UserError(f"{shown}: {obstacle}")
         if point.has_fusion_call and point.content.graph and ego.can.language_model:
             self._check_shows_objects(shown)
-        if point.has_fusion_call and point.rewrites.shuffled and self.device_profile:
-            raise UserError(
-                f"{shown}: energy is known of messages of the ego's own layout alone; leave "
-                "--device-profile out, or messages=shuffled"
-            )
         if not (point.has_fusion_call and point.rewrites.shows):
             return
         reason = self._plan_obstacle if point.content.plan else self.fusion_obstacle
@@ -405,6 +396,11 @@ class Spec:
         with a device profile the joules of all count.
         """
         return self.settings.ask == "all" or self.ego_alone or self.device_profile is not None
+
+    @property
+    def frozen(self) -> bool:
+        """Whether its scenes are frozen."""
+        return self.source.kind == "frozen"
 
     @property
     def ego_alone(self) -> bool:

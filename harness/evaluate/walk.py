@@ -18,6 +18,7 @@ from harness.coordination.encodings import JSON, reply_bits
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.parts import PLAIN, Question
 from harness.coordination.plans import NO_PLANS, Plans
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats, Ints
@@ -159,14 +160,14 @@ class Ask(Protocol[AskedPoint]):
         """
         ...
 
-    def blind(self, points: Sequence[AskedPoint], /, at: Ints) -> Intents:
-        """Return the same where helpers are shown nothing, (n, ...);
+    def others(self, points: Sequence[AskedPoint], /, question: Question, at: Ints) -> Intents:
+        """Return the same where helpers are asked another question, (n, ...);
         only the points `at` need values.
         """
         ...
 
     def helpers(
-        self, points: Sequence[AskedPoint], /, wanted: Bools, blind: bool = False
+        self, points: Sequence[AskedPoint], /, wanted: Bools, question: Question = PLAIN
     ) -> Intents:
         """Ask the helpers wanted, (n, H),
         and return the intents of the points where any is wanted.
@@ -231,16 +232,11 @@ def _steps(
         if any(point.content.graph for point in due):
             counts, bits = world.listed() or (None, None)
             intents = replace(intents, objects=counts, object_bits=bits)
-        asked_blind = [each.at for point, each in due.items() if point.blind_helpers]
-        blind = (
-            ask.blind(decision_points, np.unique(np.concatenate(asked_blind)))
-            if asked_blind
-            else None
-        )
-        intents, blind = _asked(ask, decision_points, due, intents, blind)
+        others = _others(ask, decision_points, due)
+        answers = _asked(ask, decision_points, due, {PLAIN: intents, **others})
         broadcasts = {
             point: attackers[point].said(
-                heard(point, intents, blind, each),
+                heard(point, answers, each),
                 each.draws,
                 each.episodes if point.guard.attack else (),
             )
@@ -289,51 +285,66 @@ def _decided(
     return fuse(point, heard, intents, replace(fusion, call=call))
 
 
+def _others(
+    ask: Ask[DecisionPoint],
+    decision_points: Sequence[DecisionPoint],
+    due: Mapping[OperatingPoint, Due],
+) -> dict[Question, Intents]:
+    """Return what vehicles intend by each question that is not the plain one."""
+    at: dict[Question, list[Ints]] = {}
+    for point, due_here in due.items():
+        if point.question != PLAIN:
+            at.setdefault(point.question, []).append(due_here.at)
+    return {
+        question: ask.others(decision_points, question, np.unique(np.concatenate(places)))
+        for question, places in at.items()
+    }
+
+
 def _asked(
     ask: Ask[DecisionPoint],
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
-    intents: Intents,
-    blind: Intents | None,
-) -> tuple[Intents, Intents | None]:
-    """Ask the helpers whose answers some condition uses, and return the intents, sighted and blind.
+    answers: Mapping[Question, Intents],
+) -> Mapping[Question, Intents]:
+    """Ask the helpers whose answers some condition uses, and return the intents by question.
 
     An answer may fail, and another helper is asked in its place; so this may take several turns.
     """
+    answers = dict(answers)
     while True:
-        wanted = {each: np.zeros(intents.range_m.shape, dtype=bool) for each in (False, True)}
+        wanted = {
+            question: np.zeros(intents.range_m.shape, dtype=bool)
+            for question, intents in answers.items()
+        }
         for point, due_here in due.items():
-            here = heard(point, intents, blind, due_here)
+            here = heard(point, answers, due_here)
             if here.unasked is not None and here.unasked.any():
                 decision, helper = np.nonzero(here.unasked & needed(point, here, due_here.draws))
                 shown_at = due_here.at[_sources(point, due_here)[decision]]
-                wanted[point.blind_helpers][shown_at, helper] = True
-        if not (wanted[False].any() or wanted[True].any()):
-            return intents, blind
-        if wanted[False].any():
-            at = np.flatnonzero(wanted[False].any(axis=1))
-            intents = intents.replaced(at, ask.helpers(decision_points, wanted[False]))
-        if wanted[True].any():
-            assert blind is not None
-            at = np.flatnonzero(wanted[True].any(axis=1))
-            blind = blind.replaced(at, ask.helpers(decision_points, wanted[True], blind=True))
+                wanted[point.question][shown_at, helper] = True
+        if not any(helpers.any() for helpers in wanted.values()):
+            return answers
+        for question, helpers in wanted.items():
+            if helpers.any():
+                at = np.flatnonzero(helpers.any(axis=1))
+                new = ask.helpers(decision_points, helpers, question)
+                answers[question] = answers[question].replaced(at, new)
 
 
-def heard(point: OperatingPoint, intents: Intents, blind: Intents | None, due: Due) -> Intents:
-    """Return the intents that each decision works with; a control replaces those of the helpers.
+def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) -> Intents:
+    """Return the intents that each decision works with, of all answers by question.
 
-    With `messages=blind` they are the intents of helpers that are shown nothing. With
-    `messages=shuffled` they come from another layout: the next one in which the same seed has a
-    decision at this step. If there is none, the ego hears nobody. Who is asked, the distances and
-    the times stay the same.
+    Those of helpers may be answers to another question, or come from other scenes; a decision with
+    no other to hear from hears nobody. Who is asked, the distances and the times stay the same.
     """
+    intents = answers[PLAIN]
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = _able(point, intents if every else intents.take(due.at))
-    if point.blind_helpers:
-        assert blind is not None
-        source = _able(point, blind.take(due.at))
+    if point.question != PLAIN:
+        source = _able(point, answers[point.question].take(due.at))
         own = _with_helpers(own, source, source.valid)
-    elif point.ask.messages == "shuffled":
+    elif point.elsewhere:
         places = _sources(point, due)
         source, alone = own.take(places), places == np.arange(len(places))
         own = _with_helpers(own, source, source.valid & ~alone[:, None])
@@ -373,17 +384,11 @@ def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:
     """Return the decision whose helpers each decision hears, (n,):
-    its own, but where they are shuffled.
+    its own, unless messages come from elsewhere.
     """
-    if point.ask.messages != "shuffled":
-        return np.arange(len(due.at))
-    order = np.lexsort((due.episode, due.seed))
-    following = np.roll(order, -1)
-    starts = np.flatnonzero(np.diff(due.seed[order], prepend=due.seed[order[0]] - 1))
-    following[np.roll(starts, -1) - 1] = order[starts]  # the last of a seed hears its first
-    sources = np.empty_like(order)
-    sources[order] = following
-    return sources
+    if point.elsewhere:
+        return point.elsewhere.sources(due.episode, due.seed)
+    return np.arange(len(due.at))
 
 
 class Memory:
@@ -448,11 +453,11 @@ def heard_codes(
 
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
     """Return a number for each decision, (n,):
-    of its point, and of that of its helpers if shuffled.
+    of its point, and of that of its helpers if they are elsewhere.
 
-    With `n` decision points, the number of a shuffled one is n times the first and the second.
+    With `n` decision points, the number of such a one is n times the first and the second.
     """
-    return due.at * n + due.at[_sources(point, due)] if point.rewrites.shuffled else due.at
+    return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
 
 def shown(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:

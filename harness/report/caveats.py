@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from harness.backends.registry import reads_prompts
+from harness.coordination.operating_point import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins
@@ -29,12 +30,6 @@ _FAILED = {
     "ego": ("the ego's", "it drives by the fallback, and success says little about the model"),
     "helper": ("the helpers'", "they send no message"),
     "merge": ("the fusion calls'", "the ego keeps the policy it had without them"),
-}
-_CONTROLS = {
-    "shuffled": "what helpers say in another layout, while a "
-    "decision's page shows what its own helpers "
-    "say",
-    "blind": "helpers that are shown nothing",
 }
 
 
@@ -172,9 +167,10 @@ def retried(run: Run) -> Iterator[str]:
 
 def controls(run: Run) -> Iterator[str]:
     """Yield the conditions in which the ego hears what no helper would say."""
-    for control, heard in _CONTROLS.items():
-        if names := doubts.controls(run.manifest.conditions, control):
-            yield f"{', '.join(map(printable, names))} is a control: the ego hears {heard}."
+    for kind in more_parts().values():
+        for control, words in kind.controls.items():
+            if names := doubts.under(run.manifest.conditions, control):
+                yield f"{', '.join(map(printable, names))} is a control: the ego hears {words}."
 
 
 def lagging(run: Run) -> Iterator[str]:

@@ -14,6 +14,7 @@ from msgspec import UNSET
 
 from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
+from harness.coordination.operating_point import questions
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
@@ -33,7 +34,7 @@ from harness.report.remarks import LeftOut
 from harness.report.runs import Runs
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
-from harness.runs.records import Answer, Episode
+from harness.runs.records import Answer, Episode, is_helper
 from harness.runs.run_dataset import check_scenes
 from harness.runs.sources import prompt_of
 from harness.world import scenarios
@@ -239,7 +240,8 @@ class Details:
                     sent.setdefault(key, messages)
                     asked = list(sent).index(key)
             if answer.image_sha256:
-                shown["picture"] = "blank" if answer.role == "blind" else agent["image"]
+                pictured = questions()[answer.question].pictured
+                shown["picture"] = agent["image"] if pictured else "blank"
             if run.manifest.helpers:
                 shown["agent"] = " · ".join(
                     (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
@@ -305,7 +307,7 @@ def _shown(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
     """Return where in a recovered completion its answers stand."""
-    role = "helper" if answer.role in ("helper", "blind") else "ego"
+    role = "helper" if is_helper(answer.role) else "ego"
     return spans(answer.raw, role, run.actions, run.agent(answer)["thinking"])
 
 

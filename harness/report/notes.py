@@ -3,13 +3,12 @@
 """
 
 from collections.abc import Iterator
-from typing import get_args
 
 from harness.core.errors import printable
 from harness.core.figures import PLAIN, Unit
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, written
-from harness.runs.records import Latency, Role, Score, role_word
+from harness.runs.records import Latency, Score, role_word, roles
 from harness.runs.suite import SuiteRun
 
 Shown = Run | SuiteRun
@@ -116,7 +115,7 @@ def cached(run: Shown) -> Iterator[str]:
 def readings(run: Shown) -> Iterator[str]:
     """Yield how the answers of each role were read; shares of a suite are means over families."""
     means = ", as means over families" if isinstance(run, SuiteRun) else ""
-    for role in get_args(Role):
+    for role in roles():
         yield from (f"{role_word(role)} {line}{means}" for line in _of_role(run, role))
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
@@ -204,7 +205,8 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
                 "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
                 "points": {
                     c["name"]: {
-                        key: c.get(key) for key in ("window_s", "consensus", "messages", "content")
+                        **{key: c.get(key) for key in ("window_s", "consensus", "content")},
+                        "question": OperatingPoint.from_dict(c).question.name,
                     }
                     for c in run.manifest.conditions
                 },

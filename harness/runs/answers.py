@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from harness.core.arrays import ROUNDING, Floats
-from harness.runs.records import Answer
+from harness.runs.records import Answer, roles
 
 _ANSWER = msgspec.json.Decoder(Answer)
 
@@ -40,7 +40,7 @@ class Answers:
         self._spans: list[tuple[int, int]] = []
         of_scene: dict[str, list[int]] = {}  # places in `_spans`
         keys: set[str] = set()
-        scene, start = None, 0
+        scene, start, known = None, 0, roles()
         for line in BytesIO(lines):
             stop = start + len(line)
             for answer in _ANSWER.decode_lines(line):  # one; none in a blank line
@@ -50,6 +50,10 @@ class Answers:
                     min(answer.intent) >= 0 and abs(sum(answer.intent) - 1) <= ROUNDING
                 ):
                     raise ValueError(f"answer {answer.id} has an intent that is no distribution")
+                if answer.role not in known:
+                    raise ValueError(
+                        f"answer {answer.id} has role {answer.role}; known: {', '.join(known)}"
+                    )
                 if answer.heard and answer.role != "merge":
                     raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:

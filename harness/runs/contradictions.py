@@ -117,7 +117,7 @@ def current(run: Run) -> bool:
 
 def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     """Yield which figures are others than those computed, are none of them, or are not there."""
-    own, here = METRICS.built_in, {score.key: score for score in computed}
+    own, here = METRICS.own, {score.key: score for score in computed}
     stated = {score.key: score for score in run.scores}
     for key, score in stated.items():
         other = here.get(key)
@@ -141,7 +141,7 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
     """
     stated = {_key(run, score) for score in run.scores}
     for score in computed:
-        if score.metric in METRICS.built_in and _key(run, score) not in stated:
+        if score.metric in METRICS.own and _key(run, score) not in stated:
             yield score.key
 
 
@@ -151,7 +151,7 @@ def unchecked(run: Run) -> Iterator[str]:
     """
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
-    held = {key for key in figures if key[1] in METRICS.built_in and (current(run) or key in here)}
+    held = {key for key in figures if key[1] in METRICS.own and (current(run) or key in here)}
     if names := dict.fromkeys(key[1] for key in figures if key not in held):
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."

@@ -7,12 +7,12 @@ which hold a whole run, and lists, which read no more than these, agree.
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from harness.core.extensions import control_settings
 from harness.core.pairs import pairs
 from harness.radio.limits import outside
 
 OFF_LAG = "off_lag_rate"
 MOST_OFF_LAG = 0.5  # from this share of decisions that act in another frame a page warns
-CONTROLS = ("shuffled", "blind")  # what helpers may say that no helper would
 Conditions = Sequence[Mapping[str, Any]]
 Channel = tuple[Mapping[str, Any], Mapping[str, Sequence[float]]]  # its parameters and their limits
 
@@ -23,13 +23,16 @@ def doubted(
     """Return the conditions that a warning is about:
     controls, another lag, a radio beyond its source.
     """
-    names = {name for control in CONTROLS for name in controls(conditions, control)}
+    names = {name for control in control_settings().values() for name in under(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
 
 
-def controls(conditions: Conditions, control: str) -> list[str]:
-    """Return the conditions with this control."""
-    return [c["name"] for c in conditions if c.get("messages") == control]
+def under(conditions: Conditions, control: str) -> list[str]:
+    """Return the conditions with a control, such as `messages=blind`:
+    the ego hears what no helper would say.
+    """
+    setting, _, value = control.partition("=")
+    return [c["name"] for c in conditions if c.get(setting) == value]
 
 
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:

@@ -7,8 +7,8 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import product
+from functools import cached_property, lru_cache
+from itertools import product, takewhile
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -37,7 +37,16 @@ from harness.core.strangers import aside
 from harness.parsing.status import Repair
 from harness.runs import leading, reliability
 from harness.runs.decisions import Decisions
-from harness.runs.records import Answer, AnswerFacts, Episode, Role, Score, role_word
+from harness.runs.records import (
+    PLAIN_ROLES,
+    Answer,
+    AnswerFacts,
+    Episode,
+    Role,
+    Score,
+    role_word,
+    roles,
+)
 
 World = Literal["frozen", "closed-loop"]
 Better = Literal["higher", "lower", "neither"]
@@ -52,7 +61,6 @@ ADJUSTED = {name: f"adjusted_{name}" for name in (*GAINS, *GAINS.values())}
 ONE_OPTIMAL = "decisions_one_optimal"
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
-ROLES: tuple[Role, ...] = get_args(Role)
 MS, SECONDS, METRES, JOULES, NATS = (
     Unit("ms"),
     Unit("s", 2),
@@ -126,7 +134,20 @@ class Metric:
 
 
 class Metrics(Plugins[Metric]):
-    """Metrics by name."""
+    """Metrics by name: built-in ones, those of answers to questions of extensions, packages'."""
+
+    @cached_property
+    def own(self) -> Mapping[str, Metric]:
+        """Those that are computed here, by name and in the order of rows: all but packages'."""
+        of_answers = {metric.name: metric for metric in _of_answers(roles())}
+        before = takewhile(lambda name: name not in of_answers, self.built_in)
+        return {**{name: self.built_in[name] for name in before}, **of_answers, **self.built_in}
+
+    def __getitem__(self, name: str) -> Metric:
+        return self.own[name] if name in self.own else super().__getitem__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self.own, **self._entries()})
 
     def _load(self, name: str) -> Metric:
         metric = super()._load(name)
@@ -277,7 +298,7 @@ def _label(name: str, role: Role) -> str:
     return f"{name} {role_word(role)}".replace("_", " ")
 
 
-def _of_answers() -> Iterator[Metric]:
+def _of_answers(roles: Sequence[Role]) -> Iterator[Metric]:
     """Yield the metrics of each role's answers, in the order of a summary's rows."""
     rates: tuple[tuple[tuple[str, str, Better, Callable[[Answers], Floats]], ...], ...] = (
         (
@@ -323,7 +344,7 @@ def _of_answers() -> Iterator[Metric]:
         ),
     )
     for group in rates:
-        for role in ROLES:
+        for role in roles:
             for name, meaning, better, values in group:
                 yield Metric(
                     f"{name}_{role}",
@@ -336,20 +357,17 @@ def _of_answers() -> Iterator[Metric]:
                     answers=values,
                     role=role,
                 )
+    in_letters = "probability of the letters together, in a read-out"
+    by_letter = "part of a read-out that follows the letter and not the action"
+    one_letter = "share of read-outs in which one letter is the likeliest in every order"
     lengths: tuple[tuple[str, str, Unit, Better, float], ...] = (
         ("prompt_tokens", "tokens of a prompt", COUNT, "lower", math.inf),
         ("completion_tokens", "tokens of an answer", COUNT, "lower", math.inf),
-        ("label_mass", "probability of the letters together, in a read-out", SCORE, "higher", 1.0),
-        ("letter_share", 
-            "part of a read-out that follows "
-            "the letter and not the action", SCORE, "lower",
-         1.0),
-        ("follows_letter", 
-            "share of read-outs in which one letter "
-            "is the likeliest in every order", SCORE,
-         "lower", 1.0),
-    )  # fmt: skip
-    for role in ROLES:
+        ("label_mass", in_letters, SCORE, "higher", 1.0),
+        ("letter_share", by_letter, SCORE, "lower", 1.0),
+        ("follows_letter", one_letter, SCORE, "lower", 1.0),
+    )
+    for role in roles:
         for name, meaning, unit, better, most in lengths:
             values = _stated(name)
             label = _label(name, role)
@@ -932,7 +950,7 @@ BUILT_IN = (
         )
         for name, gain in GAINS.items()
     ),
-    *_of_answers(),
+    *_of_answers(PLAIN_ROLES),
     Metric(
         "agreement_rate",
         "share of episodes that end alike, frozen and in closed loop",

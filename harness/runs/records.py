@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from msgspec import UNSET, Struct, UnsetType, defstruct, field
+from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import OperatingPoint, questions
 from harness.core.config import Seconds, convert
 from harness.core.errors import BETWEEN_NAMES, UserError
 from harness.core.statistics import Estimate
@@ -16,7 +16,18 @@ from harness.runs.settings import Settings
 from harness.world import scenarios
 from harness.world.parameters import DIALS
 
-Role = Literal["ego", "helper", "merge", "blind"]
+PLAIN_ROLES = ("ego", "helper", "merge")  # `merge` is the ego's fusion call
+Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  # one of `roles`
+
+
+def roles() -> tuple[Role, ...]:
+    """Return the roles of answers: the plain ones, and helpers' by the name of another question."""
+    return (*PLAIN_ROLES, *filter(None, questions()))
+
+
+def is_helper(role: str) -> bool:
+    """Return whether answers in a role are messages of helpers, which may be lost."""
+    return role not in ("ego", "merge")
 
 
 def role_word(role: str) -> str:
@@ -24,10 +35,15 @@ def role_word(role: str) -> str:
     return "fusion" if role == "merge" else role
 
 
-BLIND = "~blind"  # ends the key of a blind helper's answer
+ASKED = "~"  # in the key of an answer, before the name of the question where it is another one
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
 MOST_LETTERS = 300  # of a name
 TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that tables show as columns
+
+
+def asked_key(viewer: str, question: str) -> str:
+    """Return the key of a viewer's answer to a question, by name; empty is the plain one."""
+    return f"{viewer}{ASKED}{question}" if question else viewer
 
 
 class FirstTurn(Struct, frozen=True, kw_only=True):
@@ -51,7 +67,6 @@ class Answer(Struct, frozen=True, kw_only=True):
     viewer: str  # id of the vehicle that answered
     # keys of the helpers' answers whose messages were in the prompt of a fusion call
     heard: tuple[str, ...] = ()
-    # `ego`, `helper`, `merge` for the ego's fusion call, or `blind` for a helper shown nothing
     role: Role
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
     finish_reason: str  # `stop`, `length`, `refusal` or `error`
@@ -126,7 +141,12 @@ class Answer(Struct, frozen=True, kw_only=True):
         """The answer's name within its decision point:
         viewer, senders heard, and whether it was blind.
         """
-        return "+".join((self.viewer, *self.heard)) + (BLIND if self.role == "blind" else "")
+        return asked_key("+".join((self.viewer, *self.heard)), self.question)
+
+    @property
+    def question(self) -> str:
+        """The name of what it answers; empty for the plain question."""
+        return "" if self.role in PLAIN_ROLES else self.role
 
 
 class AnswerFacts(Struct, frozen=True):

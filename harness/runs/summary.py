@@ -27,7 +27,6 @@ from harness.runs.metrics import (
     LATENCY,
     METRICS,
     PERCENTILES,
-    ROLES,
     SUCCESS,
     Grid,
     World,
@@ -45,7 +44,7 @@ from harness.runs.metrics import (
     percentiles,
     sum_by_place,
 )
-from harness.runs.records import Answer, AnswerFacts, Episode, Score
+from harness.runs.records import Answer, AnswerFacts, Episode, Score, roles
 from harness.runs.reliability import Judged, estimates
 
 
@@ -201,7 +200,7 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
     Intervals are over episodes, since the answers of one episode are not independent.
     """
     by_role = {}
-    for role in ROLES:
+    for role in roles():
         pairs = [(answer, episode) for answer, episode in answers if answer.role == role]
         if pairs:
             by_role[role] = tuple(zip(*pairs, strict=True))

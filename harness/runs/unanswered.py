@@ -9,7 +9,7 @@ from pathlib import Path
 from harness.core import work
 from harness.core.errors import printable
 from harness.runs.folder import Run, read
-from harness.runs.records import Answer, AnswerFacts, Role
+from harness.runs.records import Answer, AnswerFacts, Role, is_helper
 
 MOST_LOST = 0.05  # share of the helpers' questions without an answer that no run has
 WORDS = 3  # different errors that are named
@@ -17,9 +17,7 @@ _WHO: dict[Role, str] = {
     "ego": "the ego",
     "merge": "fusion calls",
     "helper": "helpers",
-    "blind": "blind helpers",
 }
-HELPERS: tuple[Role, ...] = ("helper", "blind")  # whose answers are messages, which may be lost
 
 
 class Tally:
@@ -47,10 +45,11 @@ class Tally:
     @property
     def missing(self) -> frozenset[Role]:
         """The roles whose questions without an answer are more than lost messages."""
-        lost = sum(self.unanswered[role] for role in HELPERS)
-        too_many = lost and lost >= MOST_LOST * sum(self.asked[role] for role in HELPERS)
+        lost = sum(n for role, n in self.unanswered.items() if is_helper(role))
+        asked = sum(n for role, n in self.asked.items() if is_helper(role))
+        too_many = lost and lost >= MOST_LOST * asked
         return frozenset(
-            r for r, n in self.unanswered.items() if n and (r not in HELPERS or too_many)
+            role for role, n in self.unanswered.items() if n and (too_many or not is_helper(role))
         )
 
     def __str__(self) -> str:
@@ -65,12 +64,13 @@ class Tally:
 
     def counts(self) -> str:
         """Return how many questions got no answer, by role; empty if all did."""
-        counts = [
-            (self.unanswered[r], self.asked[r], who)
-            for r, who in _WHO.items()
-            if self.unanswered[r]
-        ]
-        return ", ".join(f"{n} of {asked} questions to {who}" for n, asked, who in counts)
+        roles = dict.fromkeys((*_WHO, *sorted(self.unanswered)))
+        return ", ".join(
+            f"{self.unanswered[role]} of {self.asked[role]} questions to "
+            f"{_WHO.get(role, f'{role} helpers')}"
+            for role in roles
+            if self.unanswered[role]
+        )
 
 
 def tally(run: Run) -> Tally:

@@ -65,7 +65,7 @@ def ordered(
     answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
 ) -> list[Answer]:
     """Sort answers by decision point, and there:
-    the ego's, the helpers', blind helpers', fusion calls'.
+    the ego's, the helpers', by another question the helpers', fusion calls'.
 
     Those of one kind are in the order of the decision point's `viewers`, where these are known.
     Answers for a decision point without a decision, or by nobody among its viewers, are left out.
@@ -73,7 +73,7 @@ def ordered(
 
     def place(answer: Answer) -> tuple[Any, ...]:
         first = viewers[answer.scene].index(answer.viewer) if answer.scene in viewers else 0
-        return order[answer.scene], answer.heard, answer.role == "blind", first
+        return order[answer.scene], answer.heard, answer.question, first
 
     order = {scene: n for n, scene in enumerate(dict.fromkeys(decisions.labels("scene")))}
     reached = (answer for answer in answers if answer.scene in order)

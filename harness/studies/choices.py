@@ -17,6 +17,7 @@ from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.exchange import exchange, worth_of
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.parts import PLAIN
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
@@ -152,8 +153,16 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
             f"--condition {shown}: consensus {consensus} is no function of who is heard now, so "
             "that the oracle would be none; give linear, or another without memory"
         )
-    for setting, honest in (("messages", "own"), ("attack", ""), ("content", INTENT)):
-        if point.setting(setting) != honest:
+    changed = {
+        "attack": point.guard.attack != "",
+        "content": point.ask.content != INTENT,
+        **{
+            part.__struct_fields__[0]: part.question != PLAIN or part.elsewhere
+            for part in point.more
+        },
+    }
+    for setting in changed:
+        if changed[setting]:
             raise UserError(f"--condition {shown}: the oracle knows no {setting}; leave it out")
 
 

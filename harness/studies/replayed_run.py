@@ -24,6 +24,7 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.exchange import Exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
+from harness.coordination.parts import PLAIN, Question
 from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable, unknown
@@ -280,24 +281,23 @@ class ReplayedRun:
         with self._writing():
             return self._asker.whole(scenes)
 
-    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
+    def helpers(
+        self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
+    ) -> Intents:
         """Return what vehicles intend where a helper is wanted;
         the model is asked what the run lacks.
         """
         asked, places = wanted_in(scenes, wanted)
-        if not self._asks and any(self._asker.lacks(asked, blind, places)):
-            lacks = (
-                "that are shown nothing, which messages=blind needs"
-                if blind
-                else "that it did not ask"
-            )
-            remedy = "" if blind else ", or make the run again with --ask all"
+        if not self._asks and any(self._asker.lacks(asked, question, places)):
+            plain = question == PLAIN
+            lacks = "that it did not ask" if plain else f"that {question.words}"
+            remedy = ", or make the run again with --ask all" if plain else ""
             raise UserError(
                 f"--no-model: {printable(self.run.path)} lacks answers of helpers {lacks}; "
                 f"leave it out{remedy}"
             )
         with self._writing():
-            return self._asker.helpers(scenes, wanted, blind)
+            return self._asker.helpers(scenes, wanted, question)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """Return what vehicles intend; unless the model is asked,
@@ -313,12 +313,12 @@ class ReplayedRun:
             leave_out(np.array(lacks))
         return self._asker.laid_out(scenes)
 
-    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
-        """Return the same where helpers are shown nothing,
+    def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
+        """Return the same where helpers are asked another question,
         as far as the run has answers or asks them all.
         """
         with self._writing():
-            return self._asker.blind(scenes, at)
+            return self._asker.others(scenes, question, at)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
@@ -383,11 +383,13 @@ class _Nearest:
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
         return self._nearest(self._stored.intents(scenes, self._leave_out))
 
-    def blind(self, scenes: Sequence[Scene], at: Ints) -> Intents:
-        return self._nearest(self._stored.blind(scenes, at))
+    def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
+        return self._nearest(self._stored.others(scenes, question, at))
 
-    def helpers(self, scenes: Sequence[Scene], wanted: Bools, blind: bool = False) -> Intents:
-        return self._nearest(self._stored.helpers(scenes, wanted, blind))
+    def helpers(
+        self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
+    ) -> Intents:
+        return self._nearest(self._stored.helpers(scenes, wanted, question))
 
     def _nearest(self, intents: Intents) -> Intents:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
@@ -197,8 +198,8 @@ def run_sweep(
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
 
     def able(source: Source, point: OperatingPoint) -> bool:
-        # The proxy has no model that could answer a fusion call, or blindly.
-        return source in runs or not (point.has_fusion_call or point.blind_helpers)
+        # The proxy has no model that could answer a fusion call, or another question.
+        return source in runs or not (point.has_fusion_call or point.question != PLAIN)
 
     results = {
         panel: [

@@ -350,6 +350,8 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
         for setting, default in structs.asdict(more_parts()[part]()).items():
             idle = "" if default is None else str(default)
             assert known.setting_of_extension(setting) == known.OfExtension(name, idle)
+        for control in more_parts()[part].controls:
+            assert control in known.control_settings().values()
 
 
 def test_every_folder_of_an_extension_is_registered() -> None:

@@ -19,6 +19,7 @@ ORDINARY = {
     "benchmark": "what a published dataset is tagged as",
     "calibration": "how far probabilities are what they say, a metric",
     "closed-loop": "the world that is driven, beside the frozen one",
+    "controls": "conditions beside which a gain is compared",
     "decide": "what vehicles do",
     "environment": "one of highway-env, and a variable of the shell",
     "examples": "what a prompt shows as earlier turns",

@@ -163,11 +163,11 @@ class CalibratedWorld:
         own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=own)
 
-    def blind(self, *_: Any, **__: Any) -> Any:
+    def others(self, *_: Any, **__: Any) -> Any:
         """Refuse: the intents of all are drawn, and nobody can be asked."""
         raise NotImplementedError
 
-    helpers = fusion_call = plan_call = blind
+    helpers = fusion_call = plan_call = others
 
     def due(self, point: OperatingPoint) -> Due:
         """Return every episode."""

@@ -13,12 +13,12 @@ function highlighted(raw, spans) {
 
 const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${number(p[n], 2)}`).join(", ") : "none");
 
-const sender = (answer) => answer.viewer.replace("~blind", "");
+const sender = (answer) => answer.viewer.replace(/~\w+/, "");
 // Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion".
 const heard = (key) =>
-  key.replaceAll("+", " + ").replaceAll("~blind", " blind").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^plan:.*/, "plan")})`);
+  key.replaceAll("+", " + ").replace(/~(\w+)/g, " $1").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^plan:.*/, "plan")})`);
 const who = (answer) =>
-  answer.role === "blind" ? `${sender(answer)}, blind helper`
+  answer.viewer.includes("~") && answer.role !== "merge" ? `${sender(answer)}, ${answer.role} helper`
     : `${heard(answer.viewer)}, ${answer.role === "merge" ? "fusion" : answer.role}`;
 
 const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;

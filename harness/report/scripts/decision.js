@@ -48,10 +48,10 @@ function reply(m) {
 const acted = (d) => d.acts_at_s != null
   && h("small", {}, d.acted ? `acts at ${number(d.acts_at_s, 2, "s")}` : "not ready before the episode ended");
 
-// Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were shown nothing,
-// or agents, whose plans are the answers that they gave from their own seats.
+// Second answers of the ego are in the fused policy. Under some conditions helpers are heard who were asked another
+// question, or agents, whose plans are the answers that they gave from their own seats.
 function first(record, point, together) {
-  const speaks = point.content === "plan" ? "plan" : point.messages === "blind" ? "blind" : "helper";
+  const speaks = point.content === "plan" ? "plan" : point.question || "helper";
   const plans = together.filter((each) => !each.here && each.own).map(({ own }) => ({ ...own, role: "plan" }));
   return [...record.answers, ...plans].filter((a) => a.role === "ego" || a.role === speaks);
 }
@@ -74,7 +74,7 @@ function policyRows(record, chosen, actions, run, together) {
 function timelineRows(record, chosen, run, together) {
   const rows = [], point = run.points[chosen.condition], { latency_ms } = chosen;
   for (const a of first(record, point, together)) {
-    const usual = run.inference_s[a.role === "helper" || a.role === "blind" ? "helper" : "ego"];
+    const usual = run.inference_s[a.role === "ego" || a.role === "merge" ? "ego" : "helper"];
     const ready = 1000 * (a.took_s === undefined ? usual : a.took_s); // null where an answer never came
     const m = chosen.messages.find((m) => m.from === sender(a)), name = who(a);
     if (a.role !== "ego" && !m) continue;

@@ -17,6 +17,7 @@ import numpy as np
 
 from harness.backends.base import Backend
 from harness.coordination.operating_point import AS_SENT, Rewrites
+from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.progress import Progress
 from harness.dataset.load import Dataset, Scene
@@ -246,17 +247,21 @@ class _Asker(Asker):
         self._charge = partial(tuning.take, record)
 
     def _ask_at(
-        self, scenes: Sequence[Scene], places: Places | None = None, blind: bool = False
+        self,
+        scenes: Sequence[Scene],
+        places: Places | None = None,
+        question: Question = PLAIN,
     ) -> None:
-        viewers = (range(int(blind), len(self.spec.viewers(scene))) for scene in scenes)
+        first = 0 if question == PLAIN else 1
+        viewers = (range(first, len(self.spec.viewers(scene))) for scene in scenes)
         wanted = [
-            (scene.id, place, blind)
+            (scene.id, place, question.name)
             for scene, there, asked in zip(scenes, viewers, places or repeat(None), strict=False)
             for place in there
             if asked is None or place in asked
         ]
         self._charge(wanted)
-        super()._ask_at(scenes, places, blind)
+        super()._ask_at(scenes, places, question)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

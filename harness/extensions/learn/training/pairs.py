@@ -26,7 +26,7 @@ from harness.extensions.learn.training.lessons import Lessons, label
 from harness.extensions.learn.training.questions import question
 from harness.prompts import readout
 from harness.runs.folder import Run
-from harness.runs.records import BLIND, Answer, FrozenScenes
+from harness.runs.records import ASKED, Answer, FrozenScenes
 from harness.runs.run_dataset import check_scenes, dataset_of
 from harness.runs.sources import prompt_of
 
@@ -150,7 +150,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
         answers = {stored.key: stored for stored in run.answers_by_scene.get(scene.id, ())}
-        for stored in (each for each in answers.values() if BLIND not in each.key):
+        for stored in (each for each in answers.values() if ASKED not in each.key):
             if stored.viewer not in scene.graphs:
                 raise UserError(
                     f"{printable(run.path / 'answers.jsonl')} has an answer of "

@@ -33,7 +33,7 @@ from harness.report.drawing.colours import conditions
 from harness.runs.folder import Run
 from harness.runs.leading import lead_of
 from harness.runs.metrics import LATENCY, METRICS, SUCCESS, by_episode, mean_by_place, over_episodes
-from harness.runs.records import Answer
+from harness.runs.records import Answer, is_helper
 from harness.runs.success import Success
 from harness.studies.study import Study, corrected, ends, p_cell
 
@@ -166,13 +166,18 @@ def run_cells(
     # All are checked first.
     specs = [replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs]
     for ((i, ego), (j, helper)), both in zip(pairs, specs, strict=True):
-        roles = {"ego": ego.name, "helper": helper.name, "blind": helper.name}
-        given = {k: v for role in roles.items() for k, v in asked.get(role, {}).items()}
+        given = {
+            name: answer
+            for (role, of_agent), answers in asked.items()
+            if of_agent == (helper.name if is_helper(role) else ego.name)
+            for name, answer in answers.items()
+        }
         folder = out / "cells" / f"{i}-{j}"
         run = read_or_evaluate(both, folder, progress, cache_file, opens, given)
         for answer in run.answers:
-            if answer.role in roles and answer.error is None:
-                asked.setdefault((answer.role, roles[answer.role]), {})[answer.id] = answer
+            if answer.role != "merge" and answer.error is None:
+                of_agent = helper.name if is_helper(answer.role) else ego.name
+                asked.setdefault((answer.role, of_agent), {})[answer.id] = answer
         cells.append(Cell(ego, helper, run))
     runs = [cell.run for cell in cells]
     episodes = runs[0].episodes[: len(runs[0].grid.episodes)]

@@ -26,7 +26,8 @@ from reading import unpacked
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
-from harness.coordination.operating_point import named_point
+from harness.coordination.operating_point import named_point, questions
+from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.dataset.load import Dataset
@@ -93,7 +94,7 @@ def test_a_prior_keeps_its_gain_and_perception_loses_it(
 def test_a_blind_helper_knows_itself_and_the_beacon_and_sees_no_sector(small: Dataset) -> None:
     scenes = small.scenes(small.courses())
     spec = spec_of(small, "swarm-tiny", "v4")
-    asked = list(requests(spec, scenes, blind=True))
+    asked = list(requests(spec, scenes, questions()["blind"]))
     assert [r.id for r in asked] == [f"{s.id}/{v}~blind" for s in scenes for v in s.viewers[1:]]
     own = {request.id: request for request in requests(spec, scenes)}
     for request in asked:
@@ -134,7 +135,7 @@ def test_each_helper_is_asked_once_where_a_blind_condition_asks(done: Evaluated)
 def test_other_conditions_are_the_same_without_it(
     done: Evaluated, small: Dataset, tmp_path: Path
 ) -> None:
-    less = tuple(point for point in CONDITIONS if not point.blind_helpers)
+    less = tuple(point for point in CONDITIONS if not point.question.name)
     without = run(spec_of(small, points=less), tmp_path / "less")
     assert not [a for a in answers_of(without.out) if a.role == "blind"]
     for point in less:
@@ -170,7 +171,7 @@ def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
     same = run(spec_of(small, f"replay:{done.out}", points=CONDITIONS), tmp_path / "same")
     assert same_scores(same, done)
     assert same_decisions(same.out, done.out)
-    less = tuple(point for point in CONDITIONS if not point.blind_helpers)
+    less = tuple(point for point in CONDITIONS if not point.question.name)
     without = run(spec_of(small, points=less), tmp_path / "less")
     more = run(spec_of(small, f"replay:{without.out}", points=CONDITIONS), tmp_path / "more")
     assert same_decisions(more.out, done.out)
@@ -182,7 +183,7 @@ def test_a_sweep_has_them_asks_for_them_or_says_that_it_lacks_them(
 ) -> None:
     less = run(spec_of(small, points=CONDITIONS[:2]), tmp_path / "less").out
     point = CONDITIONS[2]
-    assert point.blind_helpers
+    assert point.question.name == "blind"
     blind = [Setting(point.name, point, 4)]
     with pytest.raises(
         UserError, match="lacks answers of helpers that are shown nothing, which messages=bl"
@@ -255,6 +256,6 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
 
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:
-    assert not named_point("single-local:messages=blind").blind_helpers
+    assert named_point("single-local:messages=blind").question == PLAIN
     with pytest.raises(UserError, match="messages is 'shuffled'; it must be own or blind where"):
         named_point("6g:content=oracle,messages=shuffled")

@@ -1,0 +1,89 @@
+"""The setting `messages` of a condition: what the ego hears in the place of its helpers."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from harness.coordination.contents import TRUTH
+from harness.coordination.parts import PLAIN, Part, Question, RunFacts, Text, wrong
+from harness.core.arrays import Ints
+from harness.core.errors import unknown
+
+if TYPE_CHECKING:
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.world.scene_graph import SceneGraph
+
+OWN, SHUFFLED, BLIND = "own", "shuffled", "blind"
+MESSAGES = (OWN, SHUFFLED, BLIND)
+
+
+@dataclass(frozen=True)
+class Blinded(Question):
+    """Ask helpers with nothing in sight, in graphs and in pictures."""
+
+    name: str = BLIND
+    words: str = "are shown nothing, which messages=blind needs"
+    pictured: bool = False
+
+    def shown(self, graph: "SceneGraph") -> "SceneGraph":
+        return graph.blinded()
+
+
+class Controlled(Part, frozen=True, kw_only=True):
+    """What the ego hears. A gain that remains under a control is not from what helpers see."""
+
+    behind: ClassVar[str] = "on_demand"
+    questions: ClassVar = (Blinded(),)
+    controls: ClassVar = {
+        f"messages={SHUFFLED}": "what helpers say in another layout, while a decision's page shows "
+        "what its own helpers say",
+        f"messages={BLIND}": "helpers that are shown nothing",
+    }
+
+    # Its `own` helpers, helpers of another layout (`shuffled`), or helpers that are shown nothing
+    # (`blind`).
+    messages: Text = OWN
+
+    def check(self) -> None:
+        if self.messages not in MESSAGES:
+            raise unknown("messages", self.messages, MESSAGES)
+
+    def check_with(self, point: "OperatingPoint") -> None:
+        holds = f"where content is {point.ask.content}"
+        if point.content.plan:
+            raise wrong("messages", self.messages, f"own {holds}")
+        if self.elsewhere and point.content.graph == TRUTH:
+            raise wrong("messages", SHUFFLED, f"own or blind {holds}")
+
+    def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
+        if not self.elsewhere:
+            return None
+        if not run.frozen:
+            return f"messages={SHUFFLED} is for frozen scenes; use harness eval"
+        if point.has_fusion_call and run.device_profile:
+            return (
+                "energy is known of messages of the ego's own layout alone; leave "
+                f"--device-profile out, or messages={SHUFFLED}"
+            )
+        return None
+
+    @property
+    def question(self) -> Question:
+        return self.questions[0] if self.messages == BLIND else PLAIN
+
+    @property
+    def elsewhere(self) -> bool:
+        return self.messages == SHUFFLED
+
+    def sources(self, episodes: Ints, seeds: Ints) -> Ints:
+        """Return the decision that each hears, (n,):
+        the next layout's in which the same seed has one.
+        """
+        order = np.lexsort((episodes, seeds))
+        following = np.roll(order, -1)
+        starts = np.flatnonzero(np.diff(seeds[order], prepend=seeds[order[0]] - 1))
+        following[np.roll(starts, -1) - 1] = order[starts]  # the last of a seed hears its first
+        sources = np.empty_like(order)
+        sources[order] = following
+        return sources
