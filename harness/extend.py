@@ -2,17 +2,19 @@
 A name that goes warns for a release first: docs/extend.md.
 """
 
+from typing import Any
+
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
 from harness.cli.show import finish as finish_study
-from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
 from harness.coordination.intents import Intents
 from harness.coordination.parts import Kept, Part, RunFacts
 from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
+from harness.core.extensions import from_python
 from harness.core.figures import PERCENT, Unit
 from harness.core.plugins import Plugins
 from harness.evaluate.hooks import Hook
@@ -39,9 +41,17 @@ from harness.world.scenario import Draws as LayoutDraws
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import Building
 
+
+def __getattr__(name: str) -> Any:
+    """Return what extensions give to others, such as `Attack`."""
+    thing = from_python(name)
+    if thing is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return thing
+
+
 __all__ = [
     "PERCENT",
-    "Attack",
     "Backend",
     "Bools",
     "Broadcast",
@@ -85,7 +95,6 @@ __all__ = [
     "Spawn",
     "Study",
     "Table",
-    "Turn",
     "Unit",
     "UserError",
     "crossings",

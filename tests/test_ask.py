@@ -23,13 +23,13 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
+from harness.extensions.trust.study import run_bench
 from harness.prompts import versions
 from harness.runs.folder import read
 from harness.runs.settings import words
 from harness.studies import replayed_run
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
-from harness.studies.trust import run_bench
 
 # Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what
 # helpers intended before; and some hear other helpers, or blind ones.

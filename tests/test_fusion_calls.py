@@ -33,6 +33,7 @@ from harness.backends.base import Completion, Request
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.sent import SentIntents
 from harness.core.arrays import Ints
 from harness.core.errors import UserError
 from harness.core.files import digest
@@ -40,7 +41,6 @@ from harness.core.process import Stop
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
-from harness.evaluate.attackers import SentIntents
 from harness.evaluate.fusion import FusionAnswers, codes_of, heard_in
 from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.run import evaluate

@@ -7,13 +7,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from harness.coordination.attacks import Attack, Turn
 from harness.coordination.consensus import Fused, Messages
 from harness.coordination.coordinate import _by_rule
 from harness.coordination.intents import Intents
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
-from harness.evaluate.attackers import _acted
+from harness.extensions.trust.attackers import _acted
+from harness.extensions.trust.attacks import Attack, Turn
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import broadcast, delivered

@@ -15,7 +15,6 @@ import typer
 from packaged import register
 
 from harness.backends.base import Completion, Request
-from harness.coordination.attacks import ATTACKS, Attack, Turn
 from harness.coordination.consensus import Pool, linear_pool
 from harness.coordination.intents import Intents
 from harness.coordination.rules import RULES
@@ -25,6 +24,7 @@ from harness.core import parallel
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.strangers import strangers
+from harness.extensions.trust.attacks import ATTACKS, Attack, Turn
 
 ROOT = Path(__file__).parents[1]
 Typed = Callable[..., tuple[int, str, str]]

@@ -19,7 +19,6 @@ COMMANDS = {
     "report": "report",
     "study sweep": "sweep",
     "study contents": "contents",
-    "study trust": "trust",
     "study schedule compare": "schedule:compare",
     "study schedule learn": "schedule:learn",
     "run ls": "runs:ls",
@@ -53,7 +52,7 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "study": "Vary settings: sweeps, contents, attacks, schedules.",
+    "study": "Vary settings: sweeps, contents, schedules.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; check, merge or export them.",
     "model": "List and download models; list on-board computers.",
@@ -74,7 +73,6 @@ PANELS = {
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.
 OLD = {
     "sweep": "study sweep",
-    "trust": "study trust",
     "schedule": "study schedule",
     "ls": "run ls",
     "merge": "run merge",

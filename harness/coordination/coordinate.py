@@ -16,7 +16,6 @@ from harness.coordination.consensus import Fused, Messages, capped, inverse_dist
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import (
     Bools,
@@ -115,9 +114,8 @@ def fuse(
         if fusion.call is None:
             raise ValueError(f"operating point {point.name} needs a fusion call")
         fused, seconds = fusion.call(heard.on_time)
-        if "majority" in point.guard.defences:
-            voices = np.insert(heard.on_time, 0, True, axis=-1)
-            fused = outvoted(fused, p, voices, np.sum(voices, axis=-1) // 2 + 1)
+        for part in point.more:
+            fused = part.after_call(fused, p, heard.on_time)
         failed = heard_any & np.any(np.isnan(fused), axis=-1)
         latency_s = latency_s + np.where(heard_any, seconds, 0.0)
         fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)

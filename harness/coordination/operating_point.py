@@ -11,8 +11,7 @@ from typing import Any, Literal, NamedTuple, get_type_hints
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
-from harness.coordination.attacks import ATTACKS, Absent, attacks_of, in_question
-from harness.coordination.contents import CONTENTS, INTENT, OBJECTS, PLAN, Content
+from harness.coordination.contents import CONTENTS, INTENT, PLAN, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
@@ -20,9 +19,10 @@ from harness.coordination.parts import (
     PLAIN,
     RELAY,
     Ask,
+    Change,
+    Changes,
     Cloud,
     Fusion,
-    Guard,
     Kept,
     Part,
     Question,
@@ -34,6 +34,7 @@ from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
+from harness.coordination.sent import Honest, Speaker
 from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import OfExtension, part_of, setting_of_extension
@@ -56,7 +57,6 @@ PARTS: dict[str, type[Part]] = {
     "radio": Radio,
     "ask": Ask,
     "fusion": Fusion,
-    "guard": Guard,
     "cloud": Cloud,
 }
 RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
@@ -95,6 +95,16 @@ def settings_alone() -> Collection[str]:
     return {*core, *chain(*of_extensions)}
 
 
+def change_of(text: str) -> Change:
+    """Return what is done to a message, by a text of its key.
+    Raises UserError for one that no part does.
+    """
+    for kind in more_parts().values():
+        if change := kind.change(text):
+            return change
+    raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
+
+
 @cache
 def questions() -> Mapping[str, Question]:
     """Return what helpers may be asked, by name; the plain question has an empty one."""
@@ -102,13 +112,20 @@ def questions() -> Mapping[str, Question]:
     return {"": PLAIN, **{question.name: question for question in others}}
 
 
+def question_under(settings: Mapping[str, Any]) -> Question:
+    """Return what helpers are asked under a recorded condition, whatever else it names."""
+    for kind in more_parts().values():
+        own = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
+        if kind.questions and own:
+            return kind(**own).question
+    return PLAIN
+
+
 class Rewrites(NamedTuple):
     """How a fusion call shows messages."""
 
     question: str = ""  # the name of what helpers are asked; empty for the plain question
-    # the attack that changes attackers' messages (`attacks.in_question`); empty for none
-    attack: str = ""
-    defences: tuple[str, ...] = ()  # the defences that change every message
+    changes: Changes = Changes()  # what is done to messages
     graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
     # what the prompt shows of messages: all of each, its words alone, or nothing
     shows: Literal["message", "words", ""] = "message"
@@ -126,7 +143,6 @@ class OperatingPoint:
     radio: Radio = Radio()  # noqa: RUF009 (parts are frozen)
     ask: Ask = Ask()  # noqa: RUF009
     fusion: Fusion = Fusion()  # noqa: RUF009
-    guard: Guard = Guard()  # noqa: RUF009
     cloud: Cloud = Cloud()  # noqa: RUF009
     # those of extensions that do something, in the order of `more_parts`
     more: tuple[Part, ...] = ()
@@ -152,8 +168,6 @@ class OperatingPoint:
     def _check_together(self) -> None:
         holds = f"content is {self.ask.content}"
         self._check_plans(holds)
-        if self.guard.attack and self.radio.profile is None:
-            raise wrong("attack", self.guard.attack, "left out where there is no channel")
         if self.cloud.round_trip and self.has_fusion_call:
             allowed = f"left out where {self.asks_twice}, which asks twice"
             raise wrong("round_trip", self.cloud.round_trip, allowed)
@@ -165,30 +179,7 @@ class OperatingPoint:
                 FUSION,
                 f"none or relay where {holds}: a unit sends a policy and nothing else",
             )
-        attacks = attacks_of(self.guard.attack)
-        if any(attack.in_objects for attack in attacks) and self.content.graph != OBJECTS:
-            raise wrong(
-                "attack", self.guard.attack, "one on intents where content lists no objects"
-            )
-        kind = "in_words" if self.content.words else "in_objects"
-        apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
-        if not (self.content.intent or self.content.plan or apt):
-            able = ", ".join(name for name in ATTACKS if getattr(ATTACKS[name], kind))
-            allowed = f"some of {able} and absent where {holds}, which holds no intents"
-            raise wrong("attack", self.guard.attack, allowed)
-        if self.content.graph and len({attack.share for attack in attacks}) > 1:
-            allowed = f"attacks of one share where {holds}, as the same vehicles do all"
-            raise wrong("attack", self.guard.attack, allowed)
-        if self.content.words and self.guard.defence not in ("", "quoted"):
-            raise wrong("defence", self.guard.defence, f"quoted or left out where {holds}")
-        if self.has_fusion_call and not all(attack.by_scene for attack in attacks):
-            allowed = "one that needs no past and adds no voices where the ego is asked twice"
-            raise wrong("attack", self.guard.attack, allowed)
         if self.fusion.consensus != EGO_PROMPT:
-            if self.guard.defence:
-                raise wrong(
-                    "defence", self.guard.defence, f"left out where consensus is not {EGO_PROMPT}"
-                )
             return
         where = f"where consensus is {EGO_PROMPT}"
         if not (self.content.asks_helpers or self.content.plan):
@@ -223,13 +214,6 @@ class OperatingPoint:
             raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
         if self.radio.edge == FUSION:
             raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
-        if any(attack.in_words for attack in attacks_of(self.guard.attack)):
-            raise wrong(
-                "attack", self.guard.attack, f"one on intents where {holds}, which has no words"
-            )
-        if self.guard.defence:
-            allowed = f"left out where {holds}, which is no advice and has no words"
-            raise wrong("defence", self.guard.defence, allowed)
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
@@ -466,7 +450,7 @@ class OperatingPoint:
         if self.radio.profile is None:
             return frozenset()
         rule = RULES.get(self.fusion.consensus)
-        parts = (SCHEDULES[self.ask.schedule], rule, *attacks_of(self.guard.attack))
+        parts = (SCHEDULES[self.ask.schedule], rule, *self.more)
         return frozenset(need for part in parts for need in getattr(part, "needs", ()))
 
     @property
@@ -508,13 +492,24 @@ class OperatingPoint:
     @property
     def rewrites(self) -> "Rewrites":
         """How its fusion calls show messages."""
-        defences = tuple(part for part in self.guard.defences if part != "majority")
         whole: Literal["message", ""] = "message" if self.fusion.consensus == EGO_PROMPT else ""
         shows: Literal["message", "words", ""] = "words" if self.content.words else whole
         graph = self.content.graph
-        attack = in_question(self.guard.attack, bool(shows), bool(graph))
         elsewhere = self.elsewhere is not None
-        return Rewrites(self.question.name, attack, defences, graph, shows, elsewhere)
+        return Rewrites(self.question.name, self._changes(shows, graph), graph, shows, elsewhere)
+
+    def _changes(self, shows: str, graph: str) -> Changes:
+        """Return what parts change of messages whose words or objects a fusion call shows."""
+        each = [part.changes(bool(shows), bool(graph)) for part in self.more]
+        of_attackers = "&".join(filter(None, (changes.of_attackers for changes in each)))
+        return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
+
+    def speaker(self) -> Speaker:
+        """Return what says to the channel what vehicles intend, in one walk."""
+        for part in self.more:
+            if speaker := part.speaker():
+                return speaker
+        return Honest()
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))

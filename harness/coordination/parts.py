@@ -1,5 +1,4 @@
-"""Define the parts of an operating point:
-radio, whom the ego asks, fusion, what guards it, a cloud.
+"""Define the parts of an operating point: radio, whom the ego asks, fusion, a cloud.
 
 Each part checks itself and raises ValueError with the setting, its value and what it must be.
 """
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
-from harness.coordination.attacks import attacks_of
 from harness.coordination.contents import CONTENTS, INTENT
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES, names
@@ -26,11 +24,11 @@ from harness.radio.profiles import CHANNELS
 if TYPE_CHECKING:
     from harness.coordination.intents import Intents
     from harness.coordination.operating_point import OperatingPoint
-    from harness.core.arrays import Ints
+    from harness.coordination.sent import Speaker
+    from harness.core.arrays import Bools, Floats, Ints
     from harness.world.scene_graph import SceneGraph
 
 FALLBACKS = ("uniform", "brake")
-DEFENCES = ("quoted", "schema", "majority")
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
@@ -64,6 +62,27 @@ class Question:
 
 
 PLAIN = Question()
+
+
+class Change(Protocol):
+    """What is done to the message that a voice sends."""
+
+    @property
+    def adds(self) -> bool:
+        """Whether it adds what no other change is to touch, and so comes last."""
+
+    def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        """Return a message as a prompt shows it, with its `intent`."""
+
+    def graph(self, graph: "SceneGraph", scenario: Any, scene: Any) -> "SceneGraph":
+        """Return the graph that a message is made of, which its sender sees in a scene."""
+
+
+class Changes(NamedTuple):
+    """What a part changes of messages, by what their keys then hold; text without `+` and `&`."""
+
+    of_attackers: str = ""  # of those of attackers, several joined by `&`
+    of_all: tuple[str, ...] = ()
 
 
 class RunFacts(Protocol):
@@ -106,6 +125,8 @@ class Part(Struct, frozen=True, kw_only=True):
     questions: ClassVar[tuple[Question, ...]] = ()  # what helpers may be asked by it
     # what the ego hears under a control, by its setting, such as `messages=blind`
     controls: ClassVar[Mapping[str, str]] = {}
+    # of its settings that are words, the values that a sweep takes if none are given, with commas
+    usual: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -134,6 +155,16 @@ class Part(Struct, frozen=True, kw_only=True):
         return {}
 
     @property
+    def needs(self) -> Collection[str]:
+        """What it needs of the world: `claims`, `in_time`, `lot` or `outlook`."""
+        return ()
+
+    @property
+    def needs_all(self) -> bool:
+        """Whether it needs what every helper intends that is present, whoever is heard."""
+        return False
+
+    @property
     def question(self) -> Question:
         """What helpers are asked."""
         return PLAIN
@@ -142,6 +173,23 @@ class Part(Struct, frozen=True, kw_only=True):
     def elsewhere(self) -> bool:
         """Whether messages come from other scenes."""
         return False
+
+    def speaker(self) -> "Speaker | None":
+        """Return what says to the channel what vehicles intend, in one walk; None if they do."""
+
+    def changes(self, words: bool, objects: bool) -> Changes:
+        """Return what it changes of the `words` and the `objects` that a fusion call shows."""
+        return Changes()
+
+    @classmethod
+    def change(cls, text: str) -> Change | None:
+        """Return what is done to a message by a text of `changes`; None if it is no such text."""
+
+    def after_call(self, fused: "Floats", intents: "Floats", heard: "Bools") -> "Floats":
+        """Return the policies (..., A) that a fusion call answered, by the intents (..., 1+H, A)
+        of the ego and its helpers, of whom some were heard in time, (..., H).
+        """
+        return fused
 
     def sources(self, episodes: "Ints", seeds: "Ints") -> "Ints":
         """Return the decision whose helpers each decision hears, (n,), by these places; its own.
@@ -283,28 +331,6 @@ class Fusion(Part, frozen=True, kw_only=True):
             raise unknown("fallback", self.fallback, FALLBACKS)
         if self.consensus not in RULES and self.consensus != EGO_PROMPT:
             raise unknown("consensus", self.consensus, names())
-
-
-class Guard(Part, frozen=True, kw_only=True):
-    """What some helpers do instead of saying what they intend, and what guards a fusion call."""
-
-    # such as `liar:share=1/3+spoof` (`harness.coordination.attacks`); empty for none
-    attack: Text = ""
-    # Some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string; `schema` removes free
-    # text from messages; `majority` lets an action on which most voices agree win against the
-    # call's.
-    defence: Text = ""
-
-    def check(self) -> None:
-        attacks_of(self.attack)
-        for part in filter(None, self.defence.split("+")):
-            if part not in DEFENCES:
-                raise unknown("defence", part, DEFENCES)
-
-    @property
-    def defences(self) -> tuple[str, ...]:
-        """The defences, in the order of `DEFENCES`."""
-        return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
 
 class Cloud(Part, frozen=True, kw_only=True):

@@ -11,6 +11,5 @@ STUDIES = {
     "sweep": "sweep",
     "contents": "contents",
     "repeats": "repeats",
-    "trust": "trust",
     "schedule": "schedule",
 }

@@ -153,9 +153,9 @@ class Plugins(Mapping[str, T], Generic[T]):
         try:
             with _waiting(what, entry), aside(what):
                 plugin: T = entry.load()
-                # A class has the methods of its instances, so it would pass the check of the
-                # protocol.
-                fits = not isinstance(plugin, type) and isinstance(plugin, self.kind)
+                # A class has the methods of its instances, and would pass the check of a protocol.
+                is_class = isinstance(plugin, type) and self.kind is not object
+                fits = isinstance(plugin, self.kind) and not is_class
         except UserError:
             raise
         except Exception as error:  # whatever a package's import raises

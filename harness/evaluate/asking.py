@@ -620,7 +620,7 @@ def _heard_sets(
     """Yield the scene of each set of messages and the keys of its senders."""
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():
-        at, heard, attacking = heard_in(code, helpers, bool(rewrites.attack))
+        at, heard, attacking = heard_in(code, helpers, bool(rewrites.changes.of_attackers))
         at, source = divmod(at, len(scenes)) if rewrites.elsewhere else (at, at)
         name, viewers = scenes[source].id if rewrites.elsewhere else "", scenes[source].viewers
         yield scenes[at], [key_of(viewers[1 + h], rewrites, h in attacking, name) for h in heard]

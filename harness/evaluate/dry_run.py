@@ -99,9 +99,10 @@ def _fusion_calls(spec: Spec, scene: Scene) -> Iterator[str]:
             )
     helpers = scene.viewers[1:]
     for rewrites, others in most.items():
+        attacking = (False, True) if rewrites.changes.of_attackers else (False,)
         for n in range(1, min(others, len(helpers)) + 1):
             for heard in combinations(helpers, n):
-                for attacks in product((False, True) if rewrites.attack else (False,), repeat=n):
+                for attacks in product(attacking, repeat=n):
                     those = list(zip(heard, attacks, strict=True))
                     for source in sources[rewrites]:
                         yield fusion_id(

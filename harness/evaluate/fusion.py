@@ -6,7 +6,6 @@ says depends on the rounds before, so it stands in its sender's key, and equal p
 question.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.attacks import Turn, attacks_of
 from harness.coordination.contents import OBJECTS, PLAN, TEXT, TRUTH
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import Rewrites
+from harness.coordination.operating_point import Rewrites, change_of
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.evaluate.repair import as_text
@@ -26,6 +24,7 @@ from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
 FROM = "from:"  # in a key, before the id of the other scene that a message comes from
 WORDS = "words"  # in a key, after what the graph is extended by: the prompt shows the messages, too
+HOLDS = frozenset((WORDS, TEXT, OBJECTS, TRUTH))  # what a message holds, in its key
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,8 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
     where the ego's graph has its objects, or `v2!objects&from:00012-3` where it comes from another
     scene, the `source`.
     """
-    changed = [*([rewrites.attack] if attacks and rewrites.attack else []), *rewrites.defences]
+    of_attackers, of_all = rewrites.changes
+    changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]
     if rewrites.graph:
         changed += [rewrites.graph, *([WORDS] if rewrites.shows else [])]
     elif rewrites.shows == "words":
@@ -168,42 +168,17 @@ def messages_of(
             messages.append(plan)
             continue
         key, changes = sender.partition(REWRITTEN)[0], changes_of(sender)
-        holds = {WORDS, TEXT, OBJECTS, TRUTH}.intersection(changes)
+        holds = HOLDS.intersection(changes)
         if holds and holds.isdisjoint((WORDS, TEXT)):
             continue  # its objects are in the graph
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
             for change in changes:
-                message = message if change in holds else _rewritten(message, change, actions)
+                if change not in holds:
+                    message = change_of(change).message(message, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
             if TEXT in holds:
                 message = {"evidence": " ".join(message["evidence"].split())}
             messages.append({"sender": key.partition(ASKED)[0], **message})
     return messages
-
-
-def _rewritten(message: dict[str, Any], change: str, actions: Sequence[str]) -> dict[str, Any]:
-    """Return a message as an attack or a defence leaves it."""
-    if change == "schema":
-        return {**message, "evidence": ""}
-    if change == "quoted":
-        return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}
-    [attack] = attacks_of(change)
-    if attack.in_objects:
-        return message
-    p = np.array([[message["intent"]]])
-    one_helper = Intents(
-        np.full((1, p.shape[-1]), np.nan),
-        p,
-        np.ones((1, 1), dtype=bool),
-        np.zeros((1, 2)),
-        np.zeros((1, 1)),
-        np.zeros((1, 1)),
-        np.zeros((1, 2)),
-    )
-    turn = Turn(
-        one_helper, np.ones((1, 1), dtype=bool), p, np.empty((1, 0, *p.shape[1:])), np.zeros((1, 1))
-    )
-    intent = attack.act(one_helper, turn).helpers[0, 0].tolist()
-    return {**attack.rewritten(message, actions), "intent": intent}

@@ -17,8 +17,8 @@ from harness.coordination.coordinate import Coordination
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.sent import SentIntents
 from harness.core.arrays import any_of, count_of
-from harness.evaluate.attackers import SentIntents
 from harness.radio.channel import Draws
 
 

@@ -5,17 +5,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec import structs
 
-from harness.coordination.attacks import ATTACKS, attacks_of
 from harness.coordination.contents import OBJECTS, TRUTH
-from harness.coordination.operating_point import questions
+from harness.coordination.operating_point import change_of, questions
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene, by_seat
-from harness.evaluate.fusion import changes_of, source_of
+from harness.evaluate.fusion import HOLDS, changes_of, source_of
 from harness.runs.records import ASKED, REWRITTEN, Answer
 from harness.world.perception.graph import truth_graphs
-from harness.world.perception.shared import Heard, invented, merged
+from harness.world.perception.shared import Heard, merged
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
@@ -71,9 +70,9 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
     sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
     graph = questions()[question].shown(scene.graphs[sender])
-    named = [name for name in changes_of(key) if name.partition(":")[0] in ATTACKS]
-    for attack in attacks_of("+".join(named)):
-        graph = attack.listed(graph, invented(scenario, scene.state, graph.viewer))
+    changes = [change_of(change) for change in changes_of(key) if change not in HOLDS]
+    for change in sorted(changes, key=lambda change: change.adds):
+        graph = change.graph(graph, scenario, scene)
     return graph
 
 

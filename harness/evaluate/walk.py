@@ -21,11 +21,11 @@ from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrit
 from harness.coordination.parts import PLAIN, Question
 from harness.coordination.plans import NO_PLANS, Plans
 from harness.coordination.scheduling import Outlook
+from harness.coordination.sent import SentIntents
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
-from harness.evaluate.attackers import Attackers, SentIntents
 from harness.evaluate.claims import claims
 from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
@@ -216,7 +216,7 @@ def _steps(
     ties: str,
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
     memories = {point: Memory() for point in points}
-    attackers = {point: Attackers(point) for point in points}
+    speakers = {point: point.speaker() for point in points}
     physical = {point for point in points if point.physical}
     while decision_points := world.observe():
         intents = ask(decision_points)
@@ -235,10 +235,8 @@ def _steps(
         others = _others(ask, decision_points, due)
         answers = _asked(ask, decision_points, due, {PLAIN: intents, **others})
         broadcasts = {
-            point: attackers[point].said(
-                heard(point, answers, each),
-                each.draws,
-                each.episodes if point.guard.attack else (),
+            point: speakers[point].said(
+                heard(point, answers, each), each.draws, each.episode, each.seed
             )
             for point, each in due.items()
         }
@@ -462,4 +460,4 @@ def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
 
 def shown(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
     """Return who attacks, (n, H), if the text of a fusion call depends on it; else None."""
-    return broadcast.attackers if point.rewrites.attack else None
+    return broadcast.attackers if point.rewrites.changes.of_attackers else None

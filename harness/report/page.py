@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.operating_point import question_under
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, replacing
 from harness.core.memory import uncollected
@@ -206,7 +206,7 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
                 "points": {
                     c["name"]: {
                         **{key: c.get(key) for key in ("window_s", "consensus", "content")},
-                        "question": OperatingPoint.from_dict(c).question.name,
+                        "question": question_under(c).name,
                     }
                     for c in run.manifest.conditions
                 },

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.attacks import ATTACKS
 from harness.coordination.contents import CONTENTS, OF_HELPERS
 from harness.coordination.operating_point import (
     POINTS,
@@ -28,31 +27,7 @@ from harness.radio.profiles import CHANNELS
 MOST_POINTS = 1000
 CORE = "core"  # the panel that compares operating points
 CROSS = " × "  # between axes that are crossed
-NONE = "none"  # of attacks, and what else may be left out
-# The usual attacks: each alone, and a false place and several voices with a lie; at a point those
-# it allows.
-USUAL_ATTACKS = (
-    "liar",
-    "liar+spoof",
-    "liar:says=permuted",
-    "brake",
-    "brake+spoof",
-    "random",
-    "stuck",
-    "stale",
-    "replay",
-    "silent",
-    "overconfident",
-    "sybil",
-    "liar+sybil",
-    "flood",
-    "spoof",
-    "jump",
-    "liar+jump",
-    "ghost",
-    "hide",
-    "shift",
-)
+NONE = "none"  # of what may be left out
 
 Value = float | str
 
@@ -80,7 +55,7 @@ class Axis:
             )
         setting: object
         if isinstance(value, str):
-            left_out = value == NONE and self.field in ("attack", *_named())
+            left_out = value == NONE and self.field in _named()
             setting = "" if left_out else setting_of(self.field, value)
         else:
             setting = scaled = value * self.scale
@@ -106,7 +81,6 @@ AXES = {
         Axis(
             "content", "content of a message", "content", 1.0, ",".join(OF_ANY_MODEL), worded=True
         ),
-        Axis("attack", "attack", "attack", 1.0, ",".join((NONE, *USUAL_ATTACKS)), worded=True),
     )
 }
 
@@ -118,7 +92,9 @@ def axis_of(name: str) -> Axis:
     usual = {name: POINTS["6g"].setting(name)} if name in typed_settings() else _usual()
     if name not in usual:
         raise unknown("--over", name, {*AXES, *usual})
-    return Axis(name, name.replace("_", " "), name, 1.0, "", isinstance(usual[name], str | bool))
+    values = "".join(kind.usual.get(name, "") for kind in more_parts().values())
+    worded = isinstance(usual[name], str | bool)
+    return Axis(name, name.replace("_", " "), name, 1.0, values, worded)
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
@@ -137,7 +113,6 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
         known = {
             "consensus": names(),
             "schedule": SCHEDULES,
-            "attack": (NONE, *ATTACKS),
             **{setting: (NONE, *there()) for setting, there in _named().items()},
         }.get(axis.name)
         for name in (part for text in parts for part in text.split("+")):

@@ -154,10 +154,9 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
             "that the oracle would be none; give linear, or another without memory"
         )
     changed = {
-        "attack": point.guard.attack != "",
         "content": point.ask.content != INTENT,
         **{
-            part.__struct_fields__[0]: part.question != PLAIN or part.elsewhere
+            part.__struct_fields__[0]: part.needs_all or part.question != PLAIN or part.elsewhere
             for part in point.more
         },
     }

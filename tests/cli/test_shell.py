@@ -15,8 +15,8 @@ from typer.main import get_command
 from harness.cli import app
 from harness.cli.commands import commands, groups, panels, short, spellings
 from harness.cli.shell import UNREAD, plain
-from harness.coordination.attacks import ATTACKS
 from harness.coordination.rules import RULES, reads_plans
+from harness.extensions.trust.attacks import ATTACKS
 
 Said = tuple[int, str, str]
 VALUES = ("", "x", "7", "007", "-7", "7.5", "٣", "9" * 30, "/", "/nowhere", None)

@@ -29,7 +29,6 @@ from harness.backends.card import Card
 from harness.backends.openai import shapes
 from harness.backends.openai.faults import fault_in
 from harness.backends.registry import BUILT_IN, missing, open_backend
-from harness.coordination.attacks import ATTACKS
 from harness.coordination.contents import CONTENTS, INTENT
 from harness.coordination.operating_point import POINTS, named_point
 from harness.coordination.rules import RULES, reads_plans
@@ -38,6 +37,7 @@ from harness.core import versions
 from harness.core.files import sha256_bytes
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
+from harness.extensions.trust.attacks import ATTACKS
 from harness.parsing.parse import parse
 from harness.runs import folder
 

@@ -16,8 +16,8 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
+from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
-from harness.evaluate.attackers import SentIntents
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.rounds import further_rounds
 from harness.radio.channel import Draws

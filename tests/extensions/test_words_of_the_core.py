@@ -37,6 +37,7 @@ ORDINARY = {
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
     "tells": "a verb",
+    "trust": "how far a rule, or a loader of weights, trusts what it is given",
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",
 }
@@ -55,6 +56,7 @@ LEADS_ON = {
     ("report/compare/pair.py", "study fidelity"),
     ("report/scripts/decision.js", "harness view"),
     ("report/scripts/decision.js", "run video"),
+    ("runs/settings.py", "study trust"),
 }
 # Old folders of a study had this file in place of its manifest, and are listed.
 OLD_FOLDERS = {("runs/listing.py", "fidelity")}

@@ -61,11 +61,11 @@ OF_SCENES = (
 def test_usual_words_are_those_that_a_point_allows(
     condition: str, name: str, usual: tuple[float | str, ...]
 ) -> None:
-    assert usual_at(AXES[name], named_point(condition)) == usual
+    assert usual_at(axis_of(name), named_point(condition)) == usual
 
 
 def test_of_intents_no_attack_on_objects_is_usual() -> None:
-    attacks = usual_at(AXES["attack"], POINTS["6g"])
+    attacks = usual_at(axis_of("attack"), POINTS["6g"])
     assert len(attacks) == 18
     assert not {"ghost", "hide", "shift"} & {*attacks}
 

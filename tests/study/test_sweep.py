@@ -32,7 +32,7 @@ def source(done: Evaluated) -> ReplayedRun:
 
 
 def study_of(source: ReplayedRun, out: Path, name: str, text: str | None = None) -> Study:
-    axis = AXES[name]
+    axis = axis_of(name)
     points = settings([source], [axis], [grid(axis, text)], ["6g"])
     return run_sweep([source], {name: points}, source.seeds, out, lambda n: None)
 
@@ -80,7 +80,7 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
 def test_every_axis_gives_its_panels(
     source: ReplayedRun, swept_axes: tuple[str, ...], tmp_path: Path
 ) -> None:
-    panels = {name: settings([source], [AXES[name]], [None], ["6g"]) for name in swept_axes}
+    panels = {name: settings([source], [axis_of(name)], [None], ["6g"]) for name in swept_axes}
     study = run_sweep([source], panels, source.seeds, tmp_path, lambda n: None)
     write_study(study, tmp_path)
     assert set(study.data["conditions"].panel) == set(swept_axes)
@@ -204,7 +204,7 @@ def test_what_cannot_be_is_one_line(
     source: ReplayedRun, axis: str, values: tuple[float, ...] | None, condition: str, said: str
 ) -> None:
     with pytest.raises(UserError, match=said):
-        settings([source], [AXES[axis]], [values], [condition])
+        settings([source], [axis_of(axis)], [values], [condition])
 
 
 @pytest.mark.parametrize(

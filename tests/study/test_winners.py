@@ -7,8 +7,8 @@ import pytest
 
 from harness.core.arrays import Floats
 from harness.core.figures import some_of
+from harness.extensions.trust.study import BASE, PEACE, Bench, Cell, headline
 from harness.runs.success import Success
-from harness.studies.trust import BASE, PEACE, Bench, Cell, headline
 
 EPISODES = 60
 PLAIN = Success(np.zeros(EPISODES, dtype=bool))

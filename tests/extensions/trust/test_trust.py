@@ -17,11 +17,8 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.claims import claims
 from harness.evaluate.lifecycle import Evaluated
-from harness.runs.folder import read
-from harness.studies import trust
-from harness.studies.replayed_run import ReplayedRun
-from harness.studies.study import write_study
-from harness.studies.trust import (
+from harness.extensions.trust import study as trust
+from harness.extensions.trust.study import (
     EXCLUDED,
     PEACE,
     Bench,
@@ -31,6 +28,9 @@ from harness.studies.trust import (
     shares_of,
     trust_study,
 )
+from harness.runs.folder import read
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.study import write_study
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
 ATTACKED = named_point("6g:attack=liar:share=1/3+spoof:share=1/3")

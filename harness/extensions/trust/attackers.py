@@ -7,34 +7,22 @@ and the ego attacks nobody.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from harness.coordination.attacks import Attack, Turn, attackers, attacks_of
 from harness.coordination.intents import OF_EGO, WITH_EGO, Intents
-from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.sent import SentIntents
 from harness.core import noise
-from harness.core.arrays import Bools, Floats, check_distributions, check_shape, read_only
+from harness.core.arrays import Bools, Floats, Ints, check_distributions, check_shape, read_only
 from harness.core.errors import UserError
 from harness.core.strangers import worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
+from harness.extensions.trust.attacks import Attack, Turn, attackers
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
-
-
-@dataclass(frozen=True)
-class SentIntents:
-    """What H voices say to the channel in decisions (n,)."""
-
-    intents: Intents  # the intents and claims of each voice
-    draws: Draws  # the channel's draws for each voice
-    attackers: Bools  # which voices are an attacker's, (n, H)
-
-    def take(self, at: Any) -> "SentIntents":
-        return SentIntents(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 
 class Attackers:
@@ -42,36 +30,32 @@ class Attackers:
     they remember what helpers intended in each episode and seed.
     """
 
-    def __init__(self, point: OperatingPoint) -> None:
-        self._attacks = attacks_of(point.guard.attack)
-        self._steps = max((attack.steps for attack in self._attacks), default=0)
+    def __init__(self, attacks: Sequence[Attack]) -> None:
+        self._attacks = attacks
+        self._steps = max((attack.steps for attack in attacks), default=0)
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
-    def said(
-        self, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]
-    ) -> SentIntents:
-        """Return what is said in decisions (n,), given what the vehicles intend.
+    def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
+        """Return what is said, as `Speaker` says.
 
-        `truth` is what every vehicle intends, of H helpers; `episodes` has the number and seed of
-        each decision's episode. Raises UserError if the world has no layouts to draw attackers for.
+        Raises UserError if the world has no layouts to draw attackers for.
         """
-        none_attack = np.zeros(truth.valid.shape, dtype=bool)
-        if not self._attacks:
-            return SentIntents(truth, draws, none_attack)
+        episodes = list(zip(episode.tolist(), seed.tolist(), strict=True))
         if draws.trips is None:
             raise UserError(
                 "attacks need layouts, and the paper's study has none; leave attack out"
             )
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         first, past = self._remembered(truth, episodes)
-        present, said, attacking = np.isfinite(truth.range_m), truth, none_attack
+        present, said = np.isfinite(truth.range_m), truth
+        attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
             drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
             turn = Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
             said = _acted(attack, said, turn)
             attacking |= drawn
-        for intents, episode in zip(truth.helpers, episodes, strict=True):
-            intended = self._intended.setdefault(episode, [])
+        for intents, place in zip(truth.helpers, episodes, strict=True):
+            intended = self._intended.setdefault(place, [])
             intended.append(intents)
             # keep the first step and those that an attack looks at
             del intended[1 : -self._steps or None]

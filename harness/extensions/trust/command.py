@@ -71,11 +71,11 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
-    from harness.coordination.attacks import ATTACKS
     from harness.coordination.rules import RULES, reads_plans
     from harness.evaluate.run import read_or_evaluate
+    from harness.extensions.trust.attacks import ATTACKS
+    from harness.extensions.trust.study import names_of, run_bench, shares_of, trust_study
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.trust import names_of, run_bench, shares_of, trust_study
 
     attack_names = names_of("--attacks", attacks, tuple(ATTACKS))
     rule_names, shares = (

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,14 +12,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from swarm_extras import MUMBLE
 
-from harness.coordination.attacks import ATTACKS, INSTRUCTIONS, Attack, Turn, attackers, attacks_of
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, Rewrites, named_point
+from harness.coordination.parts import Changes
+from harness.coordination.sent import SentIntents, Speaker
 from harness.core.errors import UserError
-from harness.evaluate.attackers import Attackers
 from harness.evaluate.fusion import key_of, messages_of
+from harness.extensions.trust.attacks import (
+    ATTACKS,
+    INSTRUCTIONS,
+    Attack,
+    Turn,
+    attackers,
+    attacks_of,
+)
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 from harness.runs.records import Answer
@@ -61,6 +70,14 @@ def said(text: str, truth: Intents = TRUTH, **turn: Any) -> Intents:
     for attack in attacks_of(text):
         truth = attack.act(truth, Turn(**{**usual, **turn}))
     return truth
+
+
+def told_by(
+    speaker: Speaker, truth: Intents, draws: Draws, episodes: Sequence[tuple[int, int]]
+) -> SentIntents:
+    """What is said in the decisions of these episodes, by number and seed."""
+    number, seed = np.array(episodes).T
+    return speaker.said(truth, draws, number, seed)
 
 
 def test_a_liar_is_sure_of_what_it_finds_least_likely():
@@ -189,25 +206,32 @@ def test_who_attacks_is_drawn_for_a_seed_and_a_layout_and_stays():
     """
     seeds = list(range(300))
     point = named_point("6g:attack=liar:share=1/3")
-    first = Attackers(point).said(many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds])
-    later = Attackers(point).said(many(TRUTH, 300), drawn(seeds, step=4), [(0, s) for s in seeds])
+    first = told_by(point.speaker(), many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds])
+    later = told_by(
+        point.speaker(), many(TRUTH, 300), drawn(seeds, step=4), [(0, s) for s in seeds]
+    )
     assert (first.attackers.sum(axis=1) == 1).all()
     assert (first.attackers == later.attackers).all()
     assert (abs(first.attackers.sum(axis=0) - 100) < 35).all()
-    alone = Attackers(point).said(many(TRUTH, 1), drawn([217]), [(0, 217)])
+    alone = told_by(point.speaker(), many(TRUTH, 1), drawn([217]), [(0, 217)])
     assert (alone.attackers[0] == first.attackers[217]).all()
-    other = Attackers(point.changed(attack="brake")).said(
-        many(TRUTH, 300), drawn(seeds), [(0, s) for s in seeds]
+    other = told_by(
+        (point.changed(attack="brake")).speaker(),
+        many(TRUTH, 300),
+        drawn(seeds),
+        [(0, s) for s in seeds],
     )
     assert (other.attackers == first.attackers).all()
 
 
 def test_an_episode_remembers_its_own_past_and_no_other():
     point = named_point("6g:attack=stale:share=1")
-    both = Attackers(point)
-    both.said(TRUTH, drawn([0]), [(0, 0)])
-    both.said(intents([BOLD, BOLD, BOLD]), drawn([1]), [(0, 1)])
-    now = both.said(many(intents([KEEP, KEEP, KEEP]), 2), drawn([0, 1], step=1), [(0, 0), (0, 1)])
+    both = point.speaker()
+    told_by(both, TRUTH, drawn([0]), [(0, 0)])
+    told_by(both, intents([BOLD, BOLD, BOLD]), drawn([1]), [(0, 1)])
+    now = told_by(
+        both, many(intents([KEEP, KEEP, KEEP]), 2), drawn([0, 1], step=1), [(0, 0), (0, 1)]
+    )
     assert now.intents.helpers.tolist() == [[CAREFUL, KEEP, BOLD], [BOLD, BOLD, BOLD]]
 
 
@@ -228,7 +252,7 @@ def test_every_attack_leaves_distributions_and_the_honest_alone(name: str):
     rng = np.random.default_rng(3)
     p = rng.dirichlet(np.ones(3), (40, 3))
     truth = replace(many(TRUTH, 40), helpers=p)
-    told = Attackers(under(name)).said(truth, drawn(range(40)), [(n, n) for n in range(40)])
+    told = told_by(under(name).speaker(), truth, drawn(range(40)), [(n, n) for n in range(40)])
     assert told.intents.helpers.sum(axis=-1) == pytest.approx(1.0)
     honest = ~told.attackers[:, :3]
     assert (told.intents.helpers[:, :3][honest] == p[honest]).all()
@@ -265,15 +289,18 @@ def test_a_packages_attack_says_what_an_attacker_can_or_is_one_line(
     monkeypatch.setitem(ATTACKS._loaded, "bent", Bent())
     monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
     with pytest.raises(UserError, match=re.escape(f"attack Bent fails (ValueError: {says}")):
-        Attackers(under(f"bent:way={way}")).said(
-            many(TRUTH, 9), drawn(range(9)), [(n, n) for n in range(9)]
+        told_by(
+            (under(f"bent:way={way}")).speaker(),
+            many(TRUTH, 9),
+            drawn(range(9)),
+            [(n, n) for n in range(9)],
         )
 
 
 @pytest.mark.usefixtures("plugin")
 @pytest.mark.parametrize("name", [*ATTACKS, "mumble"])
 def test_an_attack_of_nobody_changes_nothing(name: str):
-    told = Attackers(under(f"{name}:share=0")).said(TRUTH, drawn([0]), [(0, 0)])
+    told = told_by((under(f"{name}:share=0")).speaker(), TRUTH, drawn([0]), [(0, 0)])
     assert not told.attackers.any()
     for field, array in TRUTH.arrays().items():
         assert np.array_equal(getattr(told.intents, field), array), field
@@ -347,7 +374,7 @@ def test_an_injection_is_text_and_the_intent_stays_true():
 
 @pytest.mark.parametrize("language", INSTRUCTIONS)
 def test_no_injection_brings_a_token_of_a_chat_template(language: str):
-    told = shown(Rewrites(attack=f"injection:language={language}"), True)["evidence"]
+    told = shown(Rewrites(changes=Changes(f"injection:language={language}")), True)["evidence"]
     assert "<|" not in told
     assert "FASTER" in told
 

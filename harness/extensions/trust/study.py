@@ -32,7 +32,7 @@ from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
 from harness.runs.metrics import SUCCESS, mean_by_place, over_episodes
 from harness.runs.success import Success
-from harness.studies.axes import AXES, NONE, Setting, usual_at
+from harness.studies.axes import NONE, Setting, axis_of, usual_at
 from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Cells, Study, corrected, ends, refuse_other
@@ -289,14 +289,14 @@ def run_bench(
     point = point_of([run], condition)
     if why := point.idle("attack"):
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
-    if point.guard.attack or EGO_PROMPT in rules:
+    if point.setting("attack") or EGO_PROMPT in rules:
         asked_again = f"{condition}{',' if ':' in condition else ':'}consensus={EGO_PROMPT}"
         raise UserError(
             "harness study trust: give a condition without attack, and rules that are arithmetic; "
             f"a fusion call is attacked by `harness eval --condition {printable(asked_again)} "
             "--attack injection`"
         )
-    attacks = attacks or [str(name) for name in usual_at(AXES["attack"], point) if name != NONE]
+    attacks = attacks or [str(name) for name in usual_at(axis_of("attack"), point) if name != NONE]
     if not attacks:
         raise UserError(
             f"--condition {printable(condition)}: it allows none of the usual attacks; give another"
