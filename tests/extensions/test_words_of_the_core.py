@@ -1,5 +1,6 @@
 """The core's texts: no code, docstring, comment or page of it names what an extension has."""
 
+import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD
-from harness.core.extensions import Extension, extensions
+from harness.coordination.operating_point import more_parts
+from harness.core.extensions import Extension, control_settings, extensions
+from harness.extensions.trust.part import DEFENCES
 
 HARNESS = Path(__file__).parents[2] / "harness"
 WORD = re.compile(r"[a-z]+(?:-[a-z]+)*")
@@ -126,3 +129,50 @@ def test_the_core_names_nothing_of_an_extension() -> None:
     assert not {(path, name) for path, name in others if name not in ORDINARY}
     assert there >= LEADS_ON | OLD_FOLDERS
     assert {name for _, name in there} >= set(ORDINARY), "a word that is no exception any more"
+
+
+# What plays a decision, and the words that it has for other things.
+LOOP = (
+    "coordination/coordinate.py",
+    "coordination/exchange.py",
+    "coordination/operating_point.py",
+    "evaluate/asking.py",
+    "evaluate/spec.py",
+    "evaluate/walk.py",
+)
+OTHER_THINGS = {
+    ("coordination/coordinate.py", "messages"): "what a rule fuses",
+    ("coordination/exchange.py", "messages"): "how many were sent",
+    ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
+    ("evaluate/asking.py", "messages"): "what a model is sent",
+    ("evaluate/spec.py", "messages"): "what a prompt shows",
+    ("evaluate/spec.py", "attack"): "an option of a run, which its conditions take the place of",
+}
+
+
+def said_in(tree: ast.AST) -> Iterator[str]:
+    """Yield names, attributes, parameters, imports and words of strings, but for docstrings."""
+    bodies = [node.body for node in ast.walk(tree) if hasattr(node, "body")]
+    firsts = [body[0] for body in bodies if isinstance(body, list) and body]
+    docstrings = {id(first.value) for first in firsts if isinstance(first, ast.Expr)}
+    for node in ast.walk(tree):
+        value = node.value if isinstance(node, ast.Constant) else None
+        if isinstance(value, str) and id(node) not in docstrings:
+            yield from WORD.findall(value)
+        for field in ("id", "attr", "arg", "name", "module"):
+            yield from (getattr(node, field, None) or "").split(".")
+
+
+def test_what_plays_a_decision_names_no_part_of_an_extension() -> None:
+    """Neither settings of conditions, nor questions to helpers, nor controls."""
+    kinds = more_parts().values()
+    settings = {setting for kind in kinds for setting in kind.__struct_fields__}
+    questions = {question.name for kind in kinds for question in kind.questions}
+    controls = {setting.partition("=")[2] for setting in control_settings().values()}
+    theirs = settings | questions | controls | set(DEFENCES)
+    named = {
+        (path, word)
+        for path in LOOP
+        for word in theirs.intersection(said_in(ast.parse((HARNESS / path).read_text())))
+    }
+    assert named == set(OTHER_THINGS)
