@@ -214,8 +214,11 @@ def beacon_radio(text: str) -> Physical | None:
     name, *settings = text.split("+")
     if name not in CHANNELS:
         raise unknown("beacon_channel", name, CHANNELS)
-    given = {key: value for key, _, value in (each.partition("=") for each in settings)}
-    radio = changed(CHANNELS[name], given, f"beacon_channel {name}")
+    values: dict[str, str] = {}
+    for setting in settings:
+        key, _, value = setting.partition("=")
+        values[key] = value
+    radio = changed(CHANNELS[name], values, f"beacon_channel {name}")
     if not isinstance(radio, Physical):
         raise UserError(
             f"scenario: beacon_channel is {printable(text)}, which has one loss for all links; "

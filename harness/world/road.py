@@ -379,21 +379,18 @@ def to_the_left(
     centres = [begin[0], begin[1] - radius], [end[0], end[1] + radius]
     angles = (quarter, quarter - turn), (-quarter - turn, -quarter)
     lines = {"width": width_m, "line_types": (LineType.NONE, LineType.NONE)}
-    first, second = (
-        CircularLane(centre, radius, *at, clockwise, **lines)
-        for centre, at, clockwise in zip(centres, angles, (False, True), strict=True)
-    )
+    first = CircularLane(centres[0], radius, *angles[0], False, **lines)
+    second = CircularLane(centres[1], radius, *angles[1], True, **lines)
     return first, second
 
 
 def lanes_of(network: Any) -> dict[Lane, Any]:
     """Return highway-env's lanes by their index."""
-    return {
-        (a, b, n): lane
-        for a, nodes in network.graph.items()
-        for b, lanes in nodes.items()
-        for n, lane in enumerate(lanes)
-    }
+    lanes: dict[Lane, Any] = {}
+    for begin, following in network.graph.items():
+        for end, beside in following.items():
+            lanes |= {(begin, end, number): lane for number, lane in enumerate(beside)}
+    return lanes
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
@@ -402,10 +399,10 @@ def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0
     """
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
-    strips = [
-        LineString(_middle(lane, origin_m)).buffer(lane.width / 2 + 0.05, cap_style="flat")
-        for lane in lanes
-    ]
+    strips = []
+    for lane in lanes:
+        middle = LineString(_middle(lane, origin_m))
+        strips.append(middle.buffer(lane.width / 2 + 0.05, cap_style="flat"))
     surface = shapely.union_all(strips).buffer(1.0).buffer(-1.0).intersection(view)
     pieces = [piece for piece in shapely.get_parts(surface) if piece.geom_type == "Polygon"]
     rings = [ring for piece in pieces for ring in (piece.exterior, *piece.interiors)]
@@ -419,12 +416,11 @@ def _marks(lanes: Sequence[Any], view: Any, origin_m: tuple[float, float]) -> It
         if lane.line_types[side] == STRIPED:
             along = np.linspace(0, lane.length, math.ceil(lane.length) + 1)
             edge_m = (side - 0.5) * lane.width
-            line = LineString(
-                [lane.position(s, edge_m) for s in along] - np.array(origin_m)
-            ).intersection(view)
-            yield from (
-                np.asarray(p.coords) * NORTH for p in shapely.get_parts(line) if len(p.coords) > 1
-            )
+            points = [lane.position(s, edge_m) for s in along] - np.array(origin_m)
+            line = LineString(points).intersection(view)
+            for part in shapely.get_parts(line):
+                if len(part.coords) > 1:
+                    yield np.asarray(part.coords) * NORTH
 
 
 def _boxes(strips: Sequence[Any], view: Any) -> Iterator[Floats]:

@@ -70,7 +70,9 @@ def module_of(name: str) -> str:
 
 
 def _allowed() -> list[str]:
-    return [module for text in os.environ.get(IMPORTS, "").split(",") if (module := text.strip())]
+    """Return the modules that the variable `IMPORTS` lets environments import."""
+    modules = [text.strip() for text in os.environ.get(IMPORTS, "").split(",")]
+    return [module for module in modules if module]
 
 
 def _id_and_changes(name: str) -> tuple[str, str]:
@@ -125,25 +127,24 @@ def reset(name: str, seed: int) -> Any:
 
 def _only_drivable(name: str, env: Any) -> None:
     """Raise UserError unless the ego is on the road, meta-actions drive it, and it can be hit."""
-    ego, its = env.vehicle, f"{shown(name)}: its ego"
+    ego = env.vehicle
+    subject = f"{shown(name)}: its ego"
     if not any(v is ego for v in env.road.vehicles):
-        raise UserError(f"{its} is not on the road; append self.vehicle to self.road.vehicles")
-    its, made = (
-        f"{its} is a {printable(type(ego).__name__)}, which",
-        "make it of self.action_type.vehicle_class",
-    )
-    if missing := [attribute for attribute in OF_EGO if not hasattr(ego, attribute)]:
-        raise UserError(f"{its} has no {', '.join(missing)}; {made}")
+        raise UserError(f"{subject} is not on the road; append self.vehicle to self.road.vehicles")
+    subject += f" is a {printable(type(ego).__name__)}, which"
+    advice = "make it of self.action_type.vehicle_class"
+    missing = [attribute for attribute in OF_EGO if not hasattr(ego, attribute)]
+    if missing:
+        raise UserError(f"{subject} has no {', '.join(missing)}; {advice}")
     try:
         speeds_mps = [float(speed) for speed in ego.target_speeds]
     except (TypeError, ValueError):
         speeds_mps = []
     if not (speeds_mps and np.isfinite(speeds_mps).all()):
-        raise UserError(
-            f"{its} has target_speeds {printable(repr(ego.target_speeds), 40)}, no speeds; {made}"
-        )
+        speeds = printable(repr(ego.target_speeds), 40)
+        raise UserError(f"{subject} has target_speeds {speeds}, no speeds; {advice}")
     if not hittable(ego):
-        raise UserError(f"{its} hits nothing; leave it collidable and solid")
+        raise UserError(f"{subject} hits nothing; leave it collidable and solid")
 
 
 def hittable(thing: Any) -> bool:
@@ -217,15 +218,15 @@ def _merged(default: Any, value: Any) -> Any:
     a part that names its own type replaces the default.
     """
     if isinstance(default, dict) and isinstance(value, dict) and "type" not in value:
-        return {**default, **{key: _merged(default.get(key), each) for key, each in value.items()}}
+        changed = {key: _merged(default.get(key), each) for key, each in value.items()}
+        return default | changed
     return value
 
 
 def config(name: str) -> dict[str, Any]:
     """Return an environment's whole configuration."""
-    whole: dict[str, Any] = json.loads(
-        json.dumps(_create(name).config, default=str), parse_constant=str
-    )
+    text = json.dumps(_create(name).config, default=str)
+    whole: dict[str, Any] = json.loads(text, parse_constant=str)
     return whole
 
 
@@ -287,17 +288,17 @@ class Constants:
 
     @classmethod
     def now(cls) -> "Constants":
+        """Return the constants as they are in this process."""
         from highway_env.vehicle import behavior, controller, kinematics
 
-        kinds = {
-            kind
-            for module in (behavior, controller, kinematics)
-            for kind in vars(module).values()
-            if isinstance(kind, type) and kind.__module__ == module.__name__
-        }
-        return cls(
-            {(kind, key): v for kind in kinds for key, v in vars(kind).items() if key.isupper()}
-        )
+        values: dict[tuple[type, str], Any] = {}
+        for module in (behavior, controller, kinematics):
+            classes = [each for each in vars(module).values() if isinstance(each, type)]
+            for kind in classes:
+                if kind.__module__ == module.__name__:
+                    constants = {key: value for key, value in vars(kind).items() if key.isupper()}
+                    values |= {(kind, key): value for key, value in constants.items()}
+        return cls(values)
 
     def restore(self) -> None:
         """Set all constants to these values."""

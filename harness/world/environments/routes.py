@@ -99,9 +99,10 @@ def routes(
 
 def _left_over(network: Any, covered: set[Lane]) -> Iterator[list[Lane]]:
     """Yield chains of lanes that no route takes, such as the inner lane of a roundabout."""
-    for lane in (
-        (*street, n) for street in _streets(network) for n in range(len(_lanes(network, street)))
-    ):
+    lanes: list[Lane] = []
+    for street in _streets(network):
+        lanes += [(*street, number) for number in range(len(_lanes(network, street)))]
+    for lane in lanes:
         chain: list[Lane] = []
         while lane not in covered:
             covered.add(lane)
@@ -116,12 +117,19 @@ def _left_over(network: Any, covered: set[Lane]) -> Iterator[list[Lane]]:
 
 
 def _streets(network: Any) -> list[Street]:
-    return [(a, b) for a, nodes in network.graph.items() for b in nodes]
+    return [(begin, end) for begin, nodes in network.graph.items() for end in nodes]
 
 
 def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
+    """Yield every route of a network; one on a ring begins at the street `begin`, if it is on it.
+
+    Raises UserError, with the environment's `name`, if there are more than MOST_ROUTES.
+    """
     streets = _streets(network)
-    after = {s: [t for t in streets if t[0] == s[1] and _goes_on(network, s, t)] for s in streets}
+    after: dict[Street, list[Street]] = {}
+    for street in streets:
+        joining = [other for other in streets if other[0] == street[1]]
+        after[street] = [other for other in joining if _goes_on(network, street, other)]
     led_to = {street for following in after.values() for street in following}
     complete: list[Route] = []
     rings: list[Route] = []
@@ -201,20 +209,23 @@ def _labels(network: Any, every: Sequence[Route]) -> list[str]:
     """Name routes by their turn if that is unique among those of one beginning,
     or else by their end.
     """
-    turns = [(route[0][0], _turn(network, route)) for route in every]
-    ends = [(route[0][0], f"to {route[-1][1]}") for route in every]
-    by_turn, by_end, begin = Counter(turns), Counter(ends), Counter(route[0][0] for route in every)
-    by_turn_alone = {
-        a: begin[a] > 1 and all(n == 1 for key, n in by_turn.items() if key[0] == a) for a in begin
-    }
-    return [
-        turn[1]
-        if by_turn_alone[turn[0]]
-        else end[1]
-        if by_end[end] == 1
-        else f"{end[1]} by {' '.join(node for _, node in route[:-1])}"
-        for turn, end, route in zip(turns, ends, every, strict=True)
-    ]
+    begins = [route[0][0] for route in every]
+    turns = [_turn(network, route) for route in every]
+    ends = [f"to {route[-1][1]}" for route in every]
+    routes_from = Counter(begins)
+    by_turn = Counter(zip(begins, turns, strict=True))
+    by_end = Counter(zip(begins, ends, strict=True))
+    ambiguous = {begin for (begin, _), count in by_turn.items() if count > 1}
+    labels = []
+    for route, begin, turn, end in zip(every, begins, turns, ends, strict=True):
+        if routes_from[begin] > 1 and begin not in ambiguous:
+            labels.append(turn)
+        elif by_end[begin, end] == 1:
+            labels.append(end)
+        else:
+            nodes = [node for _, node in route[:-1]]
+            labels.append(f"{end} by {' '.join(nodes)}")
+    return labels
 
 
 def _turn(network: Any, route: Route) -> str:

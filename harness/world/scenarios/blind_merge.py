@@ -139,14 +139,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         arc = at.other_arc_m - speed * (start / p.ego_speed_mps + late_s)
         return Spawn(id_, kind, part, approach, "straight", arc, speed)
 
-    truck = (
-        draws.between("truck_speed", p.truck_mps),
-        draws.between("truck_offset", p.truck_offset_s),
-    )
-    spawns = [
-        (ego := Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps)),
-        timed("v2", "truck", "helper", "main left", *truck),
-    ]
+    ego = Spawn("v1", "car", "ego", "ramp", "merge", at.ego_arc_m - start, p.ego_speed_mps)
+    truck_mps = draws.between("truck_speed", p.truck_mps)
+    late_s = draws.between("truck_offset", p.truck_offset_s)
+    spawns = [ego, timed("v2", "truck", "helper", "main left", truck_mps, late_s)]
     for id_, approach in (("v3", "main"), ("v4", "main left")):
         arc = at.other_arc_m + draws.between(f"{id_}_ahead", p.ahead_m)
         speed = draws.between(f"{id_}_speed", p.ahead_mps)

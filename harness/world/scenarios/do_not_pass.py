@@ -119,13 +119,19 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     ego = -BEGIN_M - draws.between("ego_start", p.ego_start_m)
     truck = ego + (CAR + TRUCK) / 2 + draws.between("gap", p.gap_m)
     leader = truck + (CAR + TRUCK) / 2 + draws.between("leader", p.leader_m)
+    leader_mps = draws.between("leader_mps", p.leader_mps)
+    itself = own("v1", "car", "ego", ego)
+    if draws.seats:
+        second = leader + draws.between("second", SECOND_M)
+        last = own("v4", "car", "helper", second, leader_mps)
+    else:
+        follower = ego - CAR - draws.between("follower", p.follower_m)
+        last = own("v4", "car", "helper", follower)
     spawns = [
-        (itself := own("v1", "car", "ego", ego)),
+        itself,
         own("v2", "truck", "helper", truck),
-        own("v3", "car", "helper", leader, leader_mps := draws.between("leader_mps", p.leader_mps)),
-        own("v4", "car", "helper", leader + draws.between("second", SECOND_M), leader_mps)
-        if draws.seats
-        else own("v4", "car", "helper", ego - CAR - draws.between("follower", p.follower_m)),
+        own("v3", "car", "helper", leader, leader_mps),
+        last,
     ]
 
     def oncoming(id_: str, after_s: float) -> Spawn:
