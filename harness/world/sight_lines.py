@@ -4,13 +4,14 @@ distances, and obstacles between antennas.
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
 from harness.core.arrays import Floats
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Site, Unit
 from harness.world.perception.rays import meetings
-from harness.world.state import HEIGHTS_M, VehicleState, WorldState
+from harness.world.state import HEIGHTS_M, Building, VehicleState, WorldState
 
 LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at a smaller angle run side by side, or merge
 
@@ -29,20 +30,19 @@ def site(
     the centre of its vehicle. If a building and a vehicle stand between two antennas, the building
     counts. Units have their positions from `zone_m`, the centroid of the conflict zone.
     """
-    looks = [(state, [state.vehicle(name) for name in viewers]) for state, viewers in points]
-    among = _site([(state, ego, helpers) for state, (ego, *helpers) in looks])
-    of_units = {
-        unit: replace(
-            _site(
-                [
-                    (state, (zone_m[0] + unit.x_m, zone_m[1] + unit.y_m), all_)
-                    for state, all_ in looks
-                ]
-            ),
-            first_m=unit.antenna_m,
-        )
-        for unit in units
-    }
+    states = [state for state, _ in points]
+    viewers: list[list[VehicleState]] = []
+    for state, ids in points:
+        viewers.append([state.vehicle(id_) for id_ in ids])
+    egos = [ego for ego, *_ in viewers]
+    helpers = [others for _, *others in viewers]
+    among = _site(list(zip(states, egos, helpers, strict=True)))
+    of_units = {}
+    for unit in units:
+        place_m = zone_m[0] + unit.x_m, zone_m[1] + unit.y_m
+        places_m = [place_m] * len(points)
+        links = _site(list(zip(states, places_m, viewers, strict=True)))
+        of_units[unit] = replace(links, first_m=unit.antenna_m)
     return replace(among, units=of_units)
 
 
@@ -50,7 +50,8 @@ def _site(
     points: Sequence[tuple[WorldState, VehicleState | Place, Sequence[VehicleState]]],
 ) -> Site:
     """Return the links from one end, a vehicle or a place, to some vehicles."""
-    n, most = len(points), max((len(targets) for _, _, targets in points), default=0)
+    n = len(points)
+    most = max((len(targets) for _, _, targets in points), default=0)
     xy_m = np.full((n, 1 + most, 2), np.nan)
     sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
     corner_m = np.full((n, most, 2), np.nan)
@@ -71,20 +72,17 @@ def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tup
     """Return what stands between two ends, and the height of the tallest vehicle between them."""
     origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
     vehicles = [v for v in state.vehicles if v not in (a, b)]
-    corners = [
-        *(v.corners() for v in vehicles),
-        *(building.corners() for building in state.buildings),
-    ]
+    obstacles: list[VehicleState | Building] = [*vehicles, *state.buildings]
+    corners = [obstacle.corners() for obstacle in obstacles]
     if not corners:
         return CLEAR, 0.0
     t, _ = meetings(origin, line, np.array(corners))
     met: list[bool] = (t.reshape(-1, 4).min(axis=1) < 1).tolist()
-    tallest = max(
-        (HEIGHTS_M[v.kind] for v, there in zip(vehicles, met, strict=False) if there), default=0.0
-    )
+    between = list(compress(vehicles, met))
+    tallest_m = max((HEIGHTS_M[v.kind] for v in between), default=0.0)
     if any(met[len(vehicles) :]):
-        return BUILDING, tallest
-    return (VEHICLE if tallest else CLEAR), tallest
+        return BUILDING, tallest_m
+    return (VEHICLE if tallest_m else CLEAR), tallest_m
 
 
 def corner(a: VehicleState, b: VehicleState) -> Floats:

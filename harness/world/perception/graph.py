@@ -17,6 +17,7 @@ from harness.world.scene_graph import (
     Conflict,
     Ego,
     Node,
+    Point,
     Role,
     SceneGraph,
     Sector,
@@ -43,15 +44,12 @@ def scene_graphs(
     scenario: Scenario, looks: Sequence[tuple[WorldState, str]], left_out: Collection[str] = ()
 ) -> list[SceneGraph]:
     """Return the scene graphs of some states, each as the vehicle with an id sees it."""
-    return [
-        graph
-        for begin in range(0, len(looks), AT_ONCE)
-        for graph in _perceived(
-            scenario,
-            [(s, s.vehicle(viewer)) for s, viewer in looks[begin : begin + AT_ONCE]],
-            left_out,
-        )
-    ]
+    graphs: list[SceneGraph] = []
+    for begin in range(0, len(looks), AT_ONCE):
+        some = looks[begin : begin + AT_ONCE]
+        viewers = [(state, state.vehicle(viewer_id)) for state, viewer_id in some]
+        graphs += _perceived(scenario, viewers, left_out)
+    return graphs
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
@@ -64,13 +62,18 @@ def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
 
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
     """Return the `truth_graph` of each state."""
-    exact = [list(map(_exact, state.vehicles[1:])) for state in states]
-    return listed_graphs(
-        scenario, [(state, state.ego) for state in states], exact, [[] for _ in states]
-    )
+    looks: list[Look] = []
+    exact: list[list[Detection]] = []
+    no_sectors: list[list[Sector]] = []
+    for state in states:
+        looks.append((state, state.ego))
+        exact.append([_exact(vehicle) for vehicle in state.vehicles[1:]])
+        no_sectors.append([])
+    return listed_graphs(scenario, looks, exact, no_sectors)
 
 
 def _exact(v: VehicleState) -> Detection:
+    """Return a vehicle as it truly is."""
     return Detection(
         v.id,
         ("truth",),
@@ -88,17 +91,20 @@ def _exact(v: VehicleState) -> Detection:
 def _perceived(
     scenario: Scenario, looks: Sequence[Look], left_out: Collection[str]
 ) -> list[SceneGraph]:
+    """Return the scene graph of each viewer, as its sensors and the beacons that it has tell it."""
     around = surfaces(looks)
     reported = reports(looks, around, scenario.parameters)
-    detected: list[list[Detection]] = [[] for _ in looks]
     listed = {place: d for place, d in reported.items() if d.id not in left_out}
+    detected: list[list[Detection]] = [[] for _ in looks]
     for (n, _), d in listed.items():
         detected[n].append(d)
-    for (state, viewer), seen in zip(looks, detected, strict=True):
-        seen += _announced(scenario, state, viewer, {*left_out, viewer.id, *(d.id for d in seen)})
+    for (state, viewer), sensed in zip(looks, detected, strict=True):
+        known = {viewer.id, *left_out, *[d.id for d in sensed]}
+        sensed += _announced(scenario, state, viewer, known)
     # An undetected vehicle must not reveal itself by what it hides.
     solid = ~around.vehicle | among(around, listed)
-    return listed_graphs(scenario, looks, detected, _sectors(scenario.road(), around, solid))
+    sectors = _sectors(scenario.road(), around, solid)
+    return listed_graphs(scenario, looks, detected, sectors)
 
 
 def _announced(
@@ -112,12 +118,13 @@ def _announced(
     """
     for v in state.vehicles:
         sends = v.radio or (scenario.seats is not None and v.part == "helper")
-        if sends and v.id not in known and viewer.part != "other":
-            beacon = last_heard(state, v.id, viewer.id)
-            if beacon or scenario.parameters.perfect_knowledge:
-                at = estimated(v, beacon, state.time_s)
-                place = at.x_m, at.y_m, at.heading_rad, at.speed_mps
-                yield Detection(v.id, BY_BEACON, v.kind, None, *place, None)
+        if not sends or v.id in known or viewer.part == "other":
+            continue
+        beacon = last_heard(state, v.id, viewer.id)
+        if beacon or scenario.parameters.perfect_knowledge:
+            at = estimated(v, beacon, state.time_s)
+            pose = at.x_m, at.y_m, at.heading_rad, at.speed_mps
+            yield Detection(v.id, BY_BEACON, v.kind, None, *pose, None)
 
 
 def listed_graphs(
@@ -130,79 +137,82 @@ def listed_graphs(
     if not looks:
         return []
     road = scenario.road()
+    viewers = [viewer for _, viewer in looks]
     beacons = [last_heard(state, state.ego.id, viewer.id) for state, viewer in looks]
     egos = [estimated(s.ego, b, s.time_s) for (s, _), b in zip(looks, beacons, strict=True)]
-    viewers = [viewer for _, viewer in looks]
-    ego_arcs, own_arcs = (_arcs(road, vehicles) for vehicles in (egos, viewers))
+    ego_arcs, viewer_arcs = _arcs(road, egos), _arcs(road, viewers)
     x, y, heading = np.array([(v.x_m, v.y_m, v.heading_rad) for v in viewers]).T
     zone_m = np.hypot(x - road.zone_m[0], y - road.zone_m[1]).tolist()
-    places_m = zip(
-        x.tolist(), y.tolist(), np.cos(heading).tolist(), np.sin(heading).tolist(), strict=True
-    )
-    seats = [Seat(*place) for place in places_m]
-    # The viewer itself may be in the ego's way, too.
-    listed = [
-        [*seen, *([] if road.form == 1 or viewer.id == state.ego.id else [_exact(viewer)])]
-        for (state, viewer), seen in zip(looks, detected, strict=True)
-    ]
-    things = [(n, d) for n, seen in enumerate(listed) for d in seen]
+    frames = np.stack([x, y, np.cos(heading), np.sin(heading)], axis=-1).tolist()
+    seats = [Seat(*frame) for frame in frames]
+    things: list[tuple[int, Detection]] = []  # number of a viewer, and what it knows
+    for n, ((state, viewer), some) in enumerate(zip(looks, detected, strict=True)):
+        things += [(n, d) for d in some]
+        # The viewer itself may be in the ego's way, too.
+        if road.form != 1 and viewer.id != state.ego.id:
+            things.append((n, _exact(viewer)))
     where = places(road, [d for _, d in things])
-    kept = [k for k, (n, d) in enumerate(things) if where[k].key and d.id != egos[n].id]
-    known = [
-        Encounter(seats[n], d, where[k], egos[n], ego_arcs[n], scenario.brake_lamps)
-        for k in kept
-        for n, d in [things[k]]
-    ]
-    met: list[list[Conflict]] = [[] for _ in looks]
-    for k, some in zip(kept, conflicts(road, known), strict=True):
-        met[things[k][0]] += some
+    owners: list[int] = []
+    encounters: list[Encounter] = []
+    for (n, d), place in zip(things, where, strict=True):
+        if place.key and d.id != egos[n].id:
+            owners.append(n)
+            encounters.append(
+                Encounter(seats[n], d, place, egos[n], ego_arcs[n], scenario.brake_lamps)
+            )
+    conflicts_of: list[list[Conflict]] = [[] for _ in looks]
+    for n, some_conflicts in zip(owners, conflicts(road, encounters), strict=True):
+        conflicts_of[n] += some_conflicts
     nodes: list[list[Node]] = [[] for _ in looks]
     headings = np.array([np.nan if d.heading_rad is None else d.heading_rad for _, d in things])
-    aside = (np.degrees(heading[[n for n, _ in things]] - headings) + 180) % 360 - 180
-    for (n, d), place, aside_deg in zip(things, where, aside.tolist(), strict=True):
+    turned_deg = (np.degrees(heading[[n for n, _ in things]] - headings) + 180) % 360 - 180
+    for (n, d), place, heading_deg in zip(things, where, turned_deg.tolist(), strict=True):
         if d.id != viewers[n].id:
             lane = road.paths[place.key].lane_role(place.arc_m) if place.key else "off-lane"
             at = seats[n].relative(d.x_m, d.y_m)
-            nodes[n].append(
-                Node(
-                    d.id,
-                    d.kind or "vehicle",
-                    at.forward_m,
-                    at.left_m,
-                    None if d.heading_rad is None else round(aside_deg),
-                    tenths(d.speed_mps),
-                    None if d.range_rate_mps is None else tenths(d.range_rate_mps),
-                    lane,
-                    d.indicator,
-                    d.sensors,
-                    d.braking if scenario.brake_lamps else UNSET,
-                )
-            )
+            nodes[n].append(_node(d, at, heading_deg, lane, scenario.brake_lamps))
     graphs = []
     for n, ((state, viewer), ego, beacon) in enumerate(zip(looks, egos, beacons, strict=True)):
         at = seats[n].relative(ego.x_m, ego.y_m)
-        stated = beacon.target_speed_mps if beacon else None
+        target_mps = beacon.target_speed_mps if beacon else None
         itself = Viewer(
             tenths(viewer.speed_mps),
-            road.paths[viewer.approach, viewer.route].lane_role(own_arcs[n]),
+            road.paths[viewer.approach, viewer.route].lane_role(viewer_arcs[n]),
             tenths(zone_m[n]),
             UNSET if road.form == 1 else viewer.kind,
         )
         known_ego = Ego(
             ego.id,
             tenths(ego.speed_mps),
-            state.target_speed_mps if stated is None else stated,
+            state.target_speed_mps if target_mps is None else target_mps,
             round(state.time_s - beacon.time_s, 2) if beacon else 0.0,
             tenths(road.zone_arc_m - ego_arcs[n]),
             at.forward_m,
             at.left_m,
             ego.route if road.ways else UNSET,
         )
-        knows = tuple(nodes[n]), tuple(met[n]), tuple(sectors[n])
+        knowledge = tuple(nodes[n]), tuple(conflicts_of[n]), tuple(sectors[n])
         graphs.append(
-            SceneGraph(viewer.id, ROLES[viewer.part], state.step, itself, known_ego, *knows)
+            SceneGraph(viewer.id, ROLES[viewer.part], state.step, itself, known_ego, *knowledge)
         )
     return graphs
+
+
+def _node(d: Detection, at: Point, heading_deg: float, lane: str, brake_lamps: bool) -> Node:
+    """Return a known vehicle as a node, at a place of the viewer's frame and in a lane."""
+    return Node(
+        d.id,
+        d.kind or "vehicle",
+        at.forward_m,
+        at.left_m,
+        None if d.heading_rad is None else round(heading_deg),
+        tenths(d.speed_mps),
+        None if d.range_rate_mps is None else tenths(d.range_rate_mps),
+        lane,
+        d.indicator,
+        d.sensors,
+        d.braking if brake_lamps else UNSET,
+    )
 
 
 def _arcs(road: Road, vehicles: Sequence[VehicleState]) -> list[float]:
@@ -227,7 +237,9 @@ def _sectors(road: Road, around: Surfaces, solid: Bools) -> list[list[Sector]]:
     for sector, blockers in zip(road.sectors, np.split(met, ends[:-1], axis=1), strict=True):
         in_sight = (blockers < 0).sum(axis=1).tolist()
         for n, (row, count) in enumerate(zip(blockers.tolist(), in_sight, strict=True)):
-            seen = count / len(row)
-            hiding = sorted({around.ids[n][of_surface[b]] for b in {*row} if b >= 0})
-            sectors[n].append(Sector(sector, round(seen, 2), seen < OCCLUDED_BELOW, tuple(hiding)))
+            share = count / len(row)
+            hiding = {around.ids[n][of_surface[blocker]] for blocker in {*row} if blocker >= 0}
+            sectors[n].append(
+                Sector(sector, round(share, 2), share < OCCLUDED_BELOW, tuple(sorted(hiding)))
+            )
     return sectors

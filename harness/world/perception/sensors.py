@@ -69,16 +69,25 @@ def reports(
     sensor reaches so far, hides what is behind it. Under 2 it hides nothing: a vehicle is reported
     if enough rays come to it past buildings and past vehicles that are reported.
     """
-    nearby = [[v for v in state.vehicles if v.id != viewer.id] for state, viewer in looks]
+    nearby: list[list[VehicleState]] = []
+    for state, viewer in looks:
+        nearby.append([v for v in state.vehicles if v.id != viewer.id])
     known: dict[tuple[int, int], Detection | None] = {}
 
     def reported(count: Ints) -> dict[tuple[int, int], Detection]:
-        in_sight = np.nonzero(around.by_viewer(np.where(around.vehicle, count, 0)) >= LEAST_RAYS)
-        pairs = list(zip(*(numbers.tolist() for numbers in in_sight), strict=True))
+        """Return what sensors report where so many rays end on each surface, (n,)."""
+        enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= LEAST_RAYS
+        viewers, places = np.nonzero(enough)
+        pairs = list(zip(viewers.tolist(), places.tolist(), strict=True))
         new = [pair for pair in pairs if pair not in known]
         seen = detections([(*looks[n], nearby[n][place]) for n, place in new], parameters.light)
         known.update(zip(new, seen, strict=True))
-        return {pair: d for pair in pairs if (d := known[pair])}
+        now = {}
+        for pair in pairs:
+            detection = known[pair]
+            if detection:
+                now[pair] = detection
+        return now
 
     rays = cast(around, around.vehicle)
     before = np.ones(len(around.place), dtype=bool)
@@ -109,9 +118,17 @@ def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
     """Return which surfaces (n,) are among pairs of a viewer's number and a place among its
     surfaces.
     """
-    table = np.zeros((len(around.ids), max(map(len, around.ids), default=0)), dtype=bool)
-    table[tuple(np.array(list(pairs), dtype=int).reshape(-1, 2).T)] = True
+    most = max([len(ids) for ids in around.ids], default=0)
+    table = np.zeros((len(around.ids), most), dtype=bool)
+    viewers, places = np.array(list(pairs), dtype=int).reshape(-1, 2).T
+    table[viewers, places] = True
     return table[around.viewer, around.place]
+
+
+def _motion(vehicles: Sequence[VehicleState]) -> Floats:
+    """Return x, y, heading and speed of vehicles, (4, n)."""
+    rows = [(v.x_m, v.y_m, v.heading_rad, v.speed_mps) for v in vehicles]
+    return np.array(rows).T.copy()
 
 
 def detections(
@@ -124,14 +141,11 @@ def detections(
     """
     if not pairs:
         return []
-    viewers, targets = (
-        np.array([(v.x_m, v.y_m, v.heading_rad, v.speed_mps) for v in pair]).T.copy()
-        for pair in ([viewer for _, viewer, _ in pairs], [target for *_, target in pairs])
-    )
-    (its_x, its_y, its_heading, its_speed), (x, y, heading, speed) = viewers, targets
-    dx, dy = x - its_x, y - its_y
+    from_x, from_y, from_heading, from_speed = _motion([viewer for _, viewer, _ in pairs])
+    x, y, heading, speed = _motion([target for *_, target in pairs])
+    dx, dy = x - from_x, y - from_y
     distance, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
-    off_axis = np.abs(turned(bearing - its_heading))
+    off_axis = np.abs(turned(bearing - from_heading))
     in_field = np.minimum(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
     camera = in_field & (distance <= ambient.camera_m)
     if ambient.glare_rad:
@@ -148,36 +162,37 @@ def detections(
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both
     # see.
     r, b = distance + RADAR_NOISE_M * z[0], bearing + BEARING_NOISE_RAD * z[1]
-    x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], its_x + r * np.cos(b))
-    y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], its_y + r * np.sin(b))
+    x_m = np.where(lidar, x + LIDAR_NOISE_M * z[0], from_x + r * np.cos(b))
+    y_m = np.where(lidar, y + LIDAR_NOISE_M * z[1], from_y + r * np.sin(b))
     # The velocity relative to the viewer.
-    parting = [speed * turn(heading) - its_speed * turn(its_heading) for turn in (np.cos, np.sin)]
-    ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-    rate = np.vecdot(np.stack(parting, axis=-1), ways) + 0.15 * z[2]
-    its_heading_rad = heading + np.radians(2.0) * z[3]
-    speed_mps = np.maximum(
-        speed + np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False]) * z[4], 0.0
-    )
-    columns = (camera, lidar, radar, reported, x_m, y_m, its_heading_rad, speed_mps, rate)
-    return [
-        Detection(
+    parting_x = speed * np.cos(heading) - from_speed * np.cos(from_heading)
+    parting_y = speed * np.sin(heading) - from_speed * np.sin(from_heading)
+    parting = np.stack([parting_x, parting_y], axis=-1)
+    sight = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    rate_mps = np.vecdot(parting, sight) + 0.15 * z[2]
+    heading_rad = heading + np.radians(2.0) * z[3]
+    speed_noise_mps = np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False])
+    speed_mps = np.maximum(speed + speed_noise_mps * z[4], 0.0)
+    flags = np.stack([camera, lidar, radar], axis=-1).tolist()
+    estimates = np.stack([x_m, y_m, heading_rad, speed_mps, rate_mps], axis=-1).tolist()
+    detected: list[Detection | None] = []
+    for (*_, v), by_sensor, numbers in zip(pairs, flags, estimates, strict=True):
+        by_camera, by_lidar, by_radar = by_sensor
+        its_x, its_y, its_heading, its_speed, its_rate = numbers
+        detection = Detection(
             v.id,
             SENSORS[by_camera, by_lidar, by_radar],
             v.kind if by_camera else None,
             v.indicator if by_camera else None,
-            at_x,
-            at_y,
-            to_rad if by_lidar else None,
-            mps,
-            away_mps if by_radar else None,
+            its_x,
+            its_y,
+            its_heading if by_lidar else None,
+            its_speed,
+            its_rate if by_radar else None,
             v.braking if by_camera else None,
         )
-        if there
-        else None
-        for (*_, v), by_camera, by_lidar, by_radar, there, at_x, at_y, to_rad, mps, away_mps in zip(
-            pairs, *(column.tolist() for column in columns), strict=True
-        )
-    ]
+        detected.append(detection if any(by_sensor) else None)
+    return detected
 
 
 def _dazzled(episode_seeds: Sequence[int], bearing_rad: Floats, ambient: Ambient) -> Bools:

@@ -67,20 +67,27 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     """Return the ego's graph of each case with the objects that messages add,
     or report more precisely.
     """
-    reports = [_reports(scenario.parameters, case) for case in cases]
-    kept = [[report.node.id for report in some if report.node] for some in reports]
-    heard = [[report.detection for report in some if report.node is None] for some in reports]
+    own_ids: list[list[str]] = []  # whose report in the ego's own graph stands
+    added: list[list[Detection]] = []  # what messages report
+    for case in cases:
+        reports = _reports(scenario.parameters, case)
+        own_ids.append([report.node.id for report in reports if report.node])
+        added.append([report.detection for report in reports if report.node is None])
     looks = [(case.state, case.state.ego) for case in cases]
-    graphs = listed_graphs(scenario, looks, heard, [() for _ in cases])
-    return [
-        structs.replace(
-            case.own,
-            nodes=(*(node for node in case.own.nodes if node.id in own), *graph.nodes),
-            conflicts=(*(c for c in case.own.conflicts if c.vehicle in own), *graph.conflicts),
-            sectors=_seen_together(case),
+    graphs = listed_graphs(scenario, looks, added, [() for _ in cases])
+    merged_graphs: list[SceneGraph] = []
+    for case, ids, graph in zip(cases, own_ids, graphs, strict=True):
+        nodes = [node for node in case.own.nodes if node.id in ids]
+        conflicts = [conflict for conflict in case.own.conflicts if conflict.vehicle in ids]
+        merged_graphs.append(
+            structs.replace(
+                case.own,
+                nodes=(*nodes, *graph.nodes),
+                conflicts=(*conflicts, *graph.conflicts),
+                sectors=_seen_together(case),
+            )
         )
-        for case, own, graph in zip(cases, kept, graphs, strict=True)
-    ]
+    return merged_graphs
 
 
 def _reports(p: Parameters, case: Heard) -> list[Report]:
@@ -120,28 +127,29 @@ def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
     no path does, it stands `STANDS_M` ahead of the ego.
     """
     road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
-    path, speed_mps = road.paths[ego.approach, ego.route], 0.0
-    own_m = path.project(ego.x_m, ego.y_m)[0]
-    arc_m = own_m + STANDS_M
-    if meeting := next(iter(road.crossings.items()), None):
-        key, crossing = meeting
-        path, speed_mps = road.paths[key], ego.speed_mps
-        arc_m = crossing.other_arc_m - (crossing.ego_arc_m - own_m)
-    x, y, heading = (float(at[0]) for at in path.places(np.array([arc_m])))
+    path = road.paths[ego.approach, ego.route]
+    ego_m = path.project(ego.x_m, ego.y_m)[0]
+    arc_m, speed_mps = ego_m + STANDS_M, 0.0
+    if road.crossings:
+        key, crossing = next(iter(road.crossings.items()))
+        path = road.paths[key]
+        arc_m = crossing.other_arc_m - (crossing.ego_arc_m - ego_m)
+        speed_mps = ego.speed_mps
+    x, y, heading = (float(column[0]) for column in path.places(np.array([arc_m])))
     seat = Seat(sender.x_m, sender.y_m, cos(sender.heading_rad), sin(sender.heading_rad))
-    at, turned = seat.relative(x, y), (degrees(sender.heading_rad - heading) + 180) % 360 - 180
-    lane, sensors = path.lane_role(arc_m), ("lidar", "radar")
+    at = seat.relative(x, y)
+    heading_deg = (degrees(sender.heading_rad - heading) + 180) % 360 - 180
     return Node(
         NOBODY,
         "car",
         at.forward_m,
         at.left_m,
-        round(turned),
+        round(heading_deg),
         tenths(speed_mps),
         None,
-        lane,
+        path.lane_role(arc_m),
         "off",
-        sensors,
+        ("lidar", "radar"),
     )
 
 
@@ -152,13 +160,13 @@ def _joined(accepted: Sequence[Report], reports: Sequence[Report]) -> list[Repor
     Nearest pairs are joined first, and no report twice.
     The first accepted report, the ego, always stands.
     """
-    apart = _distances(accepted, reports)
+    distances = _distances(accepted, reports)
     joined, new = list(accepted), dict(enumerate(reports))
     taken: set[int] = set()
-    rows, columns = np.nonzero(apart <= GATE)
-    for _, row, column in sorted(
-        zip(apart[rows, columns].tolist(), rows.tolist(), columns.tolist(), strict=True)
-    ):
+    rows, columns = np.nonzero(distances <= GATE)
+    near = distances[rows, columns].tolist()
+    pairs = zip(near, rows.tolist(), columns.tolist(), strict=True)
+    for _, row, column in sorted(pairs):
         if row not in taken and column in new:
             taken.add(row)
             report = new.pop(column)
@@ -169,24 +177,27 @@ def _joined(accepted: Sequence[Report], reports: Sequence[Report]) -> list[Repor
 
 def _distances(accepted: Sequence[Report], reports: Sequence[Report]) -> Floats:
     """Return the squared Mahalanobis distance of each pair of reports, (accepted, reports)."""
-    place, speed, place_m2, speed_m2 = (
-        tuple(
-            np.array([value(r) for r in some]).reshape(len(some), *shape)
-            for some in (accepted, reports)
-        )
-        for value, shape in (
-            (lambda r: (r.detection.x_m, r.detection.y_m), (2,)),
-            (lambda r: r.detection.speed_mps, ()),
-            (lambda r: r.place_m2, (2, 2)),
-            (lambda r: r.speed_m2ps2, ()),
-        )
-    )
-    d = place[0][:, None] - place[1][None]
-    covariance = place_m2[0][:, None] + place_m2[1][None]
-    metres = np.einsum("...i,...i", d, np.linalg.solve(covariance, d[..., None])[..., 0])
-    return np.asarray(
-        metres + (speed[0][:, None] - speed[1]) ** 2 / (speed_m2[0][:, None] + speed_m2[1])
-    )
+    place, speed, place_m2, speed_m2ps2 = _columns(accepted)
+    other_place, other_speed, other_place_m2, other_speed_m2ps2 = _columns(reports)
+    away = place[:, None] - other_place[None]
+    covariance = place_m2[:, None] + other_place_m2[None]
+    scaled = np.linalg.solve(covariance, away[..., None])[..., 0]
+    of_place = np.einsum("...i,...i", away, scaled)
+    variance = speed_m2ps2[:, None] + other_speed_m2ps2
+    of_speed = (speed[:, None] - other_speed) ** 2 / variance
+    return np.asarray(of_place + of_speed)
+
+
+def _columns(reports: Sequence[Report]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return reports' places (n, 2), speeds (n,), covariances of the places (n, 2, 2)
+    and variances of the speeds (n,).
+    """
+    n = len(reports)
+    places_m = np.array([(r.detection.x_m, r.detection.y_m) for r in reports])
+    speeds_mps = np.array([r.detection.speed_mps for r in reports])
+    places_m2 = np.array([r.place_m2 for r in reports])
+    speeds_m2ps2 = np.array([r.speed_m2ps2 for r in reports])
+    return places_m.reshape(n, 2), speeds_mps, places_m2.reshape(n, 2, 2), speeds_m2ps2
 
 
 def _itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
@@ -203,14 +214,11 @@ def _itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
         None,
         v.braking,
     )
-    sure = exact or p.perfect_knowledge
-    place = ROUNDED_M if sure else hypot(ROUNDED_M, p.beacon_noise_m)
-    return Report(
-        detection,
-        None,
-        np.eye(2) * place**2,
-        (0.1 if sure else hypot(0.1, p.beacon_noise_mps)) ** 2,
-    )
+    place_m, speed_mps = ROUNDED_M, 0.1  # standard deviations
+    if not (exact or p.perfect_knowledge):
+        place_m = hypot(place_m, p.beacon_noise_m)
+        speed_mps = hypot(speed_mps, p.beacon_noise_mps)
+    return Report(detection, None, np.eye(2) * place_m**2, speed_mps**2)
 
 
 def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = False) -> Report:
@@ -230,25 +238,22 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
         None if node.braking is UNSET else node.braking,
     )
     away_m = max(hypot(dx, dy), 0.1)
-    seen = "lidar" in node.sensors
-    along, across = (LIDAR_NOISE_M,) * 2 if seen else (RADAR_NOISE_M, BEARING_NOISE_RAD * away_m)
-    speed = SPEED_NOISE_MPS["radar" in node.sensors]
+    # Standard deviations along the line of sight, across it, and of the speed.
+    along_m, across_m = RADAR_NOISE_M, BEARING_NOISE_RAD * away_m
+    speed_mps = SPEED_NOISE_MPS["radar" in node.sensors]
+    if "lidar" in node.sensors:
+        along_m = across_m = LIDAR_NOISE_M
     if node.sensors == BY_BEACON:
-        (along, across), speed = (p.beacon_noise_m,) * 2, p.beacon_noise_mps
-    own_m, own_rad = (
-        (0.0, 0.0) if exact or p.perfect_knowledge else (p.beacon_noise_m, p.beacon_noise_rad)
-    )
-    along, across = (
-        hypot(along, ROUNDED_M, own_m),
-        hypot(across, ROUNDED_M, own_m, own_rad * away_m),
-    )
+        along_m = across_m = p.beacon_noise_m
+        speed_mps = p.beacon_noise_mps
+    sender_m, sender_rad = p.beacon_noise_m, p.beacon_noise_rad
+    if exact or p.perfect_knowledge:
+        sender_m = sender_rad = 0.0
+    along_m = hypot(along_m, ROUNDED_M, sender_m)
+    across_m = hypot(across_m, ROUNDED_M, sender_m, sender_rad * away_m)
     turn = np.array([[dx, -dy], [dy, dx]]) / away_m
-    return Report(
-        detection,
-        node if exact else None,
-        turn @ np.diag([along**2, across**2]) @ turn.T,
-        speed**2,
-    )
+    place_m2 = turn @ np.diag([along_m**2, across_m**2]) @ turn.T
+    return Report(detection, node if exact else None, place_m2, speed_mps**2)
 
 
 def _seen_together(case: Heard) -> tuple[Sector, ...]:
