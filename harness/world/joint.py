@@ -56,13 +56,18 @@ class Rehearsal(World):
         of those that set the same target one counts.
         """
         calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
-        to = {self.target_after(action): action for action in calm_last}
-        if self.script is None:
-            free = list(to.values()) if step < HORIZON else ["FASTER"]
+        action_to = {self.target_after(action): action for action in calm_last}
+        if self.script is not None:
+            scripted = self.script[step : step + 1]
+            actions = [action_to[self.target_after(action)] for action in scripted]
+        elif step < HORIZON:
+            actions = list(action_to.values())
         else:
-            free = [to[self.target_after(action)] for action in self.script[step : step + 1]]
-        parts = [self, *(cast(Rehearsal, self.branch()) for _ in free[1:])]
-        for part, action in zip(parts, free, strict=False):
+            actions = ["FASTER"]
+        parts = [self]
+        for _ in actions[1:]:
+            parts.append(cast(Rehearsal, self.branch()))
+        for part, action in zip(parts, actions, strict=False):
             part.decide(action)
         return parts
 
@@ -108,27 +113,25 @@ class Plan:
 
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
     """Return what each agent of some layouts can do, by a layout's seed and an agent's place."""
-    begun = [world for seed in seeds for world in rehearsals(scenario, seed)]
-    ended = [
-        world
-        for group in by_scenario(begun)
-        for world in _courses(group)
-        if world.outcome.result in ("cleared", "time_out")
-    ]
+    starts = [world for seed in seeds for world in rehearsals(scenario, seed)]
+    unharmed: list[Rehearsal] = []
+    for group in by_scenario(starts):
+        ended = _courses(group)
+        unharmed += [world for world in ended if world.outcome.result in ("cleared", "time_out")]
     frames = dict.fromkeys(seeds, 0)
-    for world in ended:
+    for world in unharmed:
         frames[world.seed] = max(frames[world.seed], world.frame)
-    for group in by_scenario([world for world in ended if world.outcome.success]):
+    for group in by_scenario([world for world in unharmed if world.outcome.success]):
         _drive_on(group, [frames[world.seed] for world in group])
-    worlds: dict[tuple[int, int], list[Rehearsal]] = {
-        (world.seed, world.agent): [] for world in begun
-    }
-    for world in ended:
-        worlds[world.seed, world.agent].append(world)
+    worlds_of = dict[tuple[int, int], list[Rehearsal]]()
+    for world in starts:
+        worlds_of[world.seed, world.agent] = []
+    for world in unharmed:
+        worlds_of[world.seed, world.agent].append(world)
     able: dict[int, dict[int, Options]] = {seed: {} for seed in seeds}
-    for world in begun:
-        its = worlds[world.seed, world.agent]
-        able[world.seed][world.agent] = _options(world.layout, its, frames[world.seed])
+    for world in starts:
+        worlds = worlds_of[world.seed, world.agent]
+        able[world.seed][world.agent] = _options(world.layout, worlds, frames[world.seed])
     return able
 
 
@@ -142,39 +145,52 @@ def courses(
     `taken` are layouts' seeds, with the actions of each agent;
     `able` are the `options` of the layouts.
     """
-    begun = [rehearsals(scenario, seed) for seed, _ in taken]
-    for worlds, (_, scripts) in zip(begun, taken, strict=True):
+    layouts: list[list[Rehearsal]] = []
+    for seed, scripts in taken:
+        worlds = rehearsals(scenario, seed)
         for world in worlds:
             world.script = scripts.get(world.agent, ())
-    every = [world for worlds in begun for world in worlds]
+        layouts.append(worlds)
+    every = [world for worlds in layouts for world in worlds]
     for group in by_scenario(every):
         _courses(group)
-    frames = {seed: max(its.poses.shape[1] for its in of.values()) for seed, of in able.items()}
+    frames: dict[int, int] = {}
+    for seed, by_agent in able.items():
+        frames[seed] = max(options.poses.shape[1] for options in by_agent.values())
     for group in by_scenario([world for world in every if world.outcome.success]):
         _drive_on(group, [frames[world.seed] for world in group])
-    return [
-        {world.agent: _options(world.layout, [world], frames[world.seed]) for world in worlds}
-        for worlds in begun
-    ]
+    driven: list[dict[int, Options]] = []
+    for worlds in layouts:
+        course = {}
+        for world in worlds:
+            course[world.agent] = _options(world.layout, [world], frames[world.seed])
+        driven.append(course)
+    return driven
 
 
 def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
     """Return a world of each agent of a layout, with the other traffic."""
     layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
     traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
-    seats = {agent: on_seat(scenario, layout, agent, traffic) for agent in agents}
-    return [
-        Rehearsal(its, seed, start, populated(its, start), agent=agent)
-        for agent, (its, start) in seats.items()
-    ]
+    worlds = []
+    for agent in agents:
+        own_scenario, start = on_seat(scenario, layout, agent, traffic)
+        road = populated(own_scenario, start)
+        worlds.append(Rehearsal(own_scenario, seed, start, road, agent=agent))
+    return worlds
 
 
 def _options(layout: Layout, worlds: Sequence[Rehearsal], frames: int) -> Options:
+    """Return the courses that an agent took in some worlds;
+    after the last frame of a world, everybody stays where it is.
+    """
     arrives_s = np.array([world.arrives_s for world in worlds], dtype=float)
+    order = np.argsort(arrives_s, kind="stable")
     poses = np.empty((len(worlds), frames, len(layout.spawns), 3))
-    for n, k in enumerate(order := np.argsort(arrives_s, kind="stable")):
-        known = np.concatenate(worlds[k].record)[:frames, :, :3]
-        poses[n, : len(known)], poses[n, len(known) :] = known, known[-1:]
+    for n, k in enumerate(order):
+        record = np.concatenate(worlds[k].record)[:frames, :, :3]
+        poses[n, : len(record)] = record
+        poses[n, len(record) :] = record[-1:]
     sizes_m = np.array([SIZES_M[spawn.kind] for spawn in layout.spawns])
     hz = worlds[0].scenario.parameters.simulation_hz if worlds else 1
     return Options([worlds[k].taken for k in order], arrives_s[order], poses, sizes_m, hz)
@@ -243,22 +259,21 @@ class Search:
             if cost_s < self.cost_s and chosen not in self.unfit:
                 self.best, self.cost_s = chosen, cost_s
             return
-        least_s = [self._least_s(agent + n, mask) for n, mask in enumerate(left)]
+        others = left[1:]
+        others_s = sum(self._least_s(agent + 1 + k, mask) for k, mask in enumerate(others))
         for n in np.flatnonzero(left[0]).tolist():
-            its_s = cost_s + float(self.able[agent].cost_s[n])
-            if its_s + sum(least_s[1:]) >= self.cost_s:
+            so_far_s = cost_s + float(self.able[agent].cost_s[n])
+            if so_far_s + others_s >= self.cost_s:
                 return
             if self.nodes >= MOST_NODES:
-                self.open_s = min(self.open_s, its_s + sum(least_s[1:]))
+                self.open_s = min(self.open_s, so_far_s + others_s)
                 return
             self.nodes += 1
-            after = [mask & self._row(agent, n, agent + 1 + k) for k, mask in enumerate(left[1:])]
+            after = [mask & self._row(agent, n, agent + 1 + k) for k, mask in enumerate(others)]
             if all(mask.any() for mask in after):
-                bound_s = its_s + sum(
-                    self._least_s(agent + 1 + k, mask) for k, mask in enumerate(after)
-                )
-                if bound_s < self.cost_s:
-                    self._choose((*chosen, n), its_s, after)
+                after_s = sum(self._least_s(agent + 1 + k, mask) for k, mask in enumerate(after))
+                if so_far_s + after_s < self.cost_s:
+                    self._choose((*chosen, n), so_far_s, after)
 
     def _least_s(self, agent: int, mask: Bools) -> float:
         return float(self.able[agent].cost_s[mask.argmax()])  # the first is the soonest
@@ -319,19 +334,22 @@ def plans(
     one are left out; of these, the seeds in which the search did not end, so that there may be one,
     come last.
     """
-    found, unended = dict[int, tuple[Plan, World]](), set[int]()
-    searches = {seed: Search(list(of.values())) for seed, of in able.items()}
+    solved, unended = dict[int, tuple[Plan, World]](), set[int]()
+    searches = {seed: Search(list(by_agent.values())) for seed, by_agent in able.items()}
     for _ in range(MOST_PLANS):
-        best = {
-            seed: plan for seed, search in searches.items() if (plan := _best(search, able[seed]))
-        }
-        unended |= {seed for seed in searches.keys() - best.keys() if not searches[seed].ended}
+        best: dict[int, Plan] = {}
+        for seed, search in searches.items():
+            plan = _best(search, able[seed])
+            if plan:
+                best[seed] = plan
+            elif not search.ended:
+                unended.add(seed)
         worlds = played(scenario, best)
-        found |= {
-            seed: (best[seed], worlds[seed]) for seed in best if kept(best[seed], worlds[seed])
-        }
-        searches = {seed: searches[seed] for seed in best if seed not in found}
-    return found, unended | searches.keys()
+        for seed, plan in best.items():
+            if kept(plan, worlds[seed]):
+                solved[seed] = plan, worlds[seed]
+        searches = {seed: searches[seed] for seed in best if seed not in solved}
+    return solved, unended | searches.keys()
 
 
 def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
@@ -340,13 +358,11 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
     if search.best is None:
         return None
     search.unfit.add(search.best)
-    chosen = dict(zip(able, search.best, strict=True))
-    return Plan(
-        {agent: able[agent].actions[n] for agent, n in chosen.items()},
-        {agent: float(able[agent].arrives_s[n]) for agent, n in chosen.items()},
-        search.bound_s,
-        search.nodes,
-    )
+    actions, arrives_s = {}, {}
+    for agent, n in zip(able, search.best, strict=True):
+        actions[agent] = able[agent].actions[n]
+        arrives_s[agent] = float(able[agent].arrives_s[n])
+    return Plan(actions, arrives_s, search.bound_s, search.nodes)
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
@@ -359,11 +375,15 @@ def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, W
     return worlds
 
 
-def kept(it: Plan, world: World) -> bool:
+def kept(plan: Plan, world: World) -> bool:
     """Return whether all agents of a world have arrived when the plan says, and no others."""
-    return all(
-        journey.outcome.time_s == it.arrives_s[agent]
-        if journey.outcome.success
-        else journey.outcome.result == "time_out" and np.isinf(it.arrives_s[agent])
-        for agent, journey in world.journeys.items()
-    )
+    for agent, journey in world.journeys.items():
+        outcome, arrives_s = journey.outcome, plan.arrives_s[agent]
+        as_planned = (
+            outcome.time_s == arrives_s
+            if outcome.success
+            else outcome.result == "time_out" and np.isinf(arrives_s)
+        )
+        if not as_planned:
+            return False
+    return True

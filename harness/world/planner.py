@@ -10,10 +10,10 @@ Under `limits` 1 it plays only changes to ways that lie beside its own now, so t
 overtakes never comes back in what it plays. Under 2 it plays the way back, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 
@@ -90,28 +90,18 @@ def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
     p, road = scenario.parameters, scenario.road()
     places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
     beside = [road.beside(own, at_m) for own, at_m in places]
-    starts: list[Start] = [
-        (
-            graph.ego.speed_mps,
-            graph.ego.target_speed_mps,
-            p.decisions - graph.step,
-            (int("left" in ways), int("right" in ways)),
-            road.ways.index(road.ego) - road.ways.index(own) if road.ways else 0,
-        )
-        for graph, ways, (own, _) in zip(graphs, beside, places, strict=True)
-    ]
-    tried = _rollouts(scenario.actions, starts, p)
-    return [
-        _chosen(
-            scenario,
-            graph,
-            at_m,
-            ways["own"],
-            _sequences(scenario.actions, *start[2:], p),
-            tried[start],
-        )
-        for graph, (_, at_m), ways, start in zip(graphs, places, beside, starts, strict=True)
-    ]
+    starts: list[Start] = []
+    for graph, ways, (own, _) in zip(graphs, beside, places, strict=True):
+        sides = int("left" in ways), int("right" in ways)
+        home = road.ways.index(road.ego) - road.ways.index(own) if road.ways else 0
+        ego, left = graph.ego, p.decisions - graph.step
+        starts.append((ego.speed_mps, ego.target_speed_mps, left, sides, home))
+    rollouts = _rollouts(scenario.actions, starts, p)
+    actions = []
+    for graph, (_, at_m), ways, start in zip(graphs, places, beside, starts, strict=True):
+        sequences = _sequences(scenario.actions, *start[2:], p)
+        actions.append(_chosen(scenario, graph, at_m, ways["own"], sequences, rollouts[start]))
+    return actions
 
 
 def _chosen(
@@ -132,11 +122,12 @@ def _chosen(
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
         gap = np.minimum(gap, least_gap(tried, motion, under_way))
     gap = np.where(_too_fast(road.paths[own], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
-    arrival = (short.sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1])[tried.motion]
+    arrival_s = short.sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
+    cost = arrival_s[tried.motion]
     if road.ways:
-        arrival += AWAY_S * (road.ways.index(own) + sequences.ends != road.ways.index(road.ego))
+        cost += AWAY_S * (road.ways.index(own) + sequences.ends != road.ways.index(road.ego))
     gap = gap[tried.motion]
-    score = np.where(gap > 0, -arrival, -1e3 + np.minimum(gap, 0.0))
+    score = np.where(gap > 0, -cost, -1e3 + np.minimum(gap, 0.0))
     best = np.flatnonzero(score >= score.max() - 1e-9)
     return sequences.first[int(best[sequences.calm[best].argmin()])]
 
@@ -167,21 +158,23 @@ def _sequences(
     present one, may also come back by a decision after `HORIZON`: an overtaking takes longer.
     """
     returns = parameters.limits > 1 and any(sides)
-    known = [a for a in actions if a in CALM and (a not in SIDE or returns or sides[SIDE[a] > 0])]
-    back = {SIDE[a]: a for a in known if a in SIDE}
+    played = [action for action in actions if action in CALM]
+    if not returns:  # nor does it leave its way to a side without another
+        played = [action for action in played if action not in SIDE or sides[SIDE[action] > 0]]
+    back = {SIDE[action]: action for action in played if action in SIDE}
     later = ("FASTER",) * (left - HORIZON if returns else 0)
     sequences = []
-    for played in product(known, repeat=min(HORIZON, left)):
-        way = home - sum(SIDE.get(a, 0) for a in played)
-        sequences.append(played + later)
+    for first in product(played, repeat=min(HORIZON, left)):
+        way = home - sum(SIDE.get(action, 0) for action in first)
+        sequences.append(first + later)
         for n in range(len(later) if way in back else 0):
-            sequences.append((*played, *later[:n], back[way], *later[n + 1 :]))
-    ends = np.cumsum([[SIDE.get(a, 0) for a in s] for s in sequences], axis=1)
+            sequences.append((*first, *later[:n], back[way], *later[n + 1 :]))
+    ends = np.cumsum(_changes(sequences, SIDE), axis=1)
     stays = (ends.min(axis=1) >= -sides[0]) & (ends.max(axis=1) <= sides[1])
-    sequences, ends = [s for s, fits in zip(sequences, stays, strict=True) if fits], ends[stays]
+    sequences, ends = list(compress(sequences, stays)), ends[stays]
     order = sorted(range(len(sequences)), key=lambda n: [CALM[a] for a in sequences[n]])
     return Sequences(
-        [s[0] for s in sequences],
+        [sequence[0] for sequence in sequences],
         levels(sequences),
         ends[:, -1],
         np.argsort(order),
@@ -191,32 +184,42 @@ def _sequences(
 
 
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
-    """Return the levels by which each decision of sequences changes the target speed, (n,
-    decisions).
+    """Return the levels by which each decision of sequences changes the target speed,
+    (n, decisions).
     """
-    return np.array([[SPEED.get(a, 0) for a in s] for s in sequences])
+    return _changes(sequences, SPEED)
+
+
+def _changes(sequences: Sequence[tuple[str, ...]], change_by: Mapping[str, int]) -> Ints:
+    """Return the change of each decision of sequences, (n, decisions);
+    an action that is not in `change_by` changes nothing.
+    """
+    rows = []
+    for actions in sequences:
+        rows.append([change_by.get(action, 0) for action in actions])
+    return np.array(rows)
 
 
 def _rollouts(
     actions: tuple[str, ...], starts: Sequence[Start], parameters: Parameters
 ) -> dict[Start, Rollouts]:
+    """Return the motions of the ego from each start under the sequences that it allows."""
     alike: dict[tuple[int, tuple[int, int], int], list[Start]] = {}
     for start in dict.fromkeys(starts):
         alike.setdefault(start[2:], []).append(start)
     rollouts = {}
     for (left, sides, home), some in alike.items():
-        tried = _sequences(actions, left, sides, home, parameters)
+        sequences = _sequences(actions, left, sides, home, parameters)
         speeds, targets = np.array([start[:2] for start in some]).T
-        for start, travelled in zip(
-            some, travelled_m(tried.levels, speeds, targets, left, parameters), strict=True
-        ):
+        distances_m = travelled_m(sequences.levels, speeds, targets, left, parameters)
+        for start, travelled in zip(some, distances_m, strict=True):
             _, place = np.unique(travelled[:, -1], return_inverse=True)
-            both = place * len(place) + tried.shift
+            both = place * len(place) + sequences.shift
             _, first, motion = np.unique(both, return_index=True, return_inverse=True)
             # others come as far in the end
             if not np.array_equal(travelled[first][motion], travelled):
                 first = motion = np.arange(len(travelled))
-            right_m = None if tried.right_m is None else tried.right_m[first]
+            right_m = None if sequences.right_m is None else sequences.right_m[first]
             rollouts[start] = Rollouts(travelled[first], right_m, motion)
     return rollouts
 
@@ -261,9 +264,8 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
     right = np.empty((len(ends), steps))
     now = np.zeros(len(ends))
     for k in range(steps):
-        now = (
-            now + (ends[:, min(k // every, ends.shape[1] - 1)] * LANE_M - now) * STEP_S / RESPONSE_S
-        )
+        decision = min(k // every, ends.shape[1] - 1)
+        now = now + (ends[:, decision] * LANE_M - now) * STEP_S / RESPONSE_S
         right[:, k] = now
     return right
 
@@ -292,23 +294,25 @@ def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
     # the first in a queue first
     for conflict in sorted(graph.conflicts, key=lambda c: -c.ego.arc_m):
         kind, ego, other = conflict.kind, conflict.ego, conflict.other
-        size = SIZES_M.get(type_of.get(conflict.vehicle, ""), SIZES_M["car"])
-        its_m = _travelled_m(other, time_s)
+        size_m = SIZES_M.get(type_of.get(conflict.vehicle, ""), SIZES_M["car"])
+        distance_m = _travelled_m(other, time_s)
         if conflict.meets:
-            its = conflict.sector, conflict.route
-            crossing = road.crossings[its]
-            arc = crossing.other_arc_m - other.arc_m + its_m
-            motions.append(Motion(way, crossing.ego_arc_m - ego.arc_m, road.paths[its], arc, size))
+            path_key = conflict.sector, conflict.route
+            crossing = road.crossings[path_key]
+            begin_m = crossing.ego_arc_m - ego.arc_m
+            arc_m = crossing.other_arc_m - other.arc_m + distance_m
+            motions.append(Motion(way, begin_m, road.paths[path_key], arc_m, size_m))
             continue
-        begin, lane = road.zone_arc_m - graph.ego.zone_m, conflict.lane or "own"
+        begin_m, lane = road.zone_arc_m - graph.ego.zone_m, conflict.lane or "own"
         if kind == "behind" and lane == "own":
             continue  # it keeps its distance by itself
-        arc = begin + ego.arc_m - other.arc_m + its_m
+        arc_m = begin_m + ego.arc_m - other.arc_m + distance_m
         if kind == "oncoming":
-            arc = begin + ego.arc_m + other.arc_m - its_m
+            arc_m = begin_m + ego.arc_m + other.arc_m - distance_m
         elif before := queue.get(lane):
-            arc = np.minimum(arc, before.arc_m - (before.size_m[0] + size[0]) / 2 - 2.0)
-        motion = Motion(way, begin, road.paths[road.beside(key)[lane]], arc, size)
+            bumper_m = before.arc_m - (before.size_m[0] + size_m[0]) / 2 - 2.0
+            arc_m = np.minimum(arc_m, bumper_m)
+        motion = Motion(way, begin_m, road.paths[road.beside(key)[lane]], arc_m, size_m)
         motions.append(motion)
         if kind == "ahead":
             queue[lane] = motion

@@ -68,12 +68,13 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
     """Return how the agents of a world that has ended fared;
     `alone_s` has when each would arrive alone.
     """
-    its, worst = ends(world, alone_s), gravest(world.journeys)
-    lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in its])
-    times_s = np.where(np.isnan(lost_s), joint.NEVER_S, [end.time_s or 0.0 for end in its])
+    agent_ends, worst = ends(world, alone_s), gravest(world.journeys)
+    lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in agent_ends])
+    ended_s = [end.time_s or 0.0 for end in agent_ends]
+    times_s = np.where(np.isnan(lost_s), joint.NEVER_S, ended_s)
     return Fate(
         float(np.mean(~np.isnan(lost_s))),
-        any(end.met for end in its),
+        any(end.met for end in agent_ends),
         worst is not None and world.journeys[worst].outcome.result == "time_out",
         float(times_s.sum()),
         float(lost_s.sum()),
@@ -84,27 +85,29 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
-    """Drive layouts under every policy."""
+    """Drive layouts under every policy; return each layout's fate under each, by its name."""
     drivers = POLICIES[:-1]
-    worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
-    actions = reference.turns(worlds, drivers * len(seeds))
+    policies = [(seed, driver) for seed in seeds for driver in drivers]
+    worlds = [World.start(scenario, seed) for seed, _ in policies]
+    actions: list[joint.Scripts] = [*reference.turns(worlds, drivers * len(seeds))]
     able, alone_s = joint.options(scenario, seeds), alone(scenario, seeds)
     plans, unended = joint.plans(scenario, able)
-    where = [(seed, driver) for seed in seeds for driver in drivers] + [
-        (seed, JOINT) for seed in plans
-    ]
-    worlds += [world for _, world in plans.values()]
-    taken = [*actions, *(plan.actions for plan, _ in plans.values())]
-    courses = joint.courses(
-        scenario, able, [(seed, of) for (seed, _), of in zip(where, taken, strict=True)]
-    )
+    for seed, (plan, world) in plans.items():
+        policies.append((seed, JOINT))
+        worlds.append(world)
+        actions.append(plan.actions)
+    driven_seeds = [seed for seed, _ in policies]
+    courses = joint.courses(scenario, able, list(zip(driven_seeds, actions, strict=True)))
     fates = {seed: {JOINT: replace(UNSOLVED, exact=seed not in unended)} for seed in seeds}
-    for (seed, policy), world, its in zip(where, worlds, courses, strict=True):
+    for (seed, policy), world, course in zip(policies, worlds, courses, strict=True):
         exact = policy != JOINT or plans[seed][0].exact
-        fates[seed][policy] = fate(world, alone_s[seed], exact, regret(able[seed], its))
-    return [
-        {policy: of[policy] for policy in POLICIES} | {JOINT: best_of(of)} for of in fates.values()
-    ]
+        fates[seed][policy] = fate(world, alone_s[seed], exact, regret(able[seed], course))
+    layouts = []
+    for by_policy in fates.values():
+        layout = {policy: by_policy[policy] for policy in POLICIES}
+        layout[JOINT] = best_of(by_policy)
+        layouts.append(layout)
+    return layouts
 
 
 def best_of(fates: Mapping[str, Fate]) -> Fate:
@@ -115,7 +118,7 @@ def best_of(fates: Mapping[str, Fate]) -> Fate:
     `joint.MARGIN_M`.
     """
     plan = fates[JOINT]
-    best = min(fates.values(), key=lambda of: of.sum_s)
+    best = min(fates.values(), key=lambda fate: fate.sum_s)
     return replace(best, exact=False) if best.sum_s < plan.sum_s - ROUNDING_S else plan
 
 
@@ -136,13 +139,16 @@ def check(
         )
     seeds = range(seed, seed + episodes)
     fates = reference.in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
-    best = [of[JOINT] for of in fates]
+    best = [by_policy[JOINT] for by_policy in fates]
+    summaries = {}
+    for policy in POLICIES:
+        of_policy = [by_policy[policy] for by_policy in fates]
+        summaries[policy] = summary(of_policy, best, policy)
+    by_seed = dict(zip(seeds, best, strict=True))
     return {
-        "policies": {
-            policy: summary([of[policy] for of in fates], best, policy) for policy in POLICIES
-        },
-        "unsolved": [each for each, of in zip(seeds, best, strict=True) if not of.success],
-        "inexact": [each for each, of in zip(seeds, best, strict=True) if not of.exact],
+        "policies": summaries,
+        "unsolved": [each for each, plan in by_seed.items() if not plan.success],
+        "inexact": [each for each, plan in by_seed.items() if not plan.exact],
     }
 
 
@@ -155,27 +161,27 @@ def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[st
     success. The figures of `Regret` are means over layouts.
     """
 
-    def each(of: Sequence[object], name: str) -> Any:
-        return np.array([float(getattr(one, name)) for one in of])
+    def column(rows: Sequence[object], name: str) -> Any:
+        """Return a field of all rows, (n,)."""
+        return np.array([float(getattr(row, name)) for row in rows])
 
-    costs = [each_of.cost for each_of in fates]
-    trips_s, least_s = each(fates, "trips_s"), each(best, "trips_s")
+    costs = [fate.cost for fate in fates]
+    trips_s, least_s = column(fates, "trips_s"), column(best, "trips_s")
     both = ~np.isnan(trips_s) & ~np.isnan(least_s)
     n = int(both.sum())
-    counts = (
-        resampled(noise.generator("price of anarchy", policy), n, RESAMPLES)
-        if n
-        else np.ones((1, 0))
-    )
-    anarchy = (counts @ trips_s[both]) / (counts @ least_s[both]) if n else np.array([np.nan])
-    return {
-        **{
-            name: rate_interval(each(fates, name))
-            for name in ("success", "arrived", "met", "stuck")
-        },
-        **{name: episode_interval(each(fates, name)) for name in ("lost_s", "most_lost_s")},
-        **{name: rate_interval(each(costs, name)) for name in ("best_decisions", "gave_away")},
-        "regret_s": episode_interval(each(costs, "regret_s")),
-        "anarchy": resampled_estimate(anarchy, n),
-        "less_than_joint": paired_difference([each(fates, "success") - each(best, "success")]),
-    }
+    anarchy = np.array([np.nan])
+    if n:
+        counts = resampled(noise.generator("price of anarchy", policy), n, RESAMPLES)
+        anarchy = (counts @ trips_s[both]) / (counts @ least_s[both])
+    figures = {}
+    for name in ("success", "arrived", "met", "stuck"):
+        figures[name] = rate_interval(column(fates, name))
+    for name in ("lost_s", "most_lost_s"):
+        figures[name] = episode_interval(column(fates, name))
+    for name in ("best_decisions", "gave_away"):
+        figures[name] = rate_interval(column(costs, name))
+    figures["regret_s"] = episode_interval(column(costs, "regret_s"))
+    figures["anarchy"] = resampled_estimate(anarchy, n)
+    less = column(fates, "success") - column(best, "success")
+    figures["less_than_joint"] = paired_difference([less])
+    return figures

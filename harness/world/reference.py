@@ -13,10 +13,13 @@ from harness.world.drivers import DRIVERS, LOOKING, PRIVILEGED, choices
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.seats import places_by
+from harness.world.state import WorldState
 from harness.world.world import World
 
 T = TypeVar("T")
+Place = tuple[int, int]  # number of a world, and an agent's place in it
 TOGETHER = 16  # episodes that are simulated together
 BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `summary`
 
@@ -27,31 +30,37 @@ def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, st
 
     The worlds are of one scenario.
     """
-    deciding = [
-        (n, agent)
-        for n, world in enumerate(worlds)
-        for agent, journey in world.journeys.items()
-        if not journey.outcome.ended
-    ]
+    deciding: list[Place] = []
+    for n, world in enumerate(worlds):
+        under_way = [a for a, journey in world.journeys.items() if not journey.outcome.ended]
+        deciding += [(n, agent) for agent in under_way]
+    scenarios = [worlds[n].seat(agent) for n, agent in deciding]
     actions: list[dict[int, str]] = [{} for _ in worlds]
-    for scenario, at_seat in places_by(worlds[n].seat(agent) for n, agent in deciding).items():
-        places = [deciding[at] for at in at_seat]
-        states = {
-            (n, agent): worlds[n].state(agent) for n, agent in places if drivers[n] in LOOKING
-        }
-        truthful = [at for at in states if drivers[at[0]] == PRIVILEGED]
-        others = [at for at in states if drivers[at[0]] != PRIVILEGED]
-        seen = scene_graphs(scenario, [(states[at], states[at].ego.id) for at in others])
-        graphs = dict(zip(others, seen, strict=True))
-        graphs |= zip(
-            truthful, truth_graphs(scenario, [states[at] for at in truthful]), strict=True
-        )
-        asked = [
-            (drivers[n], graphs.get((n, agent)), graphs.get((n, agent))) for n, agent in places
-        ]
-        for (n, agent), action in zip(places, choices(scenario, asked), strict=True):
+    for scenario, numbers in places_by(scenarios).items():
+        places = [deciding[number] for number in numbers]
+        graphs = _graphs(scenario, worlds, drivers, places)
+        cases = []
+        for n, agent in places:
+            graph = graphs.get((n, agent))
+            cases.append((drivers[n], graph, graph))
+        for (n, agent), action in zip(places, choices(scenario, cases), strict=True):
             actions[n][agent] = action
     return actions
+
+
+def _graphs(
+    scenario: Scenario, worlds: Sequence[World], drivers: Sequence[str], places: Sequence[Place]
+) -> dict[Place, SceneGraph]:
+    """Return the graphs of the agents whose drivers look, all of whom have one scenario."""
+    sensing, truthful = dict[Place, WorldState](), dict[Place, WorldState]()
+    for n, agent in places:
+        if drivers[n] in LOOKING:
+            states = truthful if drivers[n] == PRIVILEGED else sensing
+            states[n, agent] = worlds[n].state(agent)
+    looks = [(state, state.ego.id) for state in sensing.values()]
+    graphs = dict(zip(sensing, scene_graphs(scenario, looks), strict=True))
+    truth = truth_graphs(scenario, list(truthful.values()))
+    return graphs | dict(zip(truthful, truth, strict=True))
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
@@ -66,17 +75,17 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
     """Do what `finish` says; return each world's actions of each agent, by its place."""
-    taken: list[dict[int, list[str]]] = [
-        {agent: [] for agent in world.journeys} for world in worlds
-    ]
-    while going := [n for n, world in enumerate(worlds) if not world.ended]:
-        driven = [worlds[n] for n in going]
-        actions = decide(driven, [drivers[n] for n in going])
-        for n, chosen in zip(going, actions, strict=True):
-            for agent, action in chosen.items():
-                taken[n][agent].append(action)
+    scripts: list[dict[int, list[str]]] = []
+    for world in worlds:
+        scripts.append({agent: [] for agent in world.journeys})
+    while undecided := [n for n, world in enumerate(worlds) if not world.ended]:
+        driven = [worlds[n] for n in undecided]
+        actions = decide(driven, [drivers[n] for n in undecided])
+        for n, by_agent in zip(undecided, actions, strict=True):
+            for agent, action in by_agent.items():
+                scripts[n][agent].append(action)
         take_turn(driven, actions)
-    return taken
+    return scripts
 
 
 def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:
@@ -85,8 +94,8 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
     """
     p = worlds[0].scenario.parameters
     lockstep.advance(worlds, [p.due_frame(world.step) + p.lag_frames for world in worlds])
-    for world, chosen in zip(worlds, actions, strict=True):
-        for agent, action in chosen.items():
+    for world, by_agent in zip(worlds, actions, strict=True):
+        for agent, action in by_agent.items():
             if not world.journeys[agent].outcome.ended:
                 world.take(action, agent)
         world.step += 1
@@ -104,16 +113,16 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
     one that clears too long after the full-view driver is `late`.
     """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
-    ended = iter(finish(worlds, DRIVERS * len(seeds)))
-    outcomes = [{driver: next(ended) for driver in DRIVERS} for _ in seeds]
-    dangers = [world.layout.danger for world in worlds[:: len(DRIVERS)]]
-    return [
-        {
-            driver: out.judged(of[PRIVILEGED], danger, scenario.parameters)
-            for driver, out in of.items()
-        }
-        for of, danger in zip(outcomes, dangers, strict=True)
-    ]
+    outcomes = finish(worlds, DRIVERS * len(seeds))
+    layouts: list[dict[str, Outcome]] = []
+    for begin in range(0, len(worlds), len(DRIVERS)):
+        danger = worlds[begin].layout.danger
+        unjudged = dict(zip(DRIVERS, outcomes[begin : begin + len(DRIVERS)], strict=True))
+        full_view, judged = unjudged[PRIVILEGED], {}
+        for driver, outcome in unjudged.items():
+            judged[driver] = outcome.judged(full_view, danger, scenario.parameters)
+        layouts.append(judged)
+    return layouts
 
 
 def drive_apart(
@@ -133,7 +142,7 @@ def in_chunks(
     """Return what comes of some layouts, so many of which are driven together, on workers."""
     chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
     # all but the last have one size, so the order of completion is no matter
-    sizes = iter(map(len, chunks))
+    sizes = iter([len(chunk) for chunk in chunks])
     parts = spread(
         drives,
         chunks,
@@ -149,9 +158,13 @@ def check(
 ) -> dict[str, Any]:
     """Drive every reference driver through the same episodes; return the `summary` of each."""
     seeds = range(seed, seed + episodes)
-    outcomes = drive_apart(scenario, seeds, workers, progress)
+    layouts = drive_apart(scenario, seeds, workers, progress)
     dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
-    return {driver: summary([o[driver] for o in outcomes], dangerous) for driver in DRIVERS}
+    summaries = {}
+    for driver in DRIVERS:
+        outcomes = [by_driver[driver] for by_driver in layouts]
+        summaries[driver] = summary(outcomes, dangerous)
+    return summaries
 
 
 def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
@@ -160,20 +173,17 @@ def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str
     Where some episodes are `dangerous` and some are not, also success in either,
     and the mean of both.
     """
+    rates: dict[str, Estimate] = {}
+    for result in ("cleared", "collision", "late", "time_out", "off_road"):
+        ended_so = np.array([float(outcome.result == result) for outcome in outcomes])
+        rates["success" if result == "cleared" else result] = rate_interval(ended_so)
     by_danger: dict[str, Estimate] = {}
     if any(dangerous) and not all(dangerous):
-        success, has_danger = (
-            np.array([float(outcome.success) for outcome in outcomes]),
-            np.array(dangerous),
-        )
-        halves = [rate_interval(success[of_half]) for of_half in (has_danger, ~has_danger)]
+        success = np.array([float(outcome.success) for outcome in outcomes])
+        has_danger = np.array(dangerous)
+        halves = [rate_interval(success[has_danger]), rate_interval(success[~has_danger])]
         by_danger = dict(zip(BY_DANGER, (mean_of(halves), *halves), strict=True))
-    rates = {
-        result: rate_interval(np.array([float(outcome.result == result) for outcome in outcomes]))
-        for result in ("cleared", "collision", "late", "time_out", "off_road")
-    }
     return {
-        "success": rates.pop("cleared"),
         **rates,
         **by_danger,
         "ego_at_fault": sum(outcome.fault == "ego" for outcome in outcomes),

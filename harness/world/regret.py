@@ -22,10 +22,8 @@ class Regret:
     """What the first decisions of a layout's agents cost; NaN where there is nothing to judge."""
 
     best_decisions: float  # share of decisions after which an agent can arrive as soon as before
-    gave_away: (
-        # share of agents after one of whose decisions they could no longer arrive, but before it
-        float
-    )
+    # share of agents after one of whose decisions they could no longer arrive, but before it
+    gave_away: float
     regret_s: float  # how much later the others arrive at the soonest after their decisions, mean
 
 
@@ -36,11 +34,12 @@ def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regre
     Decisions count while their agent can still arrive.
     """
     delays, spent_s = list[Floats](), list[float]()
-    for agent, its in able.items():
+    for agent, options in able.items():
         others = [course for other, course in courses.items() if other != agent]
-        arrives_s = soonest_s(its, courses[agent], others)
+        arrives_s = soonest_s(options, courses[agent], others)
+        possible = int(np.isfinite(arrives_s).sum())
         if np.isfinite(arrives_s[0]):
-            delays.append(np.diff(arrives_s[: np.isfinite(arrives_s).sum() + 1]))
+            delays.append(np.diff(arrives_s[: possible + 1]))
             spent_s.append(arrives_s[-1] - arrives_s[0])
     if not delays:
         return Regret(np.nan, np.nan, np.nan)
@@ -57,12 +56,15 @@ def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floa
     inf for never. The decisions are the first `HORIZON` of its course.
     How it went on is one of its options.
     """
-    arrives_s, its_s = (np.where(passes(of, others), of.arrives_s, np.inf) for of in (able, course))
-    first = list(course.actions[0][:HORIZON])
-    like = [
-        [list(actions[:k]) == first[:k] for actions in able.actions] for k in range(len(first) + 1)
-    ]
-    return np.array([arrives_s[rows].min(initial=its_s[0]) for rows in np.array(like, dtype=bool)])
+    arrives_s = np.where(passes(able, others), able.arrives_s, np.inf)
+    course_s = np.where(passes(course, others), course.arrives_s, np.inf)
+    first = tuple(course.actions[0][:HORIZON])
+    soonest = []
+    for decisions in range(len(first) + 1):
+        alike = [tuple(actions[:decisions]) == first[:decisions] for actions in able.actions]
+        open_s = arrives_s[np.array(alike, dtype=bool)]
+        soonest.append(open_s.min(initial=course_s[0]))
+    return np.array(soonest)
 
 
 def passes(able: Options, others: Sequence[Options]) -> Bools:
@@ -70,7 +72,7 @@ def passes(able: Options, others: Sequence[Options]) -> Bools:
     frame = np.arange(1, able.poses.shape[1] + 1)
     under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
     free = np.ones(len(able.actions), dtype=bool)
+    own, own_size_m = able.poses[:, :, :1], able.sizes_m[:1]
     for other in others:
-        its, sizes_m = other.poses[:, :, :1], other.sizes_m[:1]
-        free &= ~near(its, sizes_m, able.poses[:, :, :1], able.sizes_m[:1], 0.0, under_way)
+        free &= ~near(other.poses[:, :, :1], other.sizes_m[:1], own, own_size_m, 0.0, under_way)
     return free

@@ -9,7 +9,7 @@ from typing import TypeVar
 from harness.world import lockstep
 from harness.world.outcome import End
 from harness.world.scenario import Layout, Scenario
-from harness.world.seats import agents_of, places_by, seat_of
+from harness.world.seats import agents_of, seat_of
 from harness.world.simulator import populated
 from harness.world.world import Journey, World
 
@@ -40,8 +40,10 @@ def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float
 
 def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
     """Return worlds by their scenario: such that can be simulated together."""
-    groups = places_by(world.scenario for world in worlds).values()
-    return [[worlds[n] for n in places] for places in groups]
+    groups: dict[Scenario, list[W]] = {}
+    for world in worlds:
+        groups.setdefault(world.scenario, []).append(world)
+    return list(groups.values())
 
 
 def on_seat(
@@ -50,35 +52,30 @@ def on_seat(
     """Return an agent's own scenario,
     and the layout in it with nobody but the agent and some others.
     """
-    spawns, its = [layout.spawns[n] for n in (agent, *others)], scenario
-    if agent:
-        seat = seat_of(scenario, spawns[0])
-        its, spawns[0] = seat.scenario, replace(spawns[0], part="ego")
-        names = [seat.names[spawn.approach, spawn.route] for spawn in spawns]
-        spawns = [
-            replace(spawn, approach=approach, route=route)
-            for spawn, (approach, route) in zip(spawns, names, strict=True)
-        ]
-    return its, Layout(tuple(spawns), layout.buildings, None, None)
+    spawns = [layout.spawns[n] for n in (agent, *others)]
+    if not agent:
+        return scenario, Layout(tuple(spawns), layout.buildings, None, None)
+    seat = seat_of(scenario, spawns[0])
+    spawns[0] = replace(spawns[0], part="ego")
+    renamed = []
+    for spawn in spawns:
+        approach, route = seat.names[spawn.approach, spawn.route]
+        renamed.append(replace(spawn, approach=approach, route=route))
+    return seat.scenario, Layout(tuple(renamed), layout.buildings, None, None)
 
 
 def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
     """Return how each agent of a world that has ended fared;
     `alone_s` has when each would arrive alone.
     """
-    outcomes = {agent: journey.outcome for agent, journey in world.journeys.items()}
-    ids = {agent: world.vehicles[agent].spawn.id for agent in outcomes}
-    return tuple(
-        End(
-            ids[agent],
-            o.result,
-            o.time_s,
-            round((o.time_s or 0.0) - alone_s[agent], 3) if o.success else None,
-            o.partner,
-            o.partner in ids.values(),
-        )
-        for agent, o in outcomes.items()
-    )
+    ids = {agent: world.vehicles[agent].spawn.id for agent in world.journeys}
+    agent_ends = []
+    for agent, journey in world.journeys.items():
+        o = journey.outcome
+        lost_s = round((o.time_s or 0.0) - alone_s[agent], 3) if o.success else None
+        met = o.partner in ids.values()
+        agent_ends.append(End(ids[agent], o.result, o.time_s, lost_s, o.partner, met))
+    return tuple(agent_ends)
 
 
 def gravest(journeys: Mapping[int, Journey]) -> int | None:
@@ -87,9 +84,9 @@ def gravest(journeys: Mapping[int, Journey]) -> int | None:
 
     None if nobody has failed.
     """
-    failed = [
-        (GRAVEST.index(o.result), o.time_s or 0.0, agent)
-        for agent, o in ((agent, journey.outcome) for agent, journey in journeys.items())
-        if o.ended and not o.success
-    ]
-    return min(failed)[2] if failed else None
+    failures: list[tuple[int, float, int]] = []
+    for agent, journey in journeys.items():
+        o = journey.outcome
+        if o.ended and not o.success:
+            failures.append((GRAVEST.index(o.result), o.time_s or 0.0, agent))
+    return min(failures)[2] if failures else None
