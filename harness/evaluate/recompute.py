@@ -27,6 +27,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
+from harness.evaluate.texts import OF_TEXTS, same
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
@@ -56,7 +57,6 @@ OF_ENDS = (  # what an episode's row says of how it ended
     "gave_way",
     "journeys",
 )
-OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
 RULES = (DRIVER, "proxy")  # engines that are no models
 
 
@@ -268,21 +268,13 @@ def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
         for each in stated.answers
     ]
     for name in OF_TEXTS:
-        wrong = sum(
-            b is not None and not _close(getattr(a, name), getattr(b, name)) for a, b in asked
-        )
+        wrong = sum(b is not None and not same(name, a, b) for a, b in asked)
         if wrong:
             yield (
                 f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
             )
     if more := sum(b is None for _, b in asked):
         yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
-
-
-def _close(a: object, b: object) -> bool:
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(map(close, a, b))
-    return close(a, b)
 
 
 def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:

@@ -49,6 +49,7 @@ from harness.evaluate.looks import looks
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
+from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
 from harness.runs import folder, run_parts, writer
 from harness.runs import sources as kept_sources
@@ -630,10 +631,16 @@ def read_or_evaluate(
 ) -> folder.Run:
     """Read the finished run in a folder, or run it with `evaluate` first;
     for studies of several runs.
+
+    Raises UserError if a finished one is another evaluation, or states answers that its texts
+    do not say.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)
     else:
         evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
         work.tidy(out)
-    return folder.read(out)
+        return folder.read(out)
+    run = folder.read(out)
+    refuse_others(run)
+    return run

@@ -37,6 +37,7 @@ from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.of_run import check_prompts, points_of, spec_of
 from harness.evaluate.spec import Spec
+from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses
 from harness.runs.folder import read
 from harness.runs.records import Answer
@@ -130,6 +131,8 @@ class ReplayedRun:
             self._count_answered,
             self._set_left,
         )
+        added = (answer for name, answer in self.answers.items() if name not in answers)
+        refuse_others(self.run, added)
 
     def _set_left(self, count: int) -> None:
         self._left = count

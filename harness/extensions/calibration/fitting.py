@@ -15,6 +15,7 @@ from harness.core.files import write_whole
 from harness.core.seeds import stated
 from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
+from harness.evaluate.texts import refuse_others
 from harness.extensions.calibration.calibrations import (
     COOLEST,
     HOTTEST,
@@ -102,6 +103,7 @@ def calibrate(
     check_seeds(name, first, last)
     rebuilt.refuse(data)
     check_scenes(run, data)
+    refuse_others(run)
     of_roles = [_of_role(run, role, forest, level) for role in ("ego", "helper")]
     fitted = [each for each in of_roles if each]
     if not fitted or fitted[0].role != "ego":

@@ -12,7 +12,9 @@ import pytest
 from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
+from run_on_disk import damage
 
+from harness.core.errors import UserError
 from harness.core.resources import MARKER
 from harness.dataset.build import build
 from harness.extensions.calibration.calibrations import (
@@ -21,7 +23,7 @@ from harness.extensions.calibration.calibrations import (
     Correction,
     question_of,
 )
-from harness.extensions.calibration.fitting import TEMPERATURES, fit
+from harness.extensions.calibration.fitting import TEMPERATURES, calibrate, fit
 from harness.runs.folder import read
 from harness.world import scenarios
 
@@ -179,6 +181,16 @@ def test_a_file_that_is_wrong_is_refused_in_one_line(
     assert code == 2
     assert said in error
     assert error.count("\n") == 1
+
+
+def test_nothing_is_fitted_on_an_intent_that_no_text_states(
+    two_run: Path, two_path: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(two_run, tmp_path / "run"))
+    assert calibrate(run, "L1", two_path, "")[1][0].role == "ego"
+    damage(run, answer=lambda row: row.update(intent=(1.0, 0.0, 0.0)))
+    with pytest.raises(UserError, match="states another intent than its text says"):
+        calibrate(run, "L1", two_path, "")
 
 
 @pytest.mark.slow

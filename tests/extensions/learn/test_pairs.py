@@ -3,14 +3,14 @@ and training on them.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
-from run_on_disk import Row, answers_of, change, configure, damage, made_up, rows_of
+from run_on_disk import ACTIONS, Row, answers_of, change, configure, damage, made_up, rows_of
 
 from harness.coordination.operating_point import POINTS
 from harness.core.files import digest
@@ -36,10 +36,17 @@ def evaluated(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     def merge(row: Row) -> None:
         """Where the last helper answered stands a fusion call with the others' messages."""
         if row["viewer"] == "v4":
-            row |= {"viewer": "v1", "heard": ("v2", "v3"), "role": "merge", "message": None}
+            row |= {"viewer": "v1", "heard": ("v2", "v3"), "role": "merge"}
+            shares(row, row["intent"])
 
     change(done, answer=merge)
     return done
+
+
+def shares(row: Row, intent: Sequence[float]) -> None:
+    """State an intent in an answer, and in its text alone."""
+    text = json.dumps({"action_distribution": dict(zip(ACTIONS, intent, strict=True))})
+    row |= {"intent": tuple(intent), "raw": text, "message": None, "mass": sum(intent)}
 
 
 @pytest.fixture
@@ -47,6 +54,11 @@ def run(evaluated: Path, tmp_path: Path) -> Path:
     import shutil
 
     return shutil.copytree(evaluated, tmp_path / "run")
+
+
+def unreadable(row: Row) -> None:
+    row |= {"raw": "brake!", "status": "no_json", "verdict": "failed"}
+    row |= {"intent": None, "mass": None, "message": None}
 
 
 def lines_of(run: Path, harness: Harness, *options: str) -> list[dict[str, Any]]:
@@ -91,6 +103,7 @@ def test_every_question_of_a_point_that_can_be_won_has_the_answer_of_its_tree(
 
 def test_a_read_out_is_answered_by_the_letter_of_the_best_action(run: Path) -> None:
     configure(run, answer="readout")
+    change(run, answer=lambda row: shares(row, row["intent"]))
     rows = {row["scene"]: row for row in rows_of(run)}
     for pair in pairs(read(run)):
         assert pair["prompt"][-1]["content"].endswith(
@@ -106,6 +119,7 @@ def test_helpers_with_a_prompt_and_answer_mode_of_their_own_have_their_own_pairs
     configure(
         run, helpers=[{"model": model, "prompt": prompt, "answer": "readout", "thinking": False}]
     )
+    change(run, answer=lambda row: row["role"] == "helper" and shares(row, row["intent"]))
     for pair in pairs(read(run)):
         system, user = (message["content"] for message in pair["prompt"])
         helps = pair["viewer"] in ("v2", "v3")
@@ -191,6 +205,16 @@ def test_a_run_of_scenes_that_its_dataset_has_not_is_one_line(
     assert not Path("pairs.jsonl").exists()
 
 
+def test_a_preference_is_not_made_of_an_intent_that_no_text_states(
+    run: Path, harness: Harness
+) -> None:
+    damage(run, answer=lambda row: row.update(intent=(0.0, 0.0, 1.0)))
+    code, out, err = harness("run", "export", run, "--dpo", "dpo.jsonl")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "states another intent than its text says; `harness eval --model replay:" in err
+    assert not Path("dpo.jsonl").exists()
+
+
 def test_a_driven_run_knows_no_best_action(tmp_path: Path, harness: Harness) -> None:
     made_up(tmp_path / "driven", closed_loop=True)
     code, _, err = harness("run", "export", "driven", "--sft", "pairs.jsonl")
@@ -208,13 +232,13 @@ def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(
 
     def worse(row: Row) -> None:
         kind = sum(map(ord, row["scene"] + row["viewer"])) % 3
-        if kind == 0:
-            row |= {"intent": (0.5, 0.5, 0.0), "raw": "half"}
-        elif kind == 1:
-            row |= {"intent": None, "raw": "brake!", "verdict": "failed", "status": "no_json"}
-        else:
-            row |= {"intent": None, "raw": "", "error": "gone", "finish_reason": "error", "verdict": "failed",
-                    "status": "no_answer"}  # fmt: skip
+        if kind == 0 and row["role"] != "helper":
+            shares(row, (0.5, 0.5, 0.0))
+            return
+        unreadable(row)
+        if kind == 2:
+            lost = {"raw": "", "error": "gone", "finish_reason": "error"}
+            row |= {**lost, "status": "engine_error"}
 
     change(run, answer=worse)
     by_tree = {(line["scene"], line["viewer"]): line for line in pairs(read(run))}
@@ -227,14 +251,14 @@ def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(
         for answer in answers_of(run):
             asked = by_tree.get((answer.scene, answer.key))
             if asked and answer.error is None:
-                worth = sum(asked["values"][:2]) / 2 if answer.raw == "half" else 0
+                worth = sum(asked["values"][:2]) / 2 if answer.intent else 0
                 if worth <= most:
                     expected.add((answer.scene, answer.key, answer.raw, worth))
         assert expected == {
             (at["scene"], at["viewer"], at["rejected"][0]["content"], at["value_rejected"])
             for at in lines
         }
-        assert ({at[2] for at in expected} == {"half", "brake!"}) == (margin <= 0.5)
+        assert (len({at[2] for at in expected}) == 2) == (margin <= 0.5)
         for line in lines:
             asked = by_tree[line["scene"], line["viewer"]]
             assert (line["prompt"], line["chosen"]) == (
@@ -245,7 +269,7 @@ def test_an_answer_is_rejected_where_it_is_worth_less_by_the_margin(
 
 def test_a_rejected_letter_is_the_likeliest(run: Path) -> None:
     configure(run, answer="readout")
-    change(run, answer=lambda row: row.update(intent=(0.2, 0.3, 0.5), raw="the shares"))
+    change(run, answer=lambda row: shares(row, (0.2, 0.3, 0.5)))
     lines = [*preferences(read(run), 0.1)]
     assert {line["rejected"][0]["content"] for line in lines} == {"C"}
     assert all(line["values"][2] == line["value_rejected"] == 0 for line in lines)
@@ -319,7 +343,7 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
     from tiny_qwen3 import build
     from transformers import AutoTokenizer
 
-    change(run, answer=lambda row: row.update(intent=None, raw="brake!"))
+    change(run, answer=unreadable)
     assert harness("run", "export", run, "--dpo", "dpo.jsonl")[0] == 0
     read_by = {"data_files": "dpo.jsonl", "split": "train", "cache_dir": tmp_path / "hf"}
     folder = build(tmp_path / "tiny", context_tokens=4096)

@@ -21,6 +21,7 @@ from harness.dataset import rebuilt
 from harness.evaluate.agent import in_mode, shown
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
+from harness.evaluate.texts import refuse_others
 from harness.extensions.learn.training.answers import answer
 from harness.extensions.learn.training.lessons import Lessons, label
 from harness.extensions.learn.training.questions import question
@@ -42,9 +43,9 @@ def write(
 ) -> Path:
     """Write a run's pairs to a file, with a `margin` its preferences, and return its path.
 
-    Raises UserError if the run was driven, its dataset or prompt is not here as it was, or, where
-    `report_seeds_too` is false, its layouts are not those of their seeds or numbers are reported of
-    them.
+    Raises UserError if the run was driven, its dataset or prompt is not here as it was, an answer
+    is not what its text says, or, where `report_seeds_too` is false, its layouts are not those of
+    their seeds or numbers are reported of them.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
@@ -139,6 +140,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
         prompts[version] = prompt
     dataset = dataset_of(run, folder)
     check_scenes(run, dataset)
+    refuse_others(run)
     forest, names = dataset.forest, list(run.decisions.scenes)
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)
     labels = {
