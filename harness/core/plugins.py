@@ -84,6 +84,17 @@ def _waiting(what: str, entry: Any) -> Iterator[None]:
         timer.cancel()
 
 
+def texts(said: Any, what: str = "its answer") -> list[str]:
+    """Return a package's texts as plain ones, which raise nothing where they are shown.
+
+    Raises TypeError, which names `what` they are, for anything but a list of texts.
+    """
+    each = () if isinstance(said, str) else tuple(said)
+    if isinstance(said, str) or not all(isinstance(text, str) for text in each):
+        raise TypeError(f"{what} holds what is no text")
+    return ["".join((text,)) for text in each]
+
+
 class Failed(UserError):
     """What people read in the place of what a plug-in would have said:
     whose it is, and why it says none.

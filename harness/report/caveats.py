@@ -10,7 +10,7 @@ from harness.backends.registry import reads_prompts
 from harness.coordination.operating_point import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
-from harness.core.plugins import Plugins
+from harness.core.plugins import Plugins, texts
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.runs import doubts, pinned
@@ -218,7 +218,7 @@ def of_extensions(run: Run) -> Iterator[str]:
     """Yield what extensions say of a run; one that fails says so itself."""
     for name in CAVEATS:
         try:
-            yield from CAVEATS.ask(name, lambda of: list(map(str, of(run.manifest))))
+            yield from CAVEATS.ask(name, lambda of: texts(of(run.manifest)))
         except UserError as error:
             yield str(error)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from markupsafe import Markup, escape
 
-from harness.core.plugins import Failed, Plugins
+from harness.core.plugins import Failed, Plugins, texts
 from harness.report.runs import Runs
 from harness.report.templating import visible
 from harness.runs.folder import Run
@@ -53,12 +53,17 @@ def sentences(runs: Runs) -> list[Markup]:
     said: list[Markup] = []
     for name in REMARKS:
         try:
-            said += REMARKS.ask(
-                name, lambda remarks: [escape(each) for each in remarks.sentences(runs)]
-            )
+            said += REMARKS.ask(name, lambda remarks: _escaped(remarks.sentences(runs)))
         except Failed as error:
             said.append(escape(visible(str(error))))
     return said
+
+
+def _escaped(sentences: Iterable[str]) -> list[Markup]:
+    """Return sentences for a page. Raises what stands for a failure if one is no text."""
+    each = list(sentences)
+    texts(each)
+    return [escape(sentence) for sentence in each]
 
 
 def left_out(run: Run) -> LeftOut:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
-from harness.core.plugins import Plugins
+from harness.core.plugins import Plugins, texts
 from harness.report.document import Section
 from harness.report.runs import Runs
 from harness.report.templating import environment
@@ -35,7 +35,19 @@ def _written(name: str, run: Run) -> tuple[str, Markup] | None:
 
 
 def _titled(section: Section | None) -> tuple[str, Markup] | None:
-    return None if section is None else (section.title, _content(section))
+    """Return a section's title and content, as what no package can change or raise any more."""
+    if section is None:
+        return None
+    if not isinstance(section, Section):
+        raise TypeError(f"it returns a {type(section).__name__} and no Section")
+    for table in section.tables:
+        for cells in (table.heads, *table.rows):
+            texts(cells, "a row of its tables")
+        texts((table.title, table.note), "the title or note of a table")
+    for name in ("headline", "about", "warnings", "caveats"):
+        texts(getattr(section, name), f"its {name}")
+    [title] = texts((section.title,), "its title")
+    return title, _content(section)
 
 
 def _content(section: Section) -> Markup:
