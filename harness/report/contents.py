@@ -1,5 +1,6 @@
 """Tables, examples and pictures of the page, besides its charts, matrix and decisions."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from harness.core.files import bytes_of
@@ -16,37 +17,41 @@ EXAMPLES = 3  # of each status of answers
 
 
 def size(runs: Runs) -> str:
-    """Return how much was run, of what: said once for all numbers."""
-    episodes, seeds = (
-        " or ".join(map(str, sorted({len(numbers) for numbers in each})))
-        for each in (
-            [run.grid.episodes for run in runs.runs],
-            [run.grid.seeds for run in runs.runs],
-        )
-    )
+    """Return in words how many episodes and channel seeds the runs have, and of what dataset."""
+    episodes = _either(len(run.grid.episodes) for run in runs.runs)
+    seeds = _either(len(run.grid.seeds) for run in runs.runs)
     source = runs.runs[0].source
     return f"{episodes} episodes × {seeds} channel seeds of {source}; 95 % intervals over episodes"
 
 
+def _either(counts: Iterable[int]) -> str:
+    """Return the different counts in words, the least first: `40 or 50`."""
+    return " or ".join(map(str, sorted(set(counts))))
+
+
 def summary(run: Run) -> list[dict[str, Any]]:
-    """Return a run's summary: a metric a line, with its value in each condition."""
-    return [
-        {
-            "name": entry(metric).label,
-            "meaning": entry(metric).meaning,
-            "cells": [
-                (s := run.score(condition, metric)) and words.shown(s)
-                for condition in run.conditions
-            ],
-        }
-        for metric in dict.fromkeys(s.metric for s in run.scores if s.condition != "all")
-        if not entry(metric).superseded
-    ]
+    """Return a row for each metric of a run: its name, its meaning, and a cell for each
+    condition, None where it has no value there.
+    """
+    metrics = dict.fromkeys(score.metric for score in run.scores if score.condition != "all")
+    rows: list[dict[str, Any]] = []
+    for metric in map(entry, metrics):
+        if not metric.superseded:
+            cells = [_cell(run, condition, metric.name) for condition in run.conditions]
+            rows.append({"name": metric.label, "meaning": metric.meaning, "cells": cells})
+    return rows
+
+
+def _cell(run: Run, condition: str, metric: str) -> dict[str, str] | None:
+    score = run.score(condition, metric)
+    return None if score is None else words.shown(score)
 
 
 def probabilities(runs: Runs) -> list[dict[str, Any]]:
-    """Return how honest the probabilities of each run's policies are:
-    a condition a line, where known.
+    """Return a row for each run and condition with scores of its policies' probabilities.
+
+    A row has two groups of decisions with their n: those in which some action is safe, and those
+    with one optimal action alone.
     """
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
@@ -55,46 +60,55 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
         places = run.decisions.codes("condition", run.conditions)
         one_optimal = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
         for place, condition in enumerate(run.conditions):
-            scores, sure = (
-                [run.score(condition, metric) for metric in some] for some in (HONEST, SURE)
-            )
-            if any(scores):
-                n, n_one = int(judged[places == place].sum()), len(one_optimal[place].sure)
-                groups = [{"n": n, "scores": [*scores, flips]}, {"n": n_one, "scores": sure}]
-                lines.append({"run": name, "condition": condition, "groups": groups})
+            scores = [run.score(condition, metric) for metric in HONEST]
+            if not any(scores):
+                continue
+            of_judged = {"n": int(judged[places == place].sum()), "scores": [*scores, flips]}
+            scores_of_one = [run.score(condition, metric) for metric in SURE]
+            of_one_optimal = {"n": len(one_optimal[place].sure), "scores": scores_of_one}
+            groups = [of_judged, of_one_optimal]
+            lines.append({"run": name, "condition": condition, "groups": groups})
     return lines
 
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
-    """Return what does not depend on the condition: a metric a line, with its value in each run."""
-    names = dict.fromkeys(s.metric for run in runs.runs for s in run.scores if s.condition == "all")
-    return [
-        (entry(m).label, [(s := run.score("all", m)) and words.shown(s) for run in runs.runs])
-        for m in names
-    ]
+    """Return a row for each metric that no condition changes: its name, and a cell for each run,
+    None where the run has no value of it.
+    """
+    scores = [score for run in runs.runs for score in run.scores]
+    metrics = dict.fromkeys(score.metric for score in scores if score.condition == "all")
+    rows = []
+    for metric in metrics:
+        cells = [_cell(run, "all", metric) for run in runs.runs]
+        rows.append((entry(metric).label, cells))
+    return rows
 
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
-    """Return the first answers of each status but strict, and where each stands."""
+    """Return the first `EXAMPLES` answers of each status but strict, each with the place of its
+    run.
+    """
     by_status: dict[str, list[dict[str, Any]]] = {}
-    for n, run in enumerate(runs.runs):
+    for place, run in enumerate(runs.runs):
         for answer in run.answers:
             if answer.status != "strict":
-                by_status.setdefault(answer.status, []).append({"run": n, "answer": answer})
-    return [{"status": status, "answers": every[:EXAMPLES]} for status, every in by_status.items()]
+                by_status.setdefault(answer.status, []).append({"run": place, "answer": answer})
+    return [
+        {"status": status, "answers": answers[:EXAMPLES]} for status, answers in by_status.items()
+    ]
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:
-    """Return pictures of the sweeps that lie in the run's folder;
-    none that a link leads out of it to.
+    """Return the pictures of the sweeps in a run's folder, each with its name and its address.
+
+    A link that leads out of the folder is not followed.
     """
-    here = run.path.resolve()
-    return [
-        {
-            "name": f"{manifest.parent.name}: {svg.stem}",
-            "src": picture(on_dark_too(bytes_of(svg, "picture"))),
-        }
-        for manifest in sorted(run.path.glob("*/sweep.json"))
-        for svg in sorted(manifest.parent.glob("*.svg"))
-        if svg.is_file() and svg.resolve().is_relative_to(here)
-    ]
+    folder = run.path.resolve()
+    manifests = sorted(run.path.glob("*/sweep.json"))
+    files = [file for manifest in manifests for file in sorted(manifest.parent.glob("*.svg"))]
+    pictures = []
+    for file in files:
+        if file.is_file() and file.resolve().is_relative_to(folder):
+            address = picture(on_dark_too(bytes_of(file, "picture")))
+            pictures.append({"name": f"{file.parent.name}: {file.stem}", "src": address})
+    return pictures

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from math import comb
 from statistics import median
 
 import numpy as np
@@ -21,7 +21,7 @@ from harness.runs.success import Success
 
 Successes = Mapping[tuple[int, int], float]  # 0 or 1, by episode and seed
 
-LEADING = (BALANCED, *entry(BALANCED).halves)
+HEADLINE_METRICS = (BALANCED, *entry(BALANCED).halves)
 OPTIMAL = "optimal_action_rate"
 BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
@@ -30,7 +30,7 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 class Behind:
     """A run against the best one, over the episodes that both have."""
 
-    # of its success minus the best one's, as it leads, with a 95 % interval over these
+    # of its success minus the best one's, by the headline metric, with a 95 % interval over these
     change: Estimate
     # of no difference, by that interval, corrected by Holm's method for all pairs of runs
     p_value: float
@@ -38,6 +38,9 @@ class Behind:
     @property
     def undecided(self) -> bool:
         return self.p_value > LEVEL
+
+
+Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and how it stands
 
 
 @dataclass(frozen=True)
@@ -54,11 +57,11 @@ class Line:
     tokens: tuple[float | None, float | None]
     mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
     behind: Behind | None  # how it stands to the best; None for the best
-    lead: str  # the metric by which the runs are read together
+    lead: str  # the headline metric, by which the runs are read together
 
     @property
     def success(self) -> Score | None:
-        """What leads."""
+        """The headline metric's score; None where the run has none."""
         return self.scores[self.lead]
 
 
@@ -74,7 +77,7 @@ class Grid:
 
 
 METRICS = (
-    *LEADING,
+    *HEADLINE_METRICS,
     SUCCESS,
     "strict_rate",
     "recovered_rate",
@@ -88,40 +91,63 @@ METRICS = (
 
 def lines(runs: Runs) -> list[Line]:
     """Return every run under each of its conditions, by condition and then in the runs' order."""
-    ended = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
     lengths = [_tokens(run) for run in runs.runs]
-    lead = lead_of(*runs.runs)
-    dangerous = {e.episode for run in runs.runs for e in run.episodes if e.danger != "none"}
-    by_condition = [[of.get(condition, {}) for of in ended] for condition in runs.conditions]
-    all_marks = marked(by_condition, dangerous if lead == BALANCED else ())
+    headline_metric = lead_of(*runs.runs)
+    all_marks = _marks(runs, headline_metric)
     rows = []
-    for condition, marks in zip(runs.conditions, all_marks, strict=True):
+    for condition in runs.conditions:
         for n, run in enumerate(runs.runs):
-            if condition in run.conditions:
-                scores = {metric: _score(run, condition, metric) for metric in METRICS}
-                who = run.manifest.variant
-                of_line = runs.names[n], f"{who.model}{who.mix}", who.prompt, who.answer, condition
-                rows.append(Line(*of_line, scores, lengths[n], *marks[n], lead))
+            if condition not in run.conditions:
+                continue
+            variant = run.manifest.variant
+            mark, behind = all_marks[condition][n]
+            line = Line(
+                name=runs.names[n],
+                model=f"{variant.model}{variant.mix}",
+                prompt=variant.prompt,
+                answer=variant.answer,
+                condition=condition,
+                scores={metric: _score(run, condition, metric) for metric in METRICS},
+                tokens=lengths[n],
+                mark=mark,
+                behind=behind,
+                lead=headline_metric,
+            )
+            rows.append(line)
     return rows
 
 
+def _marks(runs: Runs, headline_metric: str) -> dict[str, list[Mark]]:
+    """Return by condition the mark of each run, in the runs' order."""
+    by_run = [_successes(run) if len(runs.runs) > 1 else {} for run in runs.runs]
+    by_condition = []
+    for condition in runs.conditions:
+        by_condition.append([successes.get(condition, {}) for successes in by_run])
+    dangerous = set[int]()
+    if headline_metric == BALANCED:
+        episodes = [episode for run in runs.runs for episode in run.episodes]
+        dangerous = {each.episode for each in episodes if each.danger != "none"}
+    return dict(zip(runs.conditions, marked(by_condition, dangerous), strict=True))
+
+
 def grids(results: Sequence[Line]) -> list[Grid]:
-    """Return the lines as a table a condition,
+    """Return the lines as a table for each condition,
     with the models and prompts that were run under it.
     """
     modes = {line.answer for line in results}
-    tables: dict[str, dict[tuple[str, str], list[Line]]] = {}
+    cells_of: dict[str, dict[tuple[str, str], list[Line]]] = {}  # by condition, model and prompt
     for line in results:
-        asked = line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
-        tables.setdefault(line.condition, {}).setdefault((line.model, asked), []).append(line)
+        prompt = line.prompt if len(modes) == 1 else f"{line.prompt} · {line.answer}"
+        cells_of.setdefault(line.condition, {}).setdefault((line.model, prompt), []).append(line)
     grids = []
-    for condition, cells in tables.items():
-        models, prompts = (tuple(dict.fromkeys(key[place] for key in cells)) for place in (0, 1))
-        rows = tuple(
-            (model, tuple(tuple(cells.get((model, prompt), ())) for prompt in prompts))
-            for model in models
-        )
-        grids.append(Grid(condition, prompts, rows))
+    for condition, cells in cells_of.items():
+        models = dict.fromkeys(model for model, _ in cells)
+        prompts = tuple(dict.fromkeys(prompt for _, prompt in cells))
+        rows = []
+        for model in models:
+            row = tuple(tuple(cells.get((model, prompt), ())) for prompt in prompts)
+            rows.append((model, row))
+        grids.append(Grid(condition, prompts, tuple(rows)))
     return grids
 
 
@@ -131,12 +157,12 @@ def _score(run: Run, condition: str, metric: str) -> Score | None:
 
 
 def _tokens(run: Run) -> tuple[float | None, float | None]:
-    counts = [(a.prompt_tokens, a.completion_tokens) for a in run.answers]
-    stated = ([count for count in of if count is not None] for of in zip(*counts, strict=True))
-    sent, answered = (
-        (float(median(of)) if of else None for of in stated) if counts else (None, None)
-    )
-    return sent, answered
+    """Return the median tokens of a prompt and of an answer; None where nobody counted them."""
+    prompts = [a.prompt_tokens for a in run.answers if a.prompt_tokens is not None]
+    answers = [a.completion_tokens for a in run.answers if a.completion_tokens is not None]
+    prompt_tokens = float(median(prompts)) if prompts else None
+    answer_tokens = float(median(answers)) if answers else None
+    return prompt_tokens, answer_tokens
 
 
 def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
@@ -149,27 +175,28 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
 
 def marked(
     conditions: Sequence[Sequence[Successes]], dangerous: Container[int] = ()
-) -> list[list[tuple[str, Behind | None]]]:
+) -> list[list[Mark]]:
     """Return the mark of each run under each condition, and how it stands to the best one there.
 
     Args:
         conditions: of each, the successes of every run; empty for one that was not made under it.
-        dangerous: the episodes with a danger, where balanced success leads.
+        dangerous: the episodes with a danger, where balanced success is the headline metric.
     """
-    results = [_behind_best(ended, dangerous) for ended in conditions]
-    every = [(n, run) for n, (_, behind) in enumerate(results) for run in behind]
-    p_values = [results[n][1][run].p_value for n, run in every]
-    pairs = sum(len(list(combinations(filter(None, ended), 2))) for ended in conditions)
-    corrected = dict(zip(every, holm(p_values, pairs), strict=True))
-    marks: list[list[tuple[str, Behind | None]]] = []
-    for n, (ended, (best, behind)) in enumerate(zip(conditions, results, strict=True)):
-        of_runs: list[tuple[str, Behind | None]] = [("", None)] * len(ended)
+    results = [_behind_best(successes, dangerous) for successes in conditions]
+    p_values = [each.p_value for _, behind in results for each in behind.values()]
+    pairs = 0  # of runs under the same condition
+    for successes in conditions:
+        pairs += comb(sum(bool(of_run) for of_run in successes), 2)
+    corrected = iter(holm(p_values, pairs))
+    marks = []
+    for successes, (best, behind) in zip(conditions, results, strict=True):
+        marks_of_runs: list[Mark] = [("", None)] * len(successes)
         for run, standing in behind.items():
-            standing = replace(standing, p_value=corrected[n, run])
-            of_runs[run] = (CLOSE if standing.undecided else WORSE, standing)
+            standing = replace(standing, p_value=next(corrected))
+            marks_of_runs[run] = (CLOSE if standing.undecided else WORSE, standing)
         if best is not None:
-            of_runs[best] = (BEST, None)
-        marks.append(of_runs)
+            marks_of_runs[best] = (BEST, None)
+        marks.append(marks_of_runs)
     return marks
 
 
@@ -182,10 +209,10 @@ def _behind_best(
     The best is not behind any other on the episodes and seeds that the two share:
     a run of other episodes is no better for their being easy.
     """
-    scored = [n for n, of in enumerate(ended) if of]
-    for best in scored:
-        pairs = {n: _shared(ended[n], ended[best], dangerous) for n in scored if n != best}
-        if pairs and all(a.size and how.mean(a) <= how.mean(b) for how, a, b in pairs.values()):
+    runs = [n for n, successes in enumerate(ended) if successes]
+    for best in runs:
+        pairs = {n: _shared(ended[n], ended[best], dangerous) for n in runs if n != best}
+        if pairs and all(a.size and rule.mean(a) <= rule.mean(b) for rule, a, b in pairs.values()):
             return best, {n: _behind(*pair) for n, pair in pairs.items()}
     return None, {}
 
@@ -193,26 +220,27 @@ def _behind_best(
 def _shared(
     first: Successes, second: Successes, dangerous: Container[int]
 ) -> tuple[Success, Floats, Floats]:
-    """Successes of the episodes and seeds that both have, each (S, E), and how they count."""
-    both = sorted(first.keys() & second.keys())
-    episodes = sorted({episode for episode, _ in both})
-    a, b = (
-        np.array([of[key] for key in both]).reshape(len(episodes), -1).T
-        if both
-        else np.empty((0, 0))
-        for of in (first, second)
-    )
-    return Success(np.array([episode in dangerous for episode in episodes], dtype=bool)), a, b
+    """Return the success rule of the episodes that both runs have, and the successes of each
+    run in them, (S, E); (0, 0) where they share none.
+    """
+    keys = sorted(first.keys() & second.keys())
+    episodes = sorted({episode for episode, _ in keys})
+    rule = Success(np.array([episode in dangerous for episode in episodes], dtype=bool))
+    if not keys:
+        return rule, np.empty((0, 0)), np.empty((0, 0))
+    a = np.array([first[key] for key in keys]).reshape(len(episodes), -1).T
+    b = np.array([second[key] for key in keys]).reshape(len(episodes), -1).T
+    return rule, a, b
 
 
-def _behind(how: Success, a: Floats, b: Floats) -> Behind:
-    p = how.p_value(a, b)
+def _behind(rule: Success, a: Floats, b: Floats) -> Behind:
+    p = rule.p_value(a, b)
     # One episode has no interval: nothing says that it is more than chance.
-    return Behind(how.difference(a, b), 1.0 if p is None else p)
+    return Behind(rule.difference(a, b), 1.0 if p is None else p)
 
 
 def uneven(runs: Runs) -> str | None:
-    """That the runs have not the same episodes and seeds, and which; None where they have."""
+    """Say which episodes and seeds each run has, where they differ; None where they do not."""
     if len({(run.grid.episodes, run.grid.seeds) for run in runs.runs}) < 2:
         return None
     each = "; ".join(
@@ -226,28 +254,23 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's leading success under each condition,
-    with what it is and its interval.
+    """Return the best run's headline metric under each condition,
+    as its name, value, interval and n in words.
     """
-    of_best = [(line, line.success) for line in results if line.mark == BEST]
-    return [
-        {
-            "what": f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}",
-            **shown(success),
-        }
-        for line, success in of_best
-        if success
-    ]
+    rows = []
+    for line in results:
+        if line.mark == BEST and line.success:
+            name = f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}"
+            rows.append({"what": name, **shown(line.success)})
+    return rows
 
 
 def _rank(best: Line, results: Sequence[Line]) -> str:
     """Name the best run of a condition, unless others cannot be told from it."""
     close = _close(best.condition, results)
-    return (
-        f"the most of {len(close) + 1} runs that cannot be told apart"
-        if close
-        else f"best: {best.name}"
-    )
+    if close:
+        return f"the most of {len(close) + 1} runs that cannot be told apart"
+    return f"best: {best.name}"
 
 
 def shared(results: Sequence[Line]) -> set[str]:
@@ -265,23 +288,21 @@ def headline(results: Sequence[Line]) -> str:
     """
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
-        of_condition = [line for line in results if line.condition == condition]
-        best = next((line for line in of_condition if line.mark == BEST), None)
-        if best is not None and (success := best.success):
-            if close := _close(condition, results):
-                apart = f"{some_of([best.name, *close])} cannot be told apart"
-                outcomes.append(
-                    f"{condition}: none clearly ({shown(success)['value']} at the most; {apart})"
-                )
+        lines = [line for line in results if line.condition == condition]
+        best = next((line for line in lines if line.mark == BEST), None)
+        if best is not None and best.success:
+            rate = shown(best.success)["value"]
+            close = _close(condition, results)
+            if close:
+                names = some_of([best.name, *close])
+                outcome = f"none clearly ({rate} at the most; {names} cannot be told apart)"
             else:
-                outcomes.append(f"{condition}: {best.name} {shown(success)['value']}")
-        elif len(of_condition) > 1:
-            outcomes.append(
-                f"{condition}: no run, since each is behind another or shares no episodes with it"
-            )
-    by = " by balanced success" if results[0].lead == BALANCED else ""
-    return (
-        f"Best{by} under {'; '.join(outcomes)}."
-        if outcomes
-        else "No two runs have a condition in common."
-    )
+                outcome = f"{best.name} {rate}"
+            outcomes.append(f"{condition}: {outcome}")
+        elif len(lines) > 1:
+            outcome = "no run, since each is behind another or shares no episodes with it"
+            outcomes.append(f"{condition}: {outcome}")
+    if not outcomes:
+        return "No two runs have a condition in common."
+    measure = " by balanced success" if results[0].lead == BALANCED else ""
+    return f"Best{measure} under {'; '.join(outcomes)}."
