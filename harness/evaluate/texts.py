@@ -15,7 +15,7 @@ from harness.parsing.parse import Parsed, parse
 from harness.prompts.answer_schema import Shape
 from harness.runs.contradictions import close
 from harness.runs.folder import Run
-from harness.runs.records import Answer
+from harness.runs.records import Answer, is_helper
 from harness.runs.sources import lacking, prompt_of
 
 OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
@@ -66,7 +66,7 @@ class _Reader:
 
     def read(self, answer: Answer) -> Parsed:
         """Return what an answer's text says."""
-        role = "helper" if answer.role in ("helper", "blind") else "ego"
+        role = "helper" if is_helper(answer.role) else "ego"
         shape = self._prompt.shape(role, self._actions)
         if self._bare:
             shape = Shape("ego", self._actions, "distribution")
