@@ -39,8 +39,8 @@ def refuse_others(run: Run, more: Iterable[Answer] = ()) -> None:
             raise _contradicts(run, answer, other)
     for answer in more:  # which vehicle of its scene answered only the dataset knows
         others = [_other(answer, reader.read(answer)) for reader in readers.values()]
-        if other := all(others) and others[0]:
-            raise _contradicts(run, answer, other)
+        if all(others) and others[0]:
+            raise _contradicts(run, answer, others[0])
 
 
 def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:

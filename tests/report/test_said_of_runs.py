@@ -48,7 +48,10 @@ class Spiteful(str):
     def __html__(self) -> str:
         raise ValueError("no way")
 
-    __str__ = __format__ = __html__
+    __str__ = __html__
+
+    def __format__(self, spec: str) -> str:
+        return self.__html__()
 
 
 ROW: Any = (("a", "b"), [("1", 2)])
