@@ -218,7 +218,7 @@ def test_many_viewers_see_together_what_each_sees_alone(scenario: Scenario, seed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("on_each", [20, pytest.param(60, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("on_each", [6, pytest.param(60, marks=pytest.mark.exhaustive)])
 def test_many_points_are_projected_as_each_alone_on_the_nearest_point(
     scenario: Scenario, on_each: int
 ) -> None:

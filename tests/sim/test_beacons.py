@@ -140,7 +140,7 @@ DIALS = (
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.lists(st.integers(1, 60), max_size=4), st.sampled_from(DIALS))
 def test_beacons_do_not_depend_on_how_time_is_cut(frames, dials):
     """Nor on a freeze: a world that was thawed at every stop knows the same."""

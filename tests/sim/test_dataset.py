@@ -239,7 +239,7 @@ def test_the_first_episodes_can_be_loaded_alone(small_folder):
     assert {name[:5] for name in few.forest.ids} == {"00000"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
     p = replace(SCENARIO.parameters, decision_lag_s=0.0)
     at_once = replace(SCENARIO, parameters=p)

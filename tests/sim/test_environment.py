@@ -274,7 +274,7 @@ def test_a_vehicle_without_a_lane_is_named(kind, tmp_path):
         build(scenario, tmp_path / "set", 1, 0, 1, lambda done: None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_path, harness):
     scenario = scenarios.get("env:crashed-v0:decisions=1")
     build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
@@ -306,6 +306,7 @@ def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unrebuilt")
 def test_a_sound_environment_loses_nothing_at_once(folder, harness):
     assert load(folder).lost == 0
     code, said, _ = harness("dataset", "check", folder, "--json")
@@ -355,7 +356,7 @@ def test_its_frames_are_those_of_its_own_step(env):
         assert (ours.env.steps, ours.env.time) == (theirs.steps, theirs.time)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_traffic_that_it_spawns_enters():
     scenario = scenarios.get(named("intersection-v1", SPEED_ONLY))
     assert (scenario.actions, scenario.parameters.decisions) == (CAREFUL_FIRST[:3], 6)
@@ -420,7 +421,7 @@ def test_the_state_says_who_is_where_and_helpers_are_the_nearest():
     assert {v.route for v in state.vehicles} == {"to b lane 1", "to b lane 2"}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_controlled_vehicles_help_first_and_keep_to_their_course():
     several = {
         "controlled_vehicles": 2,

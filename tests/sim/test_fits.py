@@ -108,7 +108,7 @@ def test_every_frozen_record_and_tree_fits(small: Dataset):
 
 @pytest.mark.slow
 @settings(
-    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+    max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
 )
 @given(data=st.data())
 def test_a_changed_record_fits_where_the_published_schema_says_so(
@@ -123,7 +123,7 @@ def test_a_changed_record_fits_where_the_published_schema_says_so(
 
 @pytest.mark.slow
 @settings(
-    max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+    max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
 )
 @given(data=st.data())
 def test_a_changed_tree_fits_where_the_published_schema_says_so(
@@ -141,7 +141,7 @@ def test_a_changed_tree_fits_where_the_published_schema_says_so(
 
 @pytest.mark.slow
 @settings(
-    max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+    max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
 )
 @given(data=st.data())
 def test_a_changed_manifest_fits_where_the_published_schema_says_so(

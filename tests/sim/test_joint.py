@@ -141,7 +141,7 @@ def test_all_policies_drive_the_same_layouts_and_none_beats_the_plan() -> None:
     assert all(not each.trips_s < by_policy[JOINT].trips_s for each in by_policy.values())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_where_the_search_finds_nothing_the_plan_is_that_of_the_best_driver(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import one_way_crossing
 import pytest
 from frames import highway_envs_frame, poses
+from tiers import some
 
 from harness.world import lockstep, scenarios
 from harness.world.world import World
@@ -33,8 +34,7 @@ def test_together_is_as_alone(scenario):
     drive_apart_and_together(scenario, worlds=14)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["occluded-intersection", "roundabout-entries"])
+@pytest.mark.parametrize("name", some(["roundabout-entries"], exhaustive=["occluded-intersection"]))
 def test_a_few_together_are_as_alone(name):
     """Straight lanes and a circle, and traffic that comes to a stop."""
     drive_apart_and_together(scenarios.get(name), worlds=3)
@@ -91,7 +91,7 @@ def test_wrecks_stay_where_they_are_and_their_worlds_go_on():
     assert {world.outcome.other_crashes > 0 for world in worlds} == {True, False}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_environments_are_simulated_by_highway_env():
     scenario = scenarios.get("env:highway-v0")
     worlds = [World.start(scenario, seed) for seed in range(2)]

@@ -337,7 +337,7 @@ def test_an_episode_without_its_danger_looks_the_same_for_as_long_as_the_ego_doe
 
 @pytest.mark.slow
 def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
-    for seed in (1, 6, 10, 11):
+    for seed in (1, 6):
         world = World.start(SCENARIO, seed)
         for _ in range(4):
             state = world.state()
@@ -350,7 +350,7 @@ def test_a_graph_names_only_its_viewer_the_ego_what_it_lists_and_buildings():
             world.act("IDLE")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_most_dangers_are_hidden_from_the_ego_and_seen_by_a_helper_two_decisions_before():
     hidden = helped = 0
     worlds = [world for seed in range(40) if (world := World.start(SCENARIO, seed)).layout.danger]

@@ -65,7 +65,7 @@ def test_how_an_agent_went_on_after_its_first_decisions_is_one_of_its_options() 
     assert soonest_s(able(rash), careful, [OTHER]).tolist() == [4.0] * 6
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_soonest_arrival_is_that_of_all_that_the_simulator_tries() -> None:
     scenario, seed = scenarios.get(TWO), 3
     [taken] = reference.turns([World.start(scenario, seed)], ["first-come"])

@@ -97,7 +97,7 @@ def test_both_vehicles_see_its_danger_in_its_sector():
     assert plan(SCENARIO, truth_graph(SCENARIO, world.state())) == "SLOWER"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_its_dataset_is_sound_and_says_whose_it_is(folder, frozen, tmp_path):
     assert check(folder) == []
     assert (frozen.scenario, frozen.actions) == (SCENARIO, SCENARIO.actions)
@@ -142,7 +142,7 @@ def test_it_is_drawn(frozen):
     assert picture.getvalue().startswith(b"<?xml")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_command_drives_and_evaluates_it_and_reports(harness, folder):
     shown = harness("dataset", "scenario", "show", NAME)
     assert (shown[0], "decisions = 4\n" in shown[1]) == (0, True)

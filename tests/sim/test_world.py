@@ -15,6 +15,7 @@ from frames import highway_envs_frame, poses
 from highway_env.envs.intersection_env import IntersectionEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from msgspec import to_builtins
+from tiers import some
 from together import act_together
 
 from harness.core.files import digest
@@ -148,7 +149,6 @@ def test_a_world_leaves_highway_envs_classes_as_they_were():
 @pytest.mark.parametrize(
     ("seed", "actions"),
     [
-        (FROM_LEFT, ("IDLE",) * 6),
         (ONCOMING, ("SLOWER", "FASTER", "SLOWER", "IDLE")),
         *(
             pytest.param(seed, actions, marks=pytest.mark.exhaustive)
@@ -200,9 +200,7 @@ def test_two_seeds_are_two_episodes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [pytest.param(FROM_RIGHT, marks=pytest.mark.exhaustive), FROM_LEFT, ONCOMING]
-)
+@pytest.mark.parametrize("seed", some([ONCOMING], exhaustive=[FROM_RIGHT, FROM_LEFT]))
 def test_a_collision_ends_the_episode_in_the_frame_in_which_outlines_meet(seed):
     world = World.start(SCENARIO, seed)
     gaps = []
@@ -325,7 +323,7 @@ def test_a_thawed_world_goes_on_as_the_one_it_was_taken_from(seed):
 
 @pytest.mark.slow
 def test_many_seeds_thaw_at_every_step_to_the_same_next_second():
-    worlds = [World.start(SCENARIO, seed) for seed in range(20, 32)]
+    worlds = [World.start(SCENARIO, seed) for seed in range(20, 24)]
     for action in ("IDLE", "FASTER", "SLOWER"):
         thawed = [through_json(world) for world in worlds]
         act_together([*worlds, *thawed], [action] * 2 * len(worlds))
