@@ -144,7 +144,7 @@ def test_times_of_several_helper_models_are_declared_in_turn(small: Dataset) -> 
         declared("ego=0.1:0.2")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_mix_drives_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # so that both workers have some
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 1)

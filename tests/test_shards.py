@@ -24,6 +24,8 @@ DRIVE = (
     "drive",
     "--model",
     "cruise",
+    "--condition",
+    "6g",
     "--episodes",
     "6",
     "--seeds",

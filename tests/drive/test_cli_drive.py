@@ -43,7 +43,7 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert success in (0.0, 0.5, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(
     harness, tmp_path, small_path
 ):

@@ -12,6 +12,7 @@ from killed_run import PLACES, at, killed_at
 from tiers import some
 
 from harness.backends.driver import DriverBackend
+from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.core.work import tidy
 from harness.evaluate import live_world
@@ -72,18 +73,23 @@ def test_a_summary_agrees_with_its_episodes(whole):
     ]
 
 
+def few(**options):
+    """Four episodes under one condition."""
+    return spec(points=(POINTS["6g"],), seeds=(0,), episodes=4, **options)
+
+
 @pytest.fixture(scope="module")
 def four(tmp_path_factory):
-    return folder_of(spec(episodes=4), tmp_path_factory.mktemp("four") / "run")
+    return folder_of(few(), tmp_path_factory.mktemp("four") / "run")
 
 
 @pytest.mark.parametrize(
-    ("workers", "batch_size"), some([(2, 3), (1, 1)], exhaustive=[(2, 8), (1, 100)])
+    ("workers", "batch_size"), some([(2, 3)], exhaustive=[(1, 1), (2, 8), (1, 100)])
 )
 def test_workers_and_batches_change_no_byte(four, tmp_path, monkeypatch, workers, batch_size):
     # so that both workers have some
     monkeypatch.setattr("harness.evaluate.run.EPISODES_AT_ONCE", 2)
-    assert folder_of(spec(episodes=4, batch_size=batch_size), tmp_path / "run", workers) == four
+    assert folder_of(few(batch_size=batch_size), tmp_path / "run", workers) == four
 
 
 @pytest.fixture(scope="module")

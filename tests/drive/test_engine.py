@@ -194,7 +194,7 @@ def test_episodes_are_in_one_world_until_one_acts_otherwise():
 @pytest.mark.parametrize(
     ("points", "seeds", "episodes"),
     [
-        pytest.param((ALONE, POINTS["6g"]), (0,), (1, 6), marks=pytest.mark.slow),
+        pytest.param((ALONE, POINTS["6g"]), (0,), (1,), marks=pytest.mark.slow),
         pytest.param(tuple(POINTS.values()), (0, 1), (0, 1, 6), marks=pytest.mark.exhaustive),
     ],
 )
@@ -211,6 +211,7 @@ def test_sharing_a_world_changes_nothing(points, seeds, episodes):
     assert sorted(map(repr, together.decisions.table.to_pylist())) == sorted(map(repr, apart))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "count",
     [pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.exhaustive)],

@@ -109,7 +109,7 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
         scenes_of(read(gone), [scene])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_cameras_of_a_run_see_by_the_light_that_it_was_driven_in(tmp_path):
     spec = live_spec_of(
         episodes=1, first_seed=FROM_LEFT, points=(named_point("single-local"),), seeds=(0,)
@@ -226,7 +226,7 @@ def test_prompts_are_the_very_ones_that_were_sent(driven, text):
     assert found[scene, "v1"] == [dict(message) for message in sent]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path):
     pytest.importorskip("torch", reason="needs the transformers extra")
     point = named_point("6g:consensus=ego-prompt")
@@ -243,7 +243,7 @@ def test_the_prompt_of_a_second_answer_has_the_messages_that_were_heard(tmp_path
     assert all("MESSAGES" in found[key][-1]["content"] for key in heard)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_driver_beside_a_model_takes_no_helper_out_of_the_picture(driven, tmp_path):
     run(live_spec_of("cruise", episodes=2, first_seed=FROM_LEFT), tmp_path / "cruise")
     every = details(render(gather([tmp_path / "cruise", driven])))
@@ -263,7 +263,7 @@ def edited(driven, tmp_path, name, edit):
     return copy
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_prompt_with_another_digest_than_was_asked_is_not_shown(driven, tmp_path):
     def answer(a):
         if a["viewer"] == "v2":

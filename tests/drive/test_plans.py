@@ -77,7 +77,7 @@ def test_the_highest_bid_goes_first_and_a_number_decides_by_itself():
     assert decided("yield-by-id", [BOLD, STEADY], [3.0, 4.0], vehicle=[3, 0]) == [1, 0, 0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path: Path) -> None:
     points = tuple(named_point(PLAN + rule) for rule in ("yield-by-time", "auction"))
     spec = replace(

@@ -110,7 +110,7 @@ def test_without_a_plan_it_is_the_answer_alone() -> None:
         assert (part.result.fusion_s == 0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_batches_and_a_stop_change_nothing(tmp_path: Path) -> None:
     whole, asker = driven(spec(READS, TWICE), backend := Polite())
     assert same(whole, driven(spec(READS, TWICE, batch_size=1), Polite())[0])
