@@ -2,31 +2,33 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
 import msgspec
 import pytest
-from former import NAME
+from former import SCENARIO
 
 from harness.core.files import sha256_bytes
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.dataset.schema import scene_id
-from harness.world import scenarios
 from harness.world.state import WorldState
 
 SEED = 3_000_000  # of no layout that ships
+# Of few decisions, whose tree is soon built.
+FEW = replace(SCENARIO, parameters=replace(SCENARIO.parameters, decisions=3, time_limit_s=4.0))
 
 
 @pytest.fixture(scope="session")
 def relabelled(once: Callable[..., Path]) -> Path:
-    """Three report layouts under tune seeds, with every digest and id in order."""
+    """Two report layouts under tune seeds, with every digest and id in order."""
 
     def fill(folder: Path) -> None:
-        build(scenarios.get(NAME), folder / "relabelled", 3, SEED, 1, lambda done: None)
-        relabel(folder / "relabelled", {n: n for n in range(3)})
+        build(FEW, folder / "relabelled", 2, SEED, 1, lambda done: None)
+        relabel(folder / "relabelled", {n: n for n in range(2)})
 
     return once("relabelled", fill) / "relabelled"
 
