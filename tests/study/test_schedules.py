@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
+from relabelling import relabel
 
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
@@ -20,7 +21,6 @@ from harness.core.config import toml
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.core.resources import MARKER, find
-from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.evaluate import asking
 from harness.evaluate.frozen_world import FrozenWorld
@@ -36,18 +36,17 @@ from harness.studies.choices import COSTS, Choices, choices
 from harness.studies.learning import fit, layouts
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.schedules import Candidate, Compared, Play, _area, compare
-from harness.world import scenarios
 
-pytestmark = pytest.mark.usefixtures("unrebuilt")
+pytestmark = pytest.mark.usefixtures("unrebuilt", "svg_alone")
 
 SEED = 100  # of the first layout of `small`
 SIXG = POINTS["6g"]
 POINTS_PLAYED = (
-    "6g", "v2x", "6g:schedule=coverage,max_helpers=2", "6g:schedule=random", "6g:schedule=risk",
-    "6g:schedule=learnt", "6g:schedule=always", "mode4:schedule=deadline,threshold=0.01", "6g:radius_m=30",
+    "6g", "6g:schedule=coverage,max_helpers=2", "6g:schedule=learnt",
+    "mode4:schedule=deadline,threshold=0.01",
 )  # fmt: skip
 MORE_POINTS = (
-    "6g:tau=0.9", "6g:max_helpers=1", "6g:schedule=margin", "v2x:schedule=deadline", "6g:schedule=never",
+    "v2x", "6g:schedule=random", "6g:schedule=risk", "6g:schedule=always", "6g:radius_m=30", "6g:tau=0.9", "6g:max_helpers=1", "6g:schedule=margin", "v2x:schedule=deadline", "6g:schedule=never",
 )  # fmt: skip
 
 
@@ -317,7 +316,7 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
 
 @pytest.mark.slow
 def test_schedules_are_compared_from_the_command_line(
-    stored: ReplayedRun, two_run: Path, harness: Callable[..., Any], tmp_path: Path
+    stored: ReplayedRun, harness: Callable[..., Any], tmp_path: Path
 ):
     typed = (
         "study",
@@ -329,8 +328,6 @@ def test_schedules_are_compared_from_the_command_line(
         "--schedule",
         "learnt",
     )
-    tune = shutil.copytree(two_run, tmp_path / "tune")
-    assert harness(*typed, "--tune", tune, "--quiet", "--out", tmp_path / "tuned")[0] == 0
     code, said, _ = harness(*typed, "--json", "--seeds", "0:1", "--out", tmp_path / "out")
     assert code == 0
     rows = json.loads(said)
@@ -340,6 +337,15 @@ def test_schedules_are_compared_from_the_command_line(
     for success in ("success", "balanced_success"):
         assert all(row[success] <= rows[-1][success] for row in rows)
     assert "balanced %" in (tmp_path / "out/index.html").read_text()
+
+
+@pytest.mark.exhaustive
+def test_schedules_are_compared_by_what_was_best_on_tune_layouts(
+    stored: ReplayedRun, two_run: Path, harness: Callable[..., Any], tmp_path: Path
+):
+    tune = shutil.copytree(two_run, tmp_path / "tune")
+    typed = ("study", "schedule", "compare", stored.run.path, "--schedule", "entropy")
+    assert harness(*typed, "--tune", tune, "--quiet", "--out", tmp_path / "tuned")[0] == 0
 
 
 @pytest.mark.slow
@@ -361,18 +367,11 @@ def test_the_same_twice(stored: ReplayedRun):
 
 
 @pytest.fixture(scope="module")
-def train(tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
-    """A run on train layouts."""
+def train(two_path: Path, tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
+    """A run on layouts that say that they are of train seeds."""
     folder = tmp_path_factory.mktemp("train")
-    build(
-        scenarios.get("occluded-intersection"),
-        folder / "data",
-        1,
-        150_000,
-        1,
-        lambda done: None,
-        False,
-    )
+    shutil.copytree(two_path, folder / "data")
+    relabel(folder / "data", {0: 150_000, 1: 150_001}, purpose="train")
     return ReplayedRun(run(spec_of(load(folder / "data")), folder / "run").out)
 
 
@@ -394,7 +393,7 @@ def test_a_schedule_is_learnt_and_then_one_of_its_name(
     assert harness(*typed)[0] == 0
     text = toml(Path("schedules/mine.toml"), "it")
     assert text["learnt_from"] == [layouts(train, "train")]
-    assert "1 layout" in text["learnt_from"][0]
+    assert "2 layouts" in text["learnt_from"][0]
     mine = SCHEDULES["mine"]
     assert isinstance(mine, Learnt)
     assert mine.threshold == text["threshold"] == named_point("6g:schedule=mine").ask.above
@@ -463,7 +462,7 @@ def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
 def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_path: Path):
     """Read-outs of the model that ships, at the pace of another on a Jetson."""
     spec = spec_of(
-        small, "swarm-tiny", answer="readout", limit=2, points=(SIXG,), seeds=(0,),
+        small, "swarm-tiny", answer="readout", limit=1, points=(SIXG,), seeds=(0,),
         device_profile=devices.load("agx-orin"), device_model="qwen3-4b",
     )  # fmt: skip
     done = run(spec, tmp_path / "run")
