@@ -71,7 +71,7 @@ def in_process(packages: Sequence[Path], folder: Path, *typed: str) -> Said:
     return done.returncode, done.stdout, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_extension_of_the_page_installs_and_runs(tmp_path: Path, two_path: Path) -> None:
     site = tmp_path / "site"
     options = [
@@ -398,7 +398,7 @@ def in_the_core(core: Path, folder: Path, code: str) -> "subprocess.CompletedPro
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_core_writes_the_same_run_without_extensions(
     core: Path, two_path: Path, harness: Typed, tmp_path: Path
 ) -> None:

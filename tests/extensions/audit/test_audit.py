@@ -105,7 +105,7 @@ def test_what_is_known_only_where_there_is_danger_tells_too(known):
     assert list(told_by) == ["number 2"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_number_of_which_one_fold_alone_knows_anything_is_left_out(known):
     """Where that fold's model learns, scikit-learn would have nothing to bin."""
     from sklearn.model_selection import StratifiedGroupKFold
@@ -136,7 +136,7 @@ def telling(seed, parameters):
     return replace(found, spawns=tuple(moved))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_truck_that_is_elsewhere_where_there_is_danger_is_found():
     dials = Parameters(
         danger_share=0.5, sector_shares=(0.5, 0.5, 0.0), decisions=2, time_limit_s=2.0
@@ -220,7 +220,7 @@ def test_the_command_says_the_same_to_people_and_to_machines(harness, monkeypatc
     assert max(map(len, text.splitlines())) <= 80
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_card_of_a_dataset_says_what_its_audit_found(tmp_path, monkeypatch):
     dials = Parameters(
         danger_share=0.5, sector_shares=(1.0, 0.0, 0.0), decisions=1, time_limit_s=1.0

@@ -16,6 +16,7 @@ import evaluating
 import numpy as np
 import pytest
 from run_on_disk import Row, made_up, restated
+from tiers import some
 
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
@@ -336,7 +337,7 @@ def test_a_delay_that_no_card_declares_is_not_taken(
     assert project("benchmark", "verify", made, "--quiet")[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_who_sees_everything_is_known_here_whatever_a_file_says(project: Harness) -> None:
     code, _, err = project(
         "benchmark", "run", "mine-1", "--model", "full-view", "--quiet", "--out", "f"
@@ -352,7 +353,7 @@ def test_who_sees_everything_is_known_here_whatever_a_file_says(project: Harness
     assert "holds no answer for" in err, "that driver comes to other scenes"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> None:
     code, _, err = project(
         "benchmark", "run", "mine-1", "--model", "uniform", "--quiet", "--out", "u"
@@ -363,15 +364,16 @@ def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> No
     assert project("benchmark", "verify", "u.zip", "--quiet")[0] == 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "why"),
-    [
-        (("--limit", "2"), "it has 2 layouts that were selected, and all count"),
-        (("--latency", "card"), "its latency: card, not paper"),
-        (("--seeds", "1:3"), "its seeds: (1, 2), not (0, 1)"),
-        (("--helper-model", "uniform"), None),
-    ],
+    some(
+        [(("--limit", "2"), "it has 2 layouts that were selected, and all count")],
+        exhaustive=[
+            (("--latency", "card"), "its latency: card, not paper"),
+            (("--seeds", "1:3"), "its seeds: (1, 2), not (0, 1)"),
+            (("--helper-model", "uniform"), None),
+        ],
+    ),
 )
 def test_runs_that_are_not_of_the_edition_are_not_packed(
     project: Harness, options: tuple[str, ...], why: str | None
@@ -481,8 +483,7 @@ def pin(file: Path, golden: Path) -> None:
     file.write_text(SHA256.sub(f'sha256 = "{sha256_file(golden)}"', file.read_text()))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", some(["v2v-safety-1.1"], exhaustive=["v2v-safety-1.0"]))
 def test_figures_are_computed_as_a_shipped_edition_pins_them(name: str, tmp_path: Path) -> None:
     """The golden file has texts of `proxy-faulty`:
     strict ones, repaired ones, some that cannot be read.
@@ -494,7 +495,7 @@ def test_figures_are_computed_as_a_shipped_edition_pins_them(name: str, tmp_path
     Here().check(named(name))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_installation_that_computes_a_figure_otherwise_says_so(
     project: Harness, tmp_path: Path
 ) -> None:

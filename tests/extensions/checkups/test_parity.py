@@ -98,6 +98,7 @@ def test_other_weights_are_found_to_differ_and_where_is_named(unlike: Path, smal
     assert found["F32: greedy text equal"].holds
 
 
+@pytest.mark.exhaustive
 def test_the_command_says_each_finding_in_a_line_and_exits_with_1(
     unlike: Path, small_path: Path
 ) -> None:

@@ -28,7 +28,7 @@ def test_twelve_questions_of_twelve_tune_layouts_each_with_one_conflict() -> Non
         assert len({str(request.messages) for request in requests}) == 12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_question_is_as_the_dataset_freezes_it(tmp_path: Path) -> None:
     built = [
         "dataset",

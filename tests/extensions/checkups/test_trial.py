@@ -113,7 +113,7 @@ def test_a_question_without_an_answer_is_no_answer() -> None:
         try_out(Broken(lambda request: ""), EXAMPLES)  # type: ignore[arg-type]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_command_asks_a_real_model_and_says_what_it_did(small_path: Path) -> None:
     pytest.importorskip("torch")
     asked = ["prompt", "check", "v2", "--model", "swarm-tiny", "--engine", "transformers"]

@@ -114,7 +114,7 @@ def furthest(model: str, wire: str, asked: Sequence[Request], letters: str | Non
     ("model", "letters"),
     [
         ("sparrow-robot", None),
-        pytest.param("swarm-tiny", None, marks=pytest.mark.slow),
+        pytest.param("swarm-tiny", None, marks=pytest.mark.exhaustive),
         pytest.param("swarm-tiny", "cyclic", marks=pytest.mark.slow),
     ],
 )
@@ -398,7 +398,7 @@ def test_who_may_not_ask_is_told_so(url: str) -> None:
         )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_model_that_reads_letters_says_what_it_cannot_read() -> None:
     with answering(needs("swarm-tiny")) as there:
         many = post(there, "systemone", {"state": "s", "questions": {"a": choice(11)}})

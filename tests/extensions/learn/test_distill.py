@@ -83,6 +83,7 @@ def few(once: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Lessons]:
         ]
 
 
+@pytest.mark.exhaustive
 def test_of_each_level_as_many_are_learnt_from_as_a_whole_tree_has():
     forest = load(folder("datasets") / "occluded-intersection-v2", 10).forest
     chosen = forest.drivers[lessons.TEACHER]
@@ -395,6 +396,7 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
         )
 
 
+@pytest.mark.exhaustive
 def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_path: Path) -> None:
     plan = replace(PLAN, samples={**PLAN.samples, "alone": 8, "messages": 1})
     with pytest.raises(
@@ -475,6 +477,7 @@ def test_it_learns_from_every_level_of_a_tree(few: list[Lessons]) -> None:
             assert all(steps.count(step) <= PER_LEVEL for step in steps)
 
 
+@pytest.mark.exhaustive
 def test_a_layout_teaches_the_same_wherever_it_is_drawn(few: list[Lessons]) -> None:
     again = msgspec.json.encode(few_points(PASSING, CURRICULUM.seed + 1, 1))
     assert msgspec.json.decode(again, type=list[lessons.Point]) == [

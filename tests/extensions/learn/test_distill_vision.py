@@ -256,6 +256,7 @@ def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
             assert completion.prompt_tokens > VISION.tokens
 
 
+@pytest.mark.exhaustive
 def test_both_engines_answer_its_image_prompts_alike(folder: Path, asked: list[Question]):
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     requests = [request(q) for q in asked[:2]]

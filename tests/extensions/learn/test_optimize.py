@@ -316,7 +316,7 @@ def test_the_best_on_tune_layouts_is_certified_on_report_layouts(
     assert not (tmp_path / "reports" / "new" / ".work").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stopped_search_goes_on_and_comes_to_the_same(
     optimize: Typed, model: Model, tmp_path: Path
 ) -> None:
@@ -338,7 +338,7 @@ def test_a_stopped_search_goes_on_and_comes_to_the_same(
     assert len(model.chats) == asked, "nothing was asked twice"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_suite_is_certified_family_by_family(
     optimize: Typed, tmp_path: Path, small_path: Path
 ) -> None:
@@ -528,7 +528,7 @@ def test_feedback_on_a_course_is_on_its_worst_decision(small: Dataset) -> None:
     assert text.endswith("The episode failed.")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gepa_rewrites_the_system_text_by_what_went_wrong(
     optimize: Typed, model: Model, tmp_path: Path, small: Dataset
 ) -> None:
@@ -555,7 +555,7 @@ def test_gepa_rewrites_the_system_text_by_what_went_wrong(
     assert record["questions"] <= 200
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_lone_surrogate_of_a_reflecting_model_is_a_text_of_its_own(
     optimize: Typed, model: Model, tmp_path: Path
 ) -> None:

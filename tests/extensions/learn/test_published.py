@@ -298,6 +298,7 @@ def test_a_decisions_gradient_is_the_exact_policy_gradient() -> None:
     assert imitated.grad[0].tolist() == pytest.approx([0.2 - 0.6, 0.5, 0.3 - 0.4])
 
 
+@pytest.mark.exhaustive
 def test_a_value_is_what_the_episode_comes_to_when_the_decision_is_played() -> None:
     """Played in the simulator from the start of a layout, action by action."""
     scenario = PASSING
@@ -329,6 +330,7 @@ def test_layouts_with_a_danger_weigh_as_much_as_those_without() -> None:
     assert share(plain.weights) != pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.exhaustive
 def test_the_value_rises_where_it_is_what_is_learnt(tmp_path: Path) -> None:
     samples = {"excerpts": 0, "alone": 16, "messages": 8, "answers": 0}
     # At this rate the value rises by a fifth, far from what other hardware rounds.
@@ -347,6 +349,7 @@ def test_a_training_that_was_begun_before_there_were_objectives_goes_on() -> Non
     assert replace(PLAN, objective="values").settings()["objective"] == "values"
 
 
+@pytest.mark.exhaustive
 def test_all_weights_of_a_base_can_learn(tmp_path: Path) -> None:
     plan = replace(
         PLAN,

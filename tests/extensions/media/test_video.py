@@ -120,7 +120,7 @@ def test_an_episode_is_drawn_as_an_mp4_that_lasts_as_long(short, tmp_path, monke
     assert [p.name for p in tmp_path.iterdir()] == ["episode.mp4"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_same_episode_gives_the_same_gif(short, drawn, tmp_path):
     write_video(find(short, 0, None, None), tmp_path / "again.gif", lambda done: None)
     assert (tmp_path / "again.gif").read_bytes() == drawn[0].read_bytes()
@@ -149,7 +149,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     assert [p.name for p in tmp_path.iterdir()] == ["folder.gif"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     # How each is drawn to its end is tested apart.
@@ -202,7 +202,7 @@ def test_an_old_episode_played_again_ends_as_it_did(commit):
     assert last.outcome.startswith(f"{row.failure or 'cleared'} at {row.time_s:.1f} s")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_episode_of_agents_played_again_ends_as_it_did(tmp_path):
     spec = live_spec_of(
         prompt="v4",

@@ -100,7 +100,7 @@ def test_every_seed_has_every_kind_of_episode_in_its_share() -> None:
         assert saved.sum() in (31, 32, 33)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_luck_is_spread_over_those_whom_it_decides() -> None:
     """Of 32 whom only the first helper saves, .6 x .6 hear it at 40 % loss:
     11.5, and never 7 or 16.

@@ -13,8 +13,8 @@ TRIALS = {
         "It is no evidence that a language model would give them",
     ),
     "closed-loop": Trial(
-        "study closed-loop --model proxy --workers 1", "--episodes 2 --seeds 0",
-        "--episodes 2 --seeds 0 --prompt v1", 
+        "study closed-loop --model proxy --workers 1", "--episodes 1 --seeds 0",
+        "--episodes 1 --seeds 0 --prompt v1", 
             "was begun with --prompt v2, "
             "and not with --prompt v1",
         {"--scenario nowhere": "nowhere", "--prompt v0": "v0"},

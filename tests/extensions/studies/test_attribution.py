@@ -207,7 +207,7 @@ def test_a_message_left_out_of_a_pool_is_exact_and_asks_nobody(
     assert moved["helper with sight"] > moved["helper without sight"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_helpers_that_were_never_asked_are_asked_first(
     made: Callable[..., Path], judging: Judging
 ) -> None:
@@ -226,7 +226,7 @@ def test_helpers_that_were_never_asked_are_asked_first(
     ] == [True]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rule_with_memory_keeps_it(made: Callable[..., Path]) -> None:
     """It is the mean of now and of what it remembers,
     so half of what moves now moves it after step 0.
@@ -280,7 +280,7 @@ def test_the_draw_is_no_choice_and_a_larger_one_has_the_smaller(made: Callable[.
     assert len(draw(source, SIXG.name, 10**6, 0)[0]) == of
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_killed_one_goes_on_and_asks_nothing_twice(
     made: Callable[..., Path], judging: Judging
 ) -> None:
@@ -386,7 +386,7 @@ def test_no_object_can_be_left_out_of_a_picture(
     assert attribute(ReplayedRun(text), "single-local", 2, 0).left_out
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_typed_it_says_what_moves_most_in_eighty_columns(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:

@@ -85,7 +85,7 @@ def test_a_driver_drives_as_its_frozen_scenes_say(runs: list[Path]) -> None:
     assert disagreements(found.episodes).empty
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_command_writes_a_page_and_says_the_largest_difference(
     runs: list[Path], harness: Callable[..., Said]
 ) -> None:

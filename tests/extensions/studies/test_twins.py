@@ -16,6 +16,7 @@ from evaluating import Scripted, failed, says, spec_of, with_ego
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
+from tiers import some
 
 from harness.backends.base import Completion, Request
 from harness.core.errors import UserError
@@ -142,7 +143,7 @@ def test_an_oncoming_left_turn_has_no_mirrored_twin(crossing: Dataset) -> None:
     assert all(graph == twin for graph, twin in turns)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_planner_mirrors_at_the_intersection_and_keeps_right_on_the_motorway() -> None:
     """The counts of docs/decisions/0038."""
     held = {}
@@ -325,8 +326,7 @@ def test_every_paraphrase_is_of_a_sentence_that_ships() -> None:
 # What a study finds
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["proxy", "local-view"])
+@pytest.mark.parametrize("model", some(["proxy"], exhaustive=["local-view"]))
 def test_who_reads_the_scene_holds_in_every_twin_that_says_the_same(
     family: Dataset, model: str, tmp_path: Path
 ) -> None:
@@ -570,7 +570,7 @@ def test_the_command_prints_writes_and_gates(
     assert links.targets <= links.ids
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_change_nothing(
     harness: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:

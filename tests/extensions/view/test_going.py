@@ -143,7 +143,7 @@ def test_a_run_that_may_stop_early_has_that_many_at_most(reports: Path) -> None:
     assert extent(reports / "begun") == Extent(going=False, done=0, due=40, early=True, answers=0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_episodes_that_are_driven_are_counted_as_they_end(
     reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
