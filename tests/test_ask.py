@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluating import Watched, made
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Backend, Request
@@ -61,9 +62,12 @@ def n_answers(folder: Path) -> int:
     return len(read(folder).answers)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "source", [frozen(2), LiveSource(1_000_000, 1)], ids=["frozen", "closed loop"]
+    "source",
+    [
+        pytest.param(frozen(2), id="frozen", marks=pytest.mark.slow),
+        pytest.param(LiveSource(1_000_000, 1), id="closed loop", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_decisions_are_those_of_asking_all(source: Source, tmp_path: Path) -> None:
     names = POINTS if source.kind == "closed-loop" else (*POINTS, "v2x:messages=shuffled")
@@ -99,7 +103,7 @@ class Stops(Exception):
     pass
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stopped_run_asks_the_same_in_the_same_batches(tmp_path: Path) -> None:
     batches: dict[str, list[tuple[str, ...]]] = {}
 
@@ -167,7 +171,7 @@ def test_a_study_of_a_run_that_asked_few_is_that_of_one_that_asked_all(tmp_path:
     assert not (tmp_path / "alone" / replayed_run.MORE).exists()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,8 +189,7 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     assert f"one of {len(source.left_out)} decision points" in " ".join(bench.caveats)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ask", ["used", "all"])
+@pytest.mark.parametrize("ask", some(["used"], exhaustive=["all"]))
 def test_how_much_is_asked_is_said_once_and_first(ask: str, tmp_path: Path) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     evaluate(

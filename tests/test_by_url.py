@@ -15,6 +15,7 @@ import pytest
 from misbehaving import Asked, Play, completion, serving
 from served import answer, llama_cpp_server
 from test_server_identity import SERVERS, answering
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.openai import http
@@ -263,8 +264,7 @@ latency = {source = "paper", basis = "none declared"}
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("brought", ["a URL", "a file of weights", "a server"])
+@pytest.mark.parametrize("brought", some(["a URL"], exhaustive=["a file of weights", "a server"]))
 def test_a_run_of_what_the_user_brought_runs_again_as_the_first_line_of_its_file_says(
     brought: str, small_path: Path, harness: Callable[..., tuple[int, str, str]]
 ) -> None:

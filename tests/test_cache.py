@@ -308,7 +308,7 @@ def _write(path: str, first: int) -> None:
         cached.complete([replace(BASE, sample=i), replace(BASE, sample=i + 20)])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_processes_that_write_at_once_lose_nothing(
     file: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -359,7 +359,7 @@ def tiny_run(tiny: Path, data: Dataset, out: Path, cache: Path | None, **options
     return evaluate(spec, out, lambda done: None, cache)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_from_the_cache_is_the_run_that_was_asked(
     tiny: Path, small_path: Path, tmp_path: Path, file: Path
 ) -> None:
@@ -469,7 +469,7 @@ def test_a_served_models_answers_are_kept_and_its_key_is_not(
     assert not any(b"5ecret" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_gguf_files_answers_are_kept_too(small_path: Path, tmp_path: Path, file: Path) -> None:
     """Its prompts are rendered in another process."""
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")

@@ -199,7 +199,7 @@ def test_a_gguf_file_that_drops_the_system_text_is_refused(
     assert "message 1 of 2, the system's" in err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_checkpoint_whose_end_is_another_token_ends_where_its_template_says(
     harness: Harness, tmp_path: Path
 ) -> None:

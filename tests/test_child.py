@@ -73,6 +73,7 @@ def test_who_kills_the_engine_time_after_time_is_an_error_and_the_others_are_ans
     child.close()
 
 
+@pytest.mark.exhaustive
 def test_a_death_by_company_costs_nobody_an_answer(tmp_path: Path) -> None:
     child = mortal(tmp_path)
     answers = child.complete([ask("hello"), ask("die in company")])
@@ -97,6 +98,7 @@ def test_an_engine_killed_while_idle_is_started_again(tmp_path: Path) -> None:
     child.close()
 
 
+@pytest.mark.exhaustive
 def test_an_engine_that_somebody_stops_is_ended_and_its_question_asked_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,6 +127,7 @@ def test_an_engine_that_is_stopped_for_a_moment_goes_on(
     child.close()
 
 
+@pytest.mark.exhaustive
 def test_deaths_while_loading_are_tried_again_and_then_said(tmp_path: Path) -> None:
     child = mortal(tmp_path, deaths=LOADS - 1)
     assert born(tmp_path) == LOADS

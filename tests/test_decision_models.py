@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from evaluating import run, scenes_of, spec_of, with_ego
 from misbehaving import Asked, Server, serving
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
@@ -330,8 +331,7 @@ def listening(port: int) -> bool:
         return client.connect_ex(("127.0.0.1", port)) == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["general", "robot"])
+@pytest.mark.parametrize("kind", some(["robot"], exhaustive=["general"]))
 def test_a_real_model_answers_in_process_as_through_its_own_server(kind: str) -> None:
     """In all six families; both state probabilities to four digits."""
     pytest.importorskip("sparrow_decider", reason="needs the sparrow extra")

@@ -417,8 +417,8 @@ def company_changes_nothing(backend: LanguageModel, requests: list[Request]) -> 
     same([backend.complete([request])[0] for request in requests], together)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.lists(REQUESTS, max_size=7))
+@settings(max_examples=4, deadline=None)
+@given(st.lists(REQUESTS, max_size=4))
 def test_company_never_changes_an_answer(backend: LanguageModel, requests: list[Request]) -> None:
     company_changes_nothing(backend, requests)
 

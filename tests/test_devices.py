@@ -294,7 +294,7 @@ def test_a_faster_device_never_decides_later(
     assert latency_s(slow * np.array(shares)) <= latency_s(slow) + 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
     """Who is in time follows from tokens, not from how fast this machine is at the moment."""
     spec = spec_of(
@@ -335,7 +335,7 @@ class Wordy(Scripted):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_count_a_models_tokens_as_one_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

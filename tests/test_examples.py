@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from evaluating import Scripted, live_spec_of, run, scenes_of, spec_of, with_ego
 from graphs import ACTIONS, CAR, COMING, STANDING, TRUCK, graph
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.registry import open_backend
@@ -233,8 +234,7 @@ def test_reasons_may_stand_before_an_answer_where_the_prompt_asks_for_them() -> 
 # --------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("answer", ["json", "constrained", "readout"])
+@pytest.mark.parametrize("answer", some(["readout"], exhaustive=["json", "constrained"]))
 def test_the_model_that_ships_takes_earlier_turns(answer: Any, small: Dataset) -> None:
     pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     spec = with_examples(with_ego(spec_of(small, "swarm-tiny", batch_size=4), answer=answer))

@@ -12,7 +12,6 @@ import pytest
 from corpus import ACTIONS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiers import some
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -108,7 +107,7 @@ def values(schema: Any) -> st.SearchStrategy[Any]:
 
 
 @pytest.mark.slow
-@settings(deadline=None)
+@settings(deadline=None, max_examples=15)
 @given(st.sampled_from(SHAPES), st.randoms(use_true_random=False))
 def test_whatever_a_model_chooses_fits_and_is_read(shape: Shape, random: Any) -> None:
     skeleton = Skeleton(CHARACTERS, shape)
@@ -166,7 +165,7 @@ def test_a_number_is_one_of_a_hundred_to_a_thousand(
 
 
 @pytest.mark.slow
-@settings(deadline=None)
+@settings(deadline=None, max_examples=15)
 @given(
     st.fixed_dictionaries({}, optional={k: values(v) for k, v in json.loads(EGO.extension).items()})
 )
@@ -203,7 +202,7 @@ def test_unasked_for_they_are_a_field_too_many() -> None:
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=10)
 @given(st.data(), st.sampled_from(SHAPES))
 def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape: Shape) -> None:
     asked = request(shape)
@@ -255,7 +254,8 @@ def test_a_version_says_what_it_adds_and_has_room_for_it(copied: Path) -> None:
         assert valid(shape, json.dumps(plainest(answer_schema(**shape._asdict()))))
 
 
-@pytest.mark.parametrize("engine", some(["transformers"], exhaustive=["llama-cpp"]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])
 def test_a_real_model_fills_in_what_a_version_adds(engine: str, copied: Path) -> None:
     pytest.importorskip({"transformers": "torch", "llama-cpp": "llama_cpp"}[engine])
     mine = versions.load("mine", copied)

@@ -129,8 +129,7 @@ def by_hand(
     return dict(zip(listed, intent, strict=True))
 
 
-@pytest.mark.slow
-@LETTERS
+@pytest.mark.parametrize("letters", some(["raw"], exhaustive=["cyclic"]))
 def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, small: Dataset) -> None:
     pytest.importorskip("torch", reason="needs the transformers extra")
     spec = spec_with(small, letters)

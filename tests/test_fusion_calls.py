@@ -405,7 +405,7 @@ def test_what_another_process_has_asked_meanwhile_is_not_asked_again(
     assert len(ids) == len(set(ids)) > len(kept.splitlines())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_points_that_are_walked_together_make_the_calls_of_each(
     done: Evaluated, tmp_path: Path
 ) -> None:

@@ -373,7 +373,7 @@ def test_a_model_of_texts_is_asked_no_picture(
     assert len(there.asked) == 2 * 3 + examined
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

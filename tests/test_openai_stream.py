@@ -259,7 +259,7 @@ SENT = given(st.lists(json_values | st.binary().map(lambda data: b"data: " + dat
 
 
 @pytest.mark.slow
-@settings(max_examples=30)
+@settings(max_examples=10)
 @SENT
 def test_whatever_comes_is_an_answer_or_a_fault(sent: list[Any]) -> None:
     is_answer_or_fault(sent)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from small_hub import COMMIT, serving
+from tiers import some
 
 from harness.backends.card import Card, Latency
 from harness.backends.weights import check_digest
@@ -120,21 +121,22 @@ def test_a_file_that_is_not_what_its_card_says_is_refused(tmp_path: Path) -> Non
         check_digest(card, file)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("repositories", "said"),
-    [
-        ({}, "there is no {url}/some/model, or it is private; see `hf auth login`"),
-        (
-            {"some/model": {}},
-            "{url}/some/model asks for its licence to be accepted; do so on that page",
-        ),
-        ({"some/model": {"config.json": b"{}"}}, "has no weights (*.safetensors)"),
-        (
-            {"some/model": {**CHECKPOINT, "model.safetensors": None}},
-            "cannot fetch {url}/some/model: peer closed",
-        ),
-    ],
+    some(
+        [({}, "there is no {url}/some/model, or it is private; see `hf auth login`")],
+        exhaustive=[
+            (
+                {"some/model": {}},
+                "{url}/some/model asks for its licence to be accepted; do so on that page",
+            ),
+            ({"some/model": {"config.json": b"{}"}}, "has no weights (*.safetensors)"),
+            (
+                {"some/model": {**CHECKPOINT, "model.safetensors": None}},
+                "cannot fetch {url}/some/model: peer closed",
+            ),
+        ],
+    ),
 )
 def test_what_a_hub_refuses_is_one_line(
     repositories: Mapping[str, Mapping[str, bytes | None]], said: str, tmp_path: Path

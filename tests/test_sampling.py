@@ -150,7 +150,7 @@ def test_greedy_and_drawn_answers_share_a_batch(card: Card) -> None:
 
 
 def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
-    """The first token of 600 answers to one question:
+    """The first token of 200 answers to one question:
     the likeliest ones' shares within 4 standard errors.
     """
     import torch
@@ -165,7 +165,7 @@ def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
     with torch.inference_mode():
         row = hot.engine.model(torch.tensor([ids])).logits[0, -1].double() / 1.5
     p = row.softmax(-1).numpy()
-    n = 600
+    n = 200
     texts = [
         c.text
         for c in hot.complete([ask(2, max_tokens=1, temperature=1.5, sample=s) for s in range(n)])
@@ -211,7 +211,7 @@ def test_a_run_is_drawn_by_its_sampling_seed(small: Dataset, tiny: Path, tmp_pat
         answer="constrained",
         temperature=1.0,
         sampling_seed=1,
-        limit=2,
+        limit=1,
         points=alone,
     )
     one, again = (run(spec.changed(batch_size=n), tmp_path / str(n)) for n in (8, 3))
@@ -242,7 +242,7 @@ def agent_of(model: Path, answer: AnswerMode = "json") -> Agent:
     return Agent(resolve(str(model)), versions.load("v2"), answer)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_replay_asks_on_as_the_run_was_asked(
     small: Dataset, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -280,7 +280,7 @@ STATED = given(st.dictionaries(st.text(), json_values), st.sampled_from([*SERVER
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=8)
 @STATED
 def test_whatever_is_stated_is_a_short_identity(facts: dict[str, Any], kind: Kind) -> None:
     is_short(facts, kind)

@@ -8,7 +8,7 @@ import zlib
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from misbehaving import Asked, completion, event, pieces, serving
 
@@ -211,6 +211,7 @@ json_values = st.recursive(
 
 
 @pytest.mark.slow
+@settings(max_examples=15)
 @given(st.lists(json_values))
 def test_whatever_parts_come_are_texts_or_an_error(parts: list[Any]) -> None:
     said = read(completion(parts), request())

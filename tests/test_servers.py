@@ -459,9 +459,10 @@ def parted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_module, "TREES_AT_ONCE", 1)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "cached",
-    [pytest.param(False, marks=pytest.mark.exhaustive), pytest.param(True, marks=pytest.mark.slow)],
+    [False, True],
 )
 def test_workers_ask_what_one_process_asks(
     parted: None, small: Dataset, tmp_path: Path, cached: bool
@@ -483,7 +484,7 @@ def test_workers_ask_what_one_process_asks(
     assert ids[0] == ids[1] == sorted(answer.id for answer in folder.read(runs[1]).answers)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_together_have_no_more_at_a_server_than_one_process_may(
     parted: None, small: Dataset, tmp_path: Path
 ) -> None:
@@ -505,7 +506,7 @@ def test_workers_together_have_no_more_at_a_server_than_one_process_may(
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        pytest.param(1, 3, marks=pytest.mark.slow),
+        pytest.param(1, 3, marks=pytest.mark.exhaustive),
         pytest.param(3, 1, marks=pytest.mark.exhaustive),
         pytest.param(3, 2, marks=pytest.mark.exhaustive),
     ],
@@ -580,7 +581,7 @@ def test_which_server_gave_each_answer_stands_beside_the_tables(
     assert not any(one.encode() in (out / name).read_bytes() for name in FILES)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_that_is_stopped_and_goes_on_still_says_who_answered(
     small: Dataset, tmp_path: Path
 ) -> None:
@@ -612,7 +613,7 @@ def test_the_shards_lines_are_put_together_and_a_torn_one_is_left_out(tmp_path: 
     ]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_answer_of_one_server_is_kept_for_all_that_serve_the_same(
     small: Dataset, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -626,7 +627,7 @@ def test_an_answer_of_one_server_is_kept_for_all_that_serve_the_same(
     assert same_decisions(done.out, whole)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: Path) -> None:
     """Each answer takes a minute."""
 

@@ -50,6 +50,7 @@ def intents(engine: str, questions: list[Request]) -> Floats:
     return np.array([list(json.loads(c.text)["action_distribution"].values()) for c in completions])
 
 
+@pytest.mark.exhaustive
 def test_its_picture_tokens_see(shipped: Dataset) -> None:
     """What each token of a picture is read as, on report layouts;
     its decisions make no use of it yet.

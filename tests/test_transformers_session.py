@@ -29,7 +29,7 @@ SHAPE: dict[str, Any] = {
 }  # fmt: skip
 EVERY = list(range(64))
 tokens = st.integers(0, 63)
-few = settings(max_examples=20)
+few = settings(max_examples=8)
 
 
 def full_attention() -> Any:
