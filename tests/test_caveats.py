@@ -152,7 +152,7 @@ def test_whatever_shows_a_run_says_the_same_of_it_in_the_same_order(
     assert json.loads(harness("compare", "run", "again", "--json")[1])["caveats"] == every
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_that_said_nothing_says_so_wherever_it_is_shown(
     small_path: Path, harness: Callable[..., Said]
 ) -> None:

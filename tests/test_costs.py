@@ -222,7 +222,7 @@ def test_a_wrong_price_is_one_line(
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_suite_costs_what_its_runs_cost(there: Server, harness: Typed) -> None:
     code, said, error = harness(
         "eval", "--model", "mine", "--dataset", "suite:v2v-safety-2", "--limit", "1", "--condition", "6g",
@@ -237,7 +237,7 @@ def test_a_suite_costs_what_its_runs_cost(there: Server, harness: Typed) -> None
     assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_processes_that_drive_add_up_what_they_spend(there: Server, harness: Typed) -> None:
     typed = (
         "drive", "--model", "mine", "--condition", "6g", "--seeds", "0:1", "--episodes", "40", "--no-cache",

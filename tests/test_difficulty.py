@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_on_disk import configure
 from scipy.stats import t as student
+from tiers import some
 
 from harness.coordination.operating_point import POINTS
 from harness.core import covariate
@@ -111,13 +112,13 @@ def test_an_estimate_stays_within_its_bounds() -> None:
 def test_where_nothing_can_be_corrected_there_is_none() -> None:
     values, known = drawn(4, 40, 90)
     few = LEAST - 1
-    for some, of_some, of_all in (
+    for part, of_part, of_all in (
         (values, known[:40], known[:40]),
         (values[:few], known[:few], known),
         (np.ones(40), known[:40], known),
         (values, np.ones((40, 2)), known),
     ):
-        assert corrected(rate_interval(some), some, of_some, of_all, 0.0) is None
+        assert corrected(rate_interval(part), part, of_part, of_all, 0.0) is None
     unbounded = Estimate(0.5, math.nan, math.nan, 1, 0)
     assert worth(unbounded, unbounded) == 1.0
 
@@ -164,7 +165,7 @@ def test_a_run_of_some_layouts_states_its_success_corrected_for_all(runs: dict[s
     assert not [score for score in full.scores if score.metric in ADJUSTED.values()]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_first_layouts_of_a_run_are_a_run_of_the_first_layouts(runs: dict[str, Path]) -> None:
     some, full = read(runs["some"]), read(runs["more"])
     first = [e for e in full.episodes if e.episode < ASKED]
@@ -193,7 +194,7 @@ def test_two_runs_are_compared_corrected_and_gated(runs: dict[str, Path], harnes
         judge(gate("adjusted_success_rate < 0"), alike)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_difference_of_references_is_that_of_all_layouts_and_is_said(
     runs: dict[str, Path], harness: Typed
 ) -> None:
@@ -234,7 +235,7 @@ def test_words_say_also_what_is_worse() -> None:
     assert as_good_as(plain, wider) == "as good as 0.9 times as many layouts"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those asked are among them, wherever they are drawn from."""
     monkeypatch.setattr(frozen_world, "MOST_KNOWN", 2)
@@ -265,18 +266,21 @@ def corrected_anew(run: Path) -> None:
     (run / "summary.csv").write_text(csv_text(Score, scores, stated.manifest.variant))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
-    [
-        (
-            lambda text: text.replace("0.0,0.0,0.09", "0.0,7.0,0.09", 1),
-            "episode 0: a success that is not",
-        ),
-        (lambda text: text.replace("\n0,left", "\n900,left", 1), "lacks one of the run's"),
-        (lambda text: text.replace("\n0,left", "\n0,none", 1), "lacks one of the run's"),
-        (lambda text: text.replace("cruise", "crews", 1), "it lacks cruise"),
-    ],
+    some(
+        [
+            (
+                lambda text: text.replace("0.0,0.0,0.09", "0.0,7.0,0.09", 1),
+                "episode 0: a success that is not",
+            )
+        ],
+        exhaustive=[
+            (lambda text: text.replace("\n0,left", "\n900,left", 1), "lacks one of the run's"),
+            (lambda text: text.replace("\n0,left", "\n0,none", 1), "lacks one of the run's"),
+            (lambda text: text.replace("cruise", "crews", 1), "it lacks cruise"),
+        ],
+    ),
 )
 def test_a_strangers_difficulty_is_one_line(
     change: Callable[[str], str], says: str, runs: dict[str, Path], tmp_path: Path, harness: Typed

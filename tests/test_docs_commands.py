@@ -406,7 +406,7 @@ def test_a_cheap_page_can_be_followed_and_shows_what_is_printed(
     followed.end()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "docs/tutorial-radio.md"], ids=name)
 def test_what_several_pages_show_is_printed(
     page: Path, reader: Harness, copied: Copied, monkeypatch: pytest.MonkeyPatch

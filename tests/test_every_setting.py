@@ -124,7 +124,9 @@ def test_each_setting_is_typed_in_some_run() -> None:
             )
 
 
-MARKS = {**dict.fromkeys(RUNS, pytest.mark.slow), **dict.fromkeys(NEEDS, pytest.mark.exhaustive)}
+# What is driven is until it is narrow or decided as what is frozen is.
+RARE = (*NEEDS, "driven until narrow", "driven until decided")
+MARKS = {**dict.fromkeys(RUNS, pytest.mark.slow), **dict.fromkeys(RARE, pytest.mark.exhaustive)}
 
 
 @pytest.mark.parametrize("run", [pytest.param(run, marks=mark) for run, mark in MARKS.items()])

@@ -110,7 +110,7 @@ def test_what_needs_an_extra_says_in_one_line_which(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_python_needs_no_extra_for_what_the_commands_need_none_for(tmp_path: Path) -> None:
     assert bare(tmp_path, script=FROM_PYTHON) == ""
 
@@ -138,7 +138,7 @@ NO_FIGURES = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_study_without_matplotlib_has_its_tables_and_page_and_says_what_figures_need(
     tmp_path: Path,
 ) -> None:

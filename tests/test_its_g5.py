@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiers import some
 
 from harness.core.errors import UserError
 from harness.radio import back_off
@@ -173,11 +174,7 @@ def simulated(
     return met / sent, float(np.mean(waited)) * SLOT_S, busy / slots
 
 
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "vehicles", [40, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (80, 120)), 160]
-)
+@pytest.mark.parametrize("vehicles", some([160], exhaustive=[40, 80, 120]))
 def test_collisions_and_waits_are_those_of_simulated_slots(vehicles):
     """400 000 slots at busy ratios from .13 to .5, with packets of 25 slots behind an AIFS of 8."""
     runs = [simulated(vehicles, 25, 8, 15, 100_000, seed) for seed in range(4)]

@@ -95,7 +95,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def with_package(project: Path, small_path: Path) -> dict[Words, Said]:
     """What is typed where the package is installed: two runs, a sweep, a report and mistakes."""
-    evaluated = ("eval", "--model", "mine", "--dataset", str(small_path))
+    evaluated = ("eval", "--model", "mine", "--dataset", str(small_path), "--limit", "2")
     driven = ("drive", "--model", "mine", "--episodes", "2", "--seeds", "0:2", "--out", "driven")
     over = (
         "--over",

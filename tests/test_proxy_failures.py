@@ -152,7 +152,7 @@ def test_a_slow_answer_is_late_by_what_was_declared(small: Dataset, tmp_path: Pa
     assert min(arrivals) < 400 < max(arrivals), "a slow helper is heard late"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_neither_batches_nor_a_replay_nor_company_change_a_failure(
     small: Dataset, tmp_path: Path
 ) -> None:

@@ -434,7 +434,7 @@ def test_a_difference_says_that_there_is_a_repair_turn() -> None:
     assert change.texts["ego.j2"].added > 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_check_counts_the_longest_repair_turn(
     harness: Harness, small_path: Path, tmp_path: Path
 ) -> None:

@@ -60,7 +60,9 @@ def without_company(answers: list[Answer]) -> list[Answer]:
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("batch_size", [1, 3, 64, 1000])
+@pytest.mark.parametrize(
+    "batch_size", [3, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (1, 64, 1000))]
+)
 def test_the_batch_size_changes_no_byte_of_the_proxys_run(
     batch_size: int, proxy_run: Path, small: Dataset, tmp_path: Path
 ) -> None:
@@ -124,7 +126,7 @@ def tiny_spec(tiny: Path, data: Dataset, **options: Any) -> Spec:
     return made(ego, source, points=points, seeds=(0,), **device, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_batch_size_changes_no_answer_of_a_language_model(
     tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:
@@ -144,7 +146,7 @@ def test_the_batch_size_changes_no_answer_of_a_language_model(
     assert len({a.raw for a in runs[1]}) > 5, "answers that are all alike would show no order"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_prompts_that_are_too_long_for_the_model_got_no_answer(
     tiny: Path, small_path: Path, tmp_path: Path
 ) -> None:
@@ -440,7 +442,13 @@ def test_the_luck_is_the_same_for_every_prompt_and_model(small: Dataset, tmp_pat
     assert links[0] == links[1]
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize(
+    "driver",
+    [
+        "full-view",
+        *(pytest.param(n, marks=pytest.mark.exhaustive) for n in DRIVERS if n != "full-view"),
+    ],
+)
 def test_a_driver_decides_alike_in_every_condition_and_sends_nothing(
     driver: str, small: Dataset, tmp_path: Path
 ) -> None:

@@ -362,7 +362,7 @@ def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
     assert harness("run", "check", drive)[0] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
     drive: Path, harness: Harness
 ) -> None:
@@ -380,7 +380,7 @@ def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
     assert harness("report", drive)[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_latency_of_a_driven_run_is_held_against_its_source(
     drive: Path, harness: Harness
 ) -> None:

@@ -99,7 +99,7 @@ def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
     _becomes_whole(out, whole, to_kill)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_killed_between_two_walks_of_a_part_it_is_the_same_run(
     whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path
 ) -> None:
@@ -142,7 +142,9 @@ def answers(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return kept.read_bytes()
 
 
-@pytest.mark.parametrize("torn", [1, 5, 300, 20_000])
+@pytest.mark.parametrize(
+    "torn", [300, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (1, 5, 20_000))]
+)
 def test_a_torn_last_line_is_dropped_and_asked_again(
     torn: int, proxy_run: Path, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
@@ -296,7 +298,7 @@ def test_a_run_is_written_by_one_process_at_a_time(
     run(spec_of(small), out)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_read_out_over_cyclic_orders_goes_on_where_it_was_killed(
     small: Dataset, tmp_path: Path
 ) -> None:

@@ -433,7 +433,7 @@ NASTY = st.text(max_size=40) | st.sampled_from(
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=30, suppress_health_check=list(HealthCheck))
+@settings(deadline=None, max_examples=8, suppress_health_check=list(HealthCheck))
 @given(lines=st.lists(NASTY, min_size=4, max_size=4), error=st.text(max_size=10))
 def test_whatever_is_said_the_record_is_one_json_object_a_line(
     lines: list[str], error: str, played: Dataset, tmp_path_factory: pytest.TempPathFactory

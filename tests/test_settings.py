@@ -85,7 +85,7 @@ def test_an_evaluation_states_the_settings_that_make_it(small: Dataset) -> None:
         spec.changed(seeds="1:2")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path: Path) -> None:
     asked = (
         "eval",

@@ -144,7 +144,7 @@ def test_the_page_is_the_same_once_the_prompt_is_gone(
     assert page.read_bytes() == before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_prompts_that_are_gone_are_still_compared(project: Path, harness: Typed) -> None:
     prompt("other", "Beware: ")
     typed = (*EVAL, "--dataset", "own/scenes", "--condition", "mine", "--out", "reports/other")

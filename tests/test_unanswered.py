@@ -197,8 +197,7 @@ def test_nothing_is_lost_so_that_another_model_or_setting_may_begin_in_the_folde
     assert [path.name for path in (tmp_path / "reports").iterdir()] == [out.name]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("role", ["ego", "helpers"])
+@pytest.mark.parametrize("role", some(["helpers"], exhaustive=["ego"]))
 def test_the_same_command_asks_only_the_errors_and_makes_the_run_that_had_none(
     role: str, ask: Typed, play: Play, tmp_path: Path
 ) -> None:
@@ -296,7 +295,8 @@ def test_fusion_calls_count_as_the_egos(ask: Typed, play: Play, tmp_path: Path) 
     assert len(play.bodies) < len(answers_of(tmp_path / "run"))
 
 
-@pytest.mark.parametrize("role", some(["helpers"], exhaustive=["ego"]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("role", ["helpers", "ego"])
 def test_a_driven_run_asks_only_the_errors_again(
     role: str, ask: Typed, play: Play, tmp_path: Path
 ) -> None:
@@ -322,7 +322,7 @@ def test_a_driven_run_asks_only_the_errors_again(
     assert not [answer for answer in answers_of(tmp_path / "run") if answer.error]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     ask: Typed, harness: Typed, play: Play
 ) -> None:
@@ -348,20 +348,17 @@ def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
     assert harness("run", "merge", "shard", "--out", "run")[0] == 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("command", "options"),
-    some(
-        [
-            (
-                "study grid",
-                ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g"),
-            )
-        ],
-        exhaustive=[
-            ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
-            ("study twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
-        ],
-    ),
+    [
+        (
+            "study grid",
+            ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g"),
+        ),
+        ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
+        ("study twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
+    ],
 )
 def test_every_study_ends_the_same_way_and_goes_on(
     command: str, options: tuple[str, ...], ask: Typed, play: Play, tmp_path: Path

@@ -37,7 +37,7 @@ def done(small: Dataset, once: Callable[..., Path]) -> Run:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
     assert [e.witnesses for e in done.episodes] == [0, 1, 2, 3] * 6
     assert [e.danger_radio is None for e in done.episodes] == [
@@ -56,7 +56,7 @@ def test_rows_have_witnesses_and_the_dangers_radio(done: Run) -> None:
         assert (score.value, score.n, score.n_excluded) == (sum(own) / 6, 6, 18)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_dangers_stand_by_who_can_tell_of_them_beside_the_harmless_layouts(
     done: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -103,7 +103,7 @@ def test_where_none_are_declared_nothing_is_said(
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_without_a_witness_messages_make_up_no_gain(small: Dataset, tmp_path: Path) -> None:
     done = driven(
         small,

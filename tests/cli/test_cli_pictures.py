@@ -173,7 +173,7 @@ def test_a_picture_counts_in_every_prompt(
         }
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
     harness: Harness, small_path: Path, tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ Said = tuple[int, str, str]
 DRIVE = ("--episodes", "1", "--seeds", "0", "--workers", "1")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_quiet_prints_nothing_and_writes_the_same(
     harness: Callable[..., Said], small_path: Path
 ) -> None:

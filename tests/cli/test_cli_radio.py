@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
-from tiers import some
 
 from harness.cli.terminal import attributes
 from harness.coordination.operating_point import named_point
@@ -109,7 +108,8 @@ def test_check_draws_messages_on_the_curve_and_holds_it_against_others(
         assert point["round_trip"]["value"] <= point["crossing"]["value"]
 
 
-@pytest.mark.parametrize("name", some(PHYSICAL[:1], exhaustive=PHYSICAL[1:]))
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", PHYSICAL)
 def test_check_says_how_long_a_receiver_waits_for_the_next_packet(
     harness: Callable[..., Said], name: str
 ) -> None:
@@ -205,7 +205,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(spec_of(small, points=points), tmp_path_factory.mktemp("radios") / "run").out
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sweep_over_a_radios_setting_gives_what_a_run_at_it_gives(
     harness: Callable[..., Said], done: Path
 ) -> None:
@@ -244,7 +244,7 @@ def test_a_run_warns_of_a_radio_that_its_source_never_tried(
     assert said in Path("page.html").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:
@@ -271,7 +271,7 @@ def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     assert "channel profile mine has changed since; restore it or run again" in err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_messages_is_a_control_of_a_physical_radio_too(
     harness: Callable[..., Said], done: Path
 ) -> None:

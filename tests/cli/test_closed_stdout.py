@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 from run_on_disk import made_up
 
-SPEAK = (("--help",), ("run", "ls", "."), ("eval", "--limit", "1", "--seeds", "0"))
+SPEAK = (("--help",), ("run", "ls", "."))
 TOO = (
+    ("eval", "--limit", "1", "--seeds", "0"),
     ("eval", "--help"), ("compare", "run", "run"), ("model", "doctor"),
     ("prompt", "show", "v2", "--scene", "00000-0"),
 )  # fmt: skip

@@ -57,7 +57,7 @@ def test_what_needs_another_file_does_not_fail(
         ("study", "sweep", "run", "--over", "reliability", "--grid", "1"),
         ("study", "sweep", "run", "--over", "loss", "--grid", "0"),
         ("radio", "crowd"),
-        ("study", "schedule", "compare", "run"),
+        ("study", "schedule", "compare", "run", "--schedule", "never"),
     ):
         code, _, said = harness(*command)
         assert "bad.toml" not in said, command

@@ -54,7 +54,7 @@ def test_a_tag_is_short_printable_text(tag: str, harness: Callable[..., Said]) -
         assert err.endswith("': give 1 to 40 printable characters, with no space at either end\n")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_goes_on_under_other_tags_and_keeps_those_it_was_begun_with(
     small: Dataset, tmp_path: Path
 ) -> None:

@@ -266,7 +266,7 @@ def test_json_lists_what_is_shown_and_counts_all(
     assert (told["seeds"], told["episodes"], told["passed"]) == ([0, 1], 4, True)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_p_is_printed_as_zero_and_json_keeps_the_number(
     runs: tuple[Path, Path], harness: Harness
 ) -> None:

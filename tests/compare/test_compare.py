@@ -376,7 +376,7 @@ def test_one_episode_has_differences_and_no_interval(small_path: Path, tmp_path:
             assert d.change.low != d.change.low
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_live_runs_are_compared_with_live_runs(
     runs: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -108,7 +108,7 @@ EPISODES = st.integers(1, 8).flatmap(
 
 
 @pytest.mark.slow
-@settings(max_examples=20)  # each writes a run
+@settings(max_examples=8)  # each writes a run
 @given(EPISODES, st.integers(4, 50))
 def test_as_many_as_asked_for_each_once_in_the_runs_order_and_always_the_same(episodes, n):
     with TemporaryDirectory() as folder:

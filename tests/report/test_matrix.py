@@ -137,7 +137,7 @@ def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     assert "6g: no run, since each is behind another" in matrix.headline(bare)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_page_of_runs_of_other_lengths_says_so(run, tmp_path, small_path, monkeypatch):
     points, seeds = tuple(POINTS.values()), (0, 1, 2)
     paths = [

@@ -287,7 +287,7 @@ def test_the_same_runs_give_the_same_page(run):
     assert written(run) == written(run)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_workers_change_no_byte_of_a_page(run, dataset, tmp_path, monkeypatch):
     other = write_run(tmp_path / "other", dataset, model="other")
     change(other, decision=lambda row: row.update(triggered=False))

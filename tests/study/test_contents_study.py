@@ -55,7 +55,7 @@ def cell(
     return float(points[(points.content == content) & at][column].item())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_each_content_is_what_a_run_of_it_comes_to(
     played: pd.DataFrame, small: Dataset, done: Path, tmp_path: Path
 ) -> None:

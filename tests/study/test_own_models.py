@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from misbehaving import Server, completion, serving
+from tiers import some
 
 from harness.backends import cards
 from harness.backends.card import Card, Latency
@@ -79,8 +80,7 @@ def test_a_study_asks_the_server_of_the_users_card(
     assert run.asked
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("changed", [True, False])
+@pytest.mark.parametrize("changed", some([True], exhaustive=[False]))
 def test_a_study_names_the_prompt_that_its_run_keeps(
     changed: bool, run: Server, small_path: Path, harness: Callable[..., Said]
 ) -> None:
@@ -146,16 +146,17 @@ def test_another_identity_is_refused_before_a_question(
     assert "the model is not what it was (base_url); run again" in err
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "study",
     [
-        STUDY,
-        ("study", "sweep", "run", "--over", "consensus", "--grid", "ego-prompt", "--out", "swept"),
-        ("study", "trust", "run", "--attacks", "jump", "--rules", "linear", "--out", "trusted"),
-        pytest.param(
-            ("study", "schedule", "compare", "run", "--schedule", "entropy", "--out", "scheduled"),
-            marks=pytest.mark.slow,
+        pytest.param(STUDY, marks=pytest.mark.slow),
+        *(
+            pytest.param(("study", *words.split()), marks=pytest.mark.exhaustive)
+            for words in (
+                "sweep run --over consensus --grid ego-prompt --out swept",
+                "trust run --attacks jump --rules linear --out trusted",
+                "schedule compare run --schedule entropy --out scheduled",
+            )
         ),
     ],
     ids=lambda study: study[0],
@@ -189,7 +190,7 @@ def test_a_replay_asks_no_server_that_its_run_names(
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_of_a_model_that_no_longer_ships_is_read_and_runs_again_with_its_card(
     run: Server, harness: Callable[..., Said]
 ) -> None:

@@ -199,7 +199,7 @@ def test_a_repeat_is_a_run_with_its_own_sampling_seed(
     assert all("--temperature 0.7 --sampling-seed" in run.manifest.command for run in of.runs)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_stopped_one_goes_on_as_if_it_had_not_been(
     small: Dataset, tmp_path: Path, wanderer: Wanderer
 ) -> None:
@@ -225,7 +225,7 @@ def test_a_stopped_one_goes_on_as_if_it_had_not_been(
         repeated(hot(course(small, 2), temperature=0.8), tmp_path / "stopped")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer: Wanderer) -> None:
     kept = tmp_path / "completions.sqlite"
     first = repeated(hot(course(small, 2)), tmp_path / "first", cache=kept)

@@ -75,7 +75,7 @@ def test_without_others_or_trigger_a_vehicle_is_alone(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "swept_axes", [("tau", "consensus"), pytest.param(tuple(AXES), marks=pytest.mark.exhaustive)]
+    "swept_axes", [("consensus",), pytest.param(tuple(AXES), marks=pytest.mark.exhaustive)]
 )
 def test_every_axis_gives_its_panels(
     source: ReplayedRun, swept_axes: tuple[str, ...], tmp_path: Path
@@ -140,7 +140,7 @@ OF_EACH_KIND = (
     [OF_EACH_KIND, pytest.param(TOGETHER, marks=pytest.mark.exhaustive)],
     ids=["some", "all"],
 )
-@pytest.mark.parametrize("asks", [True, False])
+@pytest.mark.parametrize("asks", [True, pytest.param(False, marks=pytest.mark.exhaustive)])
 def test_points_that_are_walked_together_are_each_as_alone(
     small: Dataset, asks: bool, texts: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -170,7 +170,7 @@ def test_points_that_are_walked_together_are_each_as_alone(
         assert np.array_equal(walked.places, expected.places)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_points_are_walked_in_parts(
     source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

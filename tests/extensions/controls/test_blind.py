@@ -164,7 +164,7 @@ def test_killed_among_the_blind_it_goes_on(
     assert answers_of(tmp_path / "run") == answers_of(done.out)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_replay_has_its_blind_answers_and_asks_the_model_for_others(
     done: Evaluated, small: Dataset, tmp_path: Path
 ) -> None:
@@ -234,7 +234,7 @@ class Fusing(Prior):
         return Completion(request.id, text, None, None, "stop", None, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_fusion_call_has_the_blind_helpers_messages(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

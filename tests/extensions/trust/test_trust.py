@@ -91,7 +91,7 @@ def test_a_loss_is_paired_with_the_same_rule_in_peace(bench: Bench) -> None:
     assert bench.price("linear").value == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
     done: Evaluated, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,7 +152,7 @@ def test_what_it_cannot_play_is_one_line(act: Any, said: str) -> None:
     assert "\n" not in str(problem.value)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_frozen_and_driven_trust_alike(small: Dataset, tmp_path: Path) -> None:
     attacks = ("", ",attack=spoof", ",attack=jump", ",attack=liar+sybil")
     points = tuple(named_point(f"6g:consensus=trust{attack}") for attack in attacks)
@@ -166,7 +166,7 @@ def test_frozen_and_driven_trust_alike(small: Dataset, tmp_path: Path) -> None:
     assert np.nanmean(trust[attackers]) < 0.5 < np.nanmean(trust[~attackers])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_nobody_looks_at_claims_unless_a_rule_or_an_attack_does(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,7 +216,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
     assert "give either RUN, the folder of a finished run, or --model, with its --prompt" in err
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_objects_are_attacked_by_the_usual_attacks_on_objects(
     done: Evaluated, tmp_path: Path
 ) -> None:
