@@ -25,10 +25,12 @@ from shares import SHARES, share_of
 
 from harness import cli
 from harness.cli import shell
+from harness.coordination import operating_point
 from harness.core import extensions
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.studies import axes
 
 pytest_plugins = ["browsing", "relabelling", "studied"]
 EPISODES, SEED = 4, 100
@@ -223,8 +225,15 @@ def owner_noted(command: str) -> str | None:
     return extension
 
 
+def part_noted(extension: str) -> str:
+    """Note that a setting of an extension was named."""
+    GONE.append(f"part of the extension {extension}, which is not")
+    return extensions.part_of(extension)
+
+
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
+    operating_point.__dict__["part_of"] = axes.__dict__["part_of"] = part_noted
 
 
 def pytest_terminal_summary(

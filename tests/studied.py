@@ -104,19 +104,6 @@ TRIALS = {  # of the core; of an extension, `tests/extensions/NAME/trials.py` ha
         },
         "about these families alone", out="", folder="run/contents", beside=ASKED, dry=True,
     ),
-    "trust": Trial(
-        "study trust run", "--attacks liar,liar+spoof --rules median,trust --share 1/3",
-        "--attacks liar,liar+spoof --rules median,trust --share 1/3 --seeds 7:8",
-        "run/trust holds another trust, with other seeds; name another folder",
-        {
-            "--prompt v4": 
-                "give either RUN, the folder of a finished "
-                "run, or --model, with its --prompt",
-            "--share 0,2": "--share 0,2: give shares from 0 to 1",
-            "--attacks liar,lair": "unknown --attacks 'lair'",
-        },
-        "under 6g", out="", folder="run/trust", beside=ASKED,
-    ),
     "schedule": Trial(
         "study schedule compare run", "--schedule entropy", "--schedule entropy --seeds 7:8",
         "run/schedules holds another schedule, with other seeds; name another folder",

@@ -24,7 +24,6 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
-from harness.extensions.trust.study import run_bench
 from harness.prompts import versions
 from harness.runs.folder import read
 from harness.runs.settings import words
@@ -179,6 +178,7 @@ def test_a_trust_study_that_may_not_ask_leaves_out_what_lacks_an_ego(
     evaluate(spec(frozen(8), "all", ("single-local",)), out, lambda done: None)
     monkeypatch.setattr(replayed_run, "open_backend", None)  # nothing opens a model
     source = ReplayedRun(out, asks=False)
+    run_bench = pytest.importorskip("harness.extensions.trust.study").run_bench
     bench = run_bench(
         source, "6g", ("linear",), ("liar",), (1 / 3,), (0, 1), tmp_path / "trust", Watched()
     )

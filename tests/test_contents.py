@@ -521,6 +521,7 @@ def test_whoever_hides_all_and_invents_a_car_lists_that_car_alone(pair: Dataset,
 def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(
     small: Dataset, proxy_run: Path
 ) -> None:
+    pytest.importorskip("harness.extensions.trust")
     scene = all_scenes(small)[0]
     answer = structs.replace(next(iter(folder.read(proxy_run).answers)), role="merge", viewer="v1")
     alone, moved = (
@@ -578,6 +579,7 @@ def test_a_stranger_who_heard_nobody_is_one_line(
 def test_a_stranger_who_names_two_attacks_at_once_gets_both(
     small: Dataset, proxy_run: Path
 ) -> None:
+    pytest.importorskip("harness.extensions.trust")
     scene = all_scenes(small)[0]
     answer = next(iter(folder.read(proxy_run).answers))
     twice, apart = (

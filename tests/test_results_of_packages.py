@@ -1,7 +1,6 @@
 """What packages' rules, channels and attacks return is held to what it must be, and is copied."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -9,11 +8,8 @@ import pytest
 
 from harness.coordination.consensus import Fused, Messages
 from harness.coordination.coordinate import _by_rule
-from harness.coordination.intents import Intents
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
-from harness.extensions.trust.attackers import _acted
-from harness.extensions.trust.attacks import Attack, Turn
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import broadcast, delivered
@@ -27,11 +23,6 @@ DRAWS = Draws(np.zeros((2, 1, 2)), np.zeros((2, 1)))
 ONE = np.ones((2, 1))
 LINKS = Links(HEARD, ONE, ONE, ONE, HEARD, HEARD)
 DELIVERED = Delivery(HEARD, *np.ones((3, 2, 1)))
-SAID = Intents(P, np.full((2, 2, 2), 0.5), np.ones((2, 2), dtype=bool), np.ones((2, 3)), 2 * P, 2 * P,
-               np.ones((2, 3)))  # fmt: skip
-TURN = Turn(
-    SAID, np.array([[True, False]] * 2), SAID.helpers, np.empty((2, 0, 2, 2)), np.zeros((2, 2))
-)
 
 
 @dataclass(frozen=True)
@@ -60,14 +51,6 @@ class Radio:
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         return self.result
-
-
-@dataclass(frozen=True)
-class Lie(Attack):
-    lie: Callable[[Intents], Intents] = lambda sent: sent
-
-    def act(self, sent: Intents, turn: Turn) -> Intents:
-        return self.lie(sent)
 
 
 def fused(monkeypatch: pytest.MonkeyPatch, rule: Rule) -> Fused:
@@ -161,41 +144,3 @@ def test_a_channel_whose_parameters_no_file_can_hold_is_one_line(
         UserError, match=r"^channel profile mine fails \(TypeError: Encoding objects"
     ):
         CHANNELS.record("mine")
-
-
-@pytest.mark.parametrize(
-    ("lie", "says"),
-    [
-        (
-            lambda s: replace(s, distance_m=0 * s.distance_m),
-            "it changes distance_m of the ego, or of a hel",
-        ),
-        (
-            lambda s: replace(s, inference_s=0 * s.inference_s),
-            "it changes inference_s of the ego, or of a ",
-        ),
-        (
-            lambda s: replace(s, silent=np.ones((2, 2), dtype=bool)),
-            "it changes silent of the ego, or of a ",
-        ),
-        (
-            lambda s: replace(s, valid=~s.valid),
-            "it changes valid of the ego, or of a helper that is no att",
-        ),
-        (lambda s: replace(s, silent=s.valid.tolist()), "silent of type list"),
-        (lambda s: replace(s, helpers=masked(7 * s.helpers)), "intents of type MaskedArray"),
-        (lambda s: replace(s, text_bytes=s.range_m), "it adds or leaves out text_bytes"),
-        (lambda s: replace(s, voice_of=np.full((2, 2), 9)), "a voice of nobody who is there"),
-    ],
-)
-def test_an_attack_changes_what_is_its_own(lie: Callable[[Intents], Intents], says: str) -> None:
-    with pytest.raises(UserError, match=f"^attack Lie fails .ValueError: {says}"):
-        _acted(Lie(lie=lie), SAID, TURN)
-
-
-def test_an_attacker_may_be_silent_far_away_and_late() -> None:
-    far = _acted(Lie(lie=lambda s: replace(
-        s, silent=np.array([[True, False]] * 2), range_m=np.add(s.range_m, [9.0, 0.0]),
-        inference_s=np.add(s.inference_s, [0.0, 9.0, 0.0]),
-    )), SAID, TURN)  # fmt: skip
-    assert far.range_m[0].tolist() == [10.0, 1.0]

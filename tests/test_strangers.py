@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from packaged import register
 
 from harness.backends.base import Completion, Request
 from harness.coordination.consensus import Pool, linear_pool
-from harness.coordination.intents import Intents
 from harness.coordination.rules import RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Formula
@@ -24,7 +22,6 @@ from harness.core import parallel
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.strangers import strangers
-from harness.extensions.trust.attacks import ATTACKS, Attack, Turn
 
 ROOT = Path(__file__).parents[1]
 Typed = Callable[..., tuple[int, str, str]]
@@ -196,13 +193,6 @@ def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
     assert harness(*typed, "--out", "run")[0] == 0
 
 
-class Failing(Attack):
-    """Returns what has no value for each action."""
-
-    def act(self, sent: Intents, turn: Turn) -> Intents:
-        return replace(sent, helpers=sent.helpers[..., 0])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("worth", "says"),
@@ -236,18 +226,6 @@ def test_a_schedule_that_fails_is_one_line(
     code, out, said = harness(*typed, "--out", "run")
     assert (code, out, said.count("\n")) == (2, "", 1)
     assert said.startswith(f"harness: {says}")
-
-
-@pytest.mark.slow
-def test_an_attack_that_fails_is_one_line(
-    two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(ATTACKS._loaded, "mine", Failing())
-    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
-    typed = ("eval", "--dataset", two_path, "--attack", "mine", "--limit", "1", "--quiet")
-    code, out, said = harness(*typed, "--out", "run")
-    assert (code, out, said.count("\n")) == (2, "", 1)
-    assert said.startswith("harness: attack Failing fails (ValueError: intents of shape (")
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import settable
 from harness.core.errors import UserError, printable, unknown
+from harness.core.extensions import part_of, setting_of_extension
 from harness.radio.profiles import CHANNELS
 
 MOST_POINTS = 1000
@@ -91,6 +92,8 @@ def axis_of(name: str) -> Axis:
         return AXES[name]
     usual = {name: POINTS["6g"].setting(name)} if name in typed_settings() else _usual()
     if name not in usual:
+        if gone := setting_of_extension(name):
+            raise UserError(f"--over {name}: this setting is {part_of(gone.extension)}")
         raise unknown("--over", name, {*AXES, *usual})
     values = "".join(kind.usual.get(name, "") for kind in more_parts().values())
     worded = isinstance(usual[name], str | bool)

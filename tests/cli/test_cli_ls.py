@@ -256,7 +256,7 @@ def test_no_folder_is_one_line_and_an_empty_one_says_so(
 
 
 def kinds_of_studies() -> set[str]:
-    """The kinds that the program makes, by its text: `Study("trust", …)`."""
+    """The kinds that the program makes, by its text: `Study("sweep", …)`."""
     room = Path(studies.__file__).parent
     rooms = (room, room.parent / "extensions")
     calls = [
@@ -275,7 +275,7 @@ def test_every_study_that_is_made_is_listed_and_refuses_the_folder_of_another(
     tmp_path: Path,
 ) -> None:
     kinds = kinds_of_studies()
-    assert {"sweep", "trust", "schedule"} <= kinds
+    assert {"sweep", "contents", "schedule"} <= kinds
     known = dict(kinds_of_study())
     here = {kind for extension in extensions().values() for kind in extension.studies}
     gone = entries(STUDIES).keys() - here  # where the folder of extensions is deleted

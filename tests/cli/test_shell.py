@@ -1,7 +1,6 @@
 """What typer does otherwise: commands in groups, and plain values read without pydantic."""
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,8 +14,6 @@ from typer.main import get_command
 from harness.cli import app
 from harness.cli.commands import commands, groups, panels, short, spellings
 from harness.cli.shell import UNREAD, plain
-from harness.coordination.rules import RULES, reads_plans
-from harness.extensions.trust.attacks import ATTACKS
 
 Said = tuple[int, str, str]
 VALUES = ("", "x", "7", "007", "-7", "7.5", "٣", "9" * 30, "/", "/nowhere", None)
@@ -134,10 +131,3 @@ def test_a_slip_is_answered_with_what_was_meant(
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert f"No such command {typed.split()[-1]!r} (did you mean {meant}" in err
     assert f"?) in `harness {typed}`; see" in err
-
-
-def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Said]) -> None:
-    said = set(
-        re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("study", "trust", "--help")[1]))
-    )
-    assert {*ATTACKS, *(rule for rule in RULES if not reads_plans(rule))} <= said

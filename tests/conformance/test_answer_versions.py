@@ -37,7 +37,6 @@ from harness.core import versions
 from harness.core.files import sha256_bytes
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import requests
-from harness.extensions.trust.attacks import ATTACKS
 from harness.parsing.parse import parse
 from harness.runs import folder
 
@@ -165,6 +164,7 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
     """Every operating point, rule, content, attack and schedule that needs no words,
     by the proxy.
     """
+    attacks = pytest.importorskip("harness.extensions.trust.attacks").ATTACKS
     changes = [
         *(f"consensus={rule}" for rule in RULES.built_in if not reads_plans(rule)),
         *(
@@ -174,8 +174,8 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
         ),
         *(
             f"{'content=objects' if attack.in_objects else 'consensus=trust'},attack={name}:share=2/3"
-            for name, attack in ATTACKS.items()
-            if name in ATTACKS.built_in and name != "injection"
+            for name, attack in attacks.items()
+            if name in attacks.built_in and name != "injection"
         ),
         *(f"schedule={schedule}" for schedule in FORMULAS),
     ]

@@ -10,7 +10,6 @@ import numpy as np
 
 from harness.extend import (
     PERCENT,
-    Attack,
     Broadcast,
     Capabilities,
     Card,
@@ -21,14 +20,12 @@ from harness.extend import (
     Formula,
     Fused,
     Hook,
-    Intents,
     Links,
     Messages,
     Metric,
     Registration,
     Request,
     ScheduleInputs,
-    Turn,
     linear_pool,
     link_up,
 )
@@ -74,15 +71,6 @@ class Fog:
         loss = np.minimum(links.range_m * self.loss_per_m, 1.0)
         delay_s = np.where(links.asked, links.ready_s + self.latency_s, np.inf)
         return Delivery(link_up(draws.link, loss), delay_s, loss, np.full_like(loss, np.nan))
-
-
-@dataclass(frozen=True)
-class Mumble(Attack):
-    """Is half as sure as it is: the mean of its intent and of all actions alike."""
-
-    def act(self, said: Intents, turn: Turn) -> Intents:
-        """From what attacks before it have made of the truth."""
-        return self.intend(said, turn, (said.helpers + 1 / said.helpers.shape[-1]) / 2)
 
 
 def near(known: ScheduleInputs) -> Floats:
@@ -138,7 +126,6 @@ class Notebook:
 SMOOTHING = Smoothing()
 NOTEBOOK: Hook = Notebook()
 FOG = Fog()
-MUMBLE = Mumble()
 NEAR = Formula(near, 0.5)
 SURE = Metric(
     "sure_rate", 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from swarm_extras import MUMBLE
+from swarm_attacks import MUMBLE
 
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import FusionInputs, coordinate

@@ -1,0 +1,89 @@
+"""What a package's attack may do: it changes what is an attacker's, and fails in one line."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.coordination.intents import Intents
+from harness.core.errors import UserError
+from harness.extensions.trust.attackers import _acted
+from harness.extensions.trust.attacks import ATTACKS, Attack, Turn
+
+Typed = Callable[..., tuple[int, str, str]]
+P = np.full((2, 2), 0.5)
+SAID = Intents(P, np.full((2, 2, 2), 0.5), np.ones((2, 2), dtype=bool), np.ones((2, 3)), 2 * P, 2 * P,
+               np.ones((2, 3)))  # fmt: skip
+TURN = Turn(
+    SAID, np.array([[True, False]] * 2), SAID.helpers, np.empty((2, 0, 2, 2)), np.zeros((2, 2))
+)
+
+
+@dataclass(frozen=True)
+class Lie(Attack):
+    lie: Callable[[Intents], Intents] = lambda sent: sent
+
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return self.lie(sent)
+
+
+@pytest.mark.parametrize(
+    ("lie", "says"),
+    [
+        (
+            lambda s: replace(s, distance_m=0 * s.distance_m),
+            "it changes distance_m of the ego, or of a hel",
+        ),
+        (
+            lambda s: replace(s, inference_s=0 * s.inference_s),
+            "it changes inference_s of the ego, or of a ",
+        ),
+        (
+            lambda s: replace(s, silent=np.ones((2, 2), dtype=bool)),
+            "it changes silent of the ego, or of a ",
+        ),
+        (
+            lambda s: replace(s, valid=~s.valid),
+            "it changes valid of the ego, or of a helper that is no att",
+        ),
+        (lambda s: replace(s, silent=s.valid.tolist()), "silent of type list"),
+        (
+            lambda s: replace(s, helpers=np.ma.masked_array(7 * s.helpers)),
+            "intents of type MaskedArray",
+        ),
+        (lambda s: replace(s, text_bytes=s.range_m), "it adds or leaves out text_bytes"),
+        (lambda s: replace(s, voice_of=np.full((2, 2), 9)), "a voice of nobody who is there"),
+    ],
+)
+def test_an_attack_changes_what_is_its_own(lie: Callable[[Intents], Intents], says: str) -> None:
+    with pytest.raises(UserError, match=f"^attack Lie fails .ValueError: {says}"):
+        _acted(Lie(lie=lie), SAID, TURN)
+
+
+def test_an_attacker_may_be_silent_far_away_and_late() -> None:
+    far = _acted(Lie(lie=lambda s: replace(
+        s, silent=np.array([[True, False]] * 2), range_m=np.add(s.range_m, [9.0, 0.0]),
+        inference_s=np.add(s.inference_s, [0.0, 9.0, 0.0]),
+    )), SAID, TURN)  # fmt: skip
+    assert far.range_m[0].tolist() == [10.0, 1.0]
+
+
+class Failing(Attack):
+    """Returns what has no value for each action."""
+
+    def act(self, sent: Intents, turn: Turn) -> Intents:
+        return replace(sent, helpers=sent.helpers[..., 0])
+
+
+@pytest.mark.slow
+def test_an_attack_that_fails_is_one_line(
+    two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "mine", Failing())
+    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
+    typed = ("eval", "--dataset", two_path, "--attack", "mine", "--limit", "1", "--quiet")
+    code, out, said = harness(*typed, "--out", "run")
+    assert (code, out, said.count("\n")) == (2, "", 1)
+    assert said.startswith("harness: attack Failing fails (ValueError: intents of shape (")
