@@ -15,7 +15,7 @@ from harness.coordination.operating_point import POINTS
 from harness.core.extensions import PYTHON
 from harness.dataset.load import Dataset
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("svg_alone")]
 
 
 @pytest.fixture(scope="module")

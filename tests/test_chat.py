@@ -153,7 +153,7 @@ def with_template(folder: Path, template: str) -> Path:
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_gguf_file_without_a_system_role_is_run_and_said_to_be(
     harness: Harness, small: Dataset, small_path: Path, tmp_path: Path
 ) -> None:

@@ -148,7 +148,8 @@ def test_a_model_flips_where_two_questions_by_hand_say_so(letters: Letters, smal
     assert any(sure)
 
 
-@pytest.mark.parametrize("letters", some(["cyclic"], exhaustive=["raw"]))
+@pytest.mark.exhaustive
+@LETTERS
 def test_a_run_and_its_replay_count_it_and_decide_as_without(
     letters: Letters, small: Dataset, tmp_path: Path
 ) -> None:

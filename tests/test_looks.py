@@ -240,9 +240,10 @@ def test_what_another_run_lacks_is_one_line(
         (("eval", "--until-width", "0"), "--until-width 0 is out of range; give 0.1 to 99 points"),
         (("eval", "--until-width", "4", "--until-decided", "x"), "give one of them"),
         (("eval", "--until-decided", "nowhere"), "nowhere"),
-        (
+        pytest.param(
             ("eval", "--until-width", "4", "--dataset", "suite:v2v-safety-2"),
             "suite v2v-safety-2: runs that stop",
+            marks=pytest.mark.exhaustive,
         ),
         (
             ("drive", "--until-width", "4", "--sample", "3"),

@@ -204,6 +204,13 @@ def test_a_table_of_few_bytes_and_a_thousand_million_rows_is_refused(tmp_path: P
         UserError, match=f"100000 rows; {2 * 10 * len(runs.read(run).episodes)} is the most"
     ):
         _ = runs.read(run).decisions
+
+
+@pytest.mark.exhaustive
+def test_a_table_of_few_bytes_and_a_text_of_many_is_refused(tmp_path: Path) -> None:
+    run = made_up(tmp_path / "run")
+    file = run / "decisions.parquet"
+    table = pq.read_table(file)
     text = pa.array(["x" * 70_000_000]).dictionary_encode()
     wide = table.slice(0, 1).set_column(table.column_names.index("danger"), "danger", text)
     pq.write_table(

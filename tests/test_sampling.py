@@ -11,6 +11,7 @@ import pytest
 from evaluating import run, same_decisions, scenes_of, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
+from tiers import some
 
 from harness.backends.base import AnswerMode, Request
 from harness.backends.card import Card, Latency
@@ -119,8 +120,7 @@ def said(card: Card, requests: Sequence[Request], batch_size: int = 4) -> list[s
     return [c.text for c in completions]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("answer", ["json", "constrained"])
+@pytest.mark.parametrize("answer", some(["constrained"], exhaustive=["json"]))
 def test_nothing_but_the_seed_moves_an_answer(card: Card, answer: AnswerMode) -> None:
     asked = [ask(i, answer, temperature=1.0, sample=s) for s in (0, 1) for i in range(4)]
     texts = said(card, asked)

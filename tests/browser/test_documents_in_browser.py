@@ -48,7 +48,7 @@ WIDELY = pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "scheme"),
     [
-        pytest.param("study", "light", marks=pytest.mark.slow),
+        pytest.param("study", "light", marks=WIDELY),
         pytest.param("study", "dark", marks=WIDELY),
         pytest.param("compare", "light", marks=WIDELY),
         pytest.param("compare", "dark", marks=pytest.mark.slow),

@@ -91,6 +91,7 @@ def test_an_answer_says_which_picture_its_prompt_had(seeing, mode, monkeypatch):
         }
 
 
+@pytest.mark.exhaustive
 def test_pictures_of_a_report_of_the_default_dataset_take_less_than_one_and_a_half_megabytes():
     dataset = load(folder("datasets") / "occluded-intersection-v2", limit=30)
     drawn = [cameras(dataset.scenario, scene) for scene in dataset.scenes(dataset.courses()[::20])]

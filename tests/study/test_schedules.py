@@ -458,7 +458,7 @@ def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
     assert all("(tune)" in source for source in shipped["tuned_on"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_path: Path):
     """Read-outs of the model that ships, at the pace of another on a Jetson."""
     spec = spec_of(
