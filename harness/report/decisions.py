@@ -2,7 +2,7 @@
 and their details in parts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,125 +33,128 @@ class Decisions:
 
     def __init__(self, runs: Runs, prompts: Prompts = prompts_of, full: bool = False) -> None:
         self._runs, self._full = runs, full
-        places: dict[str, tuple[int, int, str | None, str | None]] = {}
-        for run in reversed(runs.runs):
-            episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
-            danger, agent = run.decisions.labels("danger"), run.decisions.labels("agent")
-            for scene, rows in run.decisions.scenes.items():
-                at = rows.start
-                places[scene] = int(episode[at]), int(step[at]), danger[at], agent[at]
-        order = sorted(places.items(), key=lambda item: (*item[1][:2], item[1][3] or "", item[0]))
-        # else a scene has no place for who decides
-        several = any(agent for *_, agent in places.values())
-        self.ids = [scene for scene, _ in order]
+        places = _places(runs.runs)
+        self.ids = list(places)
         failed = [failures(run) if runs.live else {} for run in runs.runs]
         if runs.dataset:
             for run in runs.runs:
                 # decisions are checked where their trees are read
                 check_scenes(run, runs.dataset, ())
         self._not_replayed = 0
-        self._replayed = {} if runs.dataset else self._played(failed)
-        framed = self._telling()
-        self._details = Details(
-            runs, self._replayed, framed, prompts, full, [*map(left_out, runs.runs)]
-        )
+        self._replayed = {} if runs.dataset else self._replayed_scenes(failed)
+        framed = self._framed()
+        remarks = [left_out(run) for run in runs.runs]
+        self._details = Details(runs, self._replayed, framed, prompts, full, remarks)
         self.index = {
             "actions": runs.actions,
-            "scenes": [[scene, *(place if several else place[:3])] for scene, place in order],
+            "scenes": [[scene, *place] for scene, place in places.items()],
             "block": BLOCK,
             "live": runs.live,
             "framed": len(framed),
             "statuses": list(map(str, Status)),
-            "runs": [self._indexed(n, list(of)) for n, of in enumerate(failed)],
+            "runs": [self._indexed(n, list(scenes)) for n, scenes in enumerate(failed)],
         }
 
-    def _played(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
-        """Return the telling decision points, replayed;
-        none where this simulator differs from the run's.
-        """
-        telling = dict.fromkeys(
-            scene
-            for run, of in zip(self._runs.runs, failed, strict=True)
-            for scene in (run.decisions.scenes if self._full else pick(run, of, REPLAYED))
-        )
-        scenes = replayed(self._runs, list(telling))
-        self._not_replayed = len(telling) - len(scenes)
-        return scenes
+    def _replayed_scenes(self, failed: Sequence[dict[str, int]]) -> dict[str, Scene]:
+        """Return by id the decision points of closed-loop runs that the page draws, played again.
 
-    def _telling(self) -> frozenset[str]:
+        Those are missing that come out otherwise in this simulator; they are counted.
+        """
+        ids = dict[str, None]()
+        for run, failures_of_run in zip(self._runs.runs, failed, strict=True):
+            scenes = run.decisions.scenes if self._full else pick(run, failures_of_run, REPLAYED)
+            ids |= dict.fromkeys(scenes)
+        played = replayed(self._runs, list(ids))
+        self._not_replayed = len(ids) - len(played)
+        return played
+
+    def _framed(self) -> frozenset[str]:
         """Return decision points that have cameras' pictures:
         where episodes are lost, then a sample.
 
         Models that see were shown them; of others a page has them only if it is to be full.
         """
+        runs = self._runs.runs
         if self._full:
             return frozenset(self.ids)
-        if not any(answer.image_sha256 for run in self._runs.runs for answer in run.answers):
+        if not any(answer.image_sha256 for run in runs for answer in run.answers):
             return frozenset()
-        most = FRAMES // (1 + max(run.decisions.helpers for run in self._runs.runs))
+        most = FRAMES // (1 + max(run.decisions.helpers for run in runs))
         if self._runs.live:
             return frozenset(spread(list(self._replayed), most))
-        runs = self._runs.runs
-        first = spread(list(dict.fromkeys(scene for run in runs for scene in lost(run))), most)
-        more = dict.fromkeys(
-            scene for run in runs for scene in pick(run, {}, most) if scene not in first
-        )
-        return frozenset((*first, *spread(list(more), most - len(first))))
+        lost_scenes = dict.fromkeys(scene for run in runs for scene in lost(run))
+        first = spread(list(lost_scenes), most)
+        picked = dict.fromkeys(scene for run in runs for scene in pick(run, {}, most))
+        more = [scene for scene in picked if scene not in first]
+        return frozenset((*first, *spread(more, most - len(first))))
 
     def _indexed(self, n: int, first_failures: Sequence[str]) -> dict[str, Any]:
         """Return one run's part of the index:
         a letter a scene, condition and seed, in this order.
         """
         run = self._runs.runs[n]
-        d, shape = run.decisions, run.grid.shape[:2]
         place = {scene: position for position, scene in enumerate(self.ids)}
-        of_scene = np.empty(len(d), dtype=int)
-        for scene, rows in d.scenes.items():
-            of_scene[rows.start : rows.stop] = place[scene]
-        of_run = run.grid.places(d) // run.grid.shape[2]
-        letters = {
-            "acted": np.array(list(map(str, range(len(run.actions)))))[
-                d.codes("action", run.actions)
-            ],
-            "ended": self._details.ends[n],
-            "asked": np.where(d.flags("triggered"), "1", "0"),
-        }
-        index = {}
-        for name, values in letters.items():
-            line = np.full((len(self.ids), shape[0] * shape[1]), "0" if name == "asked" else ABSENT)
-            line[of_scene, of_run] = values
-            index[name] = "".join(line.ravel().tolist())
-        statuses = list(map(str, Status))
-        met = [{a.status for a in run.answers_by_scene.get(scene, ())} for scene in self.ids]
-        return {
+        index: dict[str, Any] = {
             "conditions": run.conditions,
             "seeds": run.manifest.seeds,
-            **index,
-            "statuses": [sum(1 << statuses.index(s) for s in of if s in statuses) for of in met],
+            **self._letters(n, place),
+            "statuses": [self._statuses(run, scene) for scene in self.ids],
             "first": [place[scene] for scene in first_failures],
-            **(self._own(run) if len(self._runs.runs) > 1 else {}),
         }
+        if len(self._runs.runs) > 1:
+            index |= self._ego_answers(run)
+        return index
 
-    def _own(self, run: Run) -> dict[str, Any]:
+    def _letters(self, n: int, place: Mapping[str, int]) -> dict[str, str]:
+        """Return of each decision of a run its action, what it led to and whether helpers were
+        asked, a text each.
+
+        `place` is that of each scene in the index. Decisions that a run has not are `ABSENT`, and
+        nobody was asked in them.
+        """
+        run = self._runs.runs[n]
+        decisions = run.decisions
+        conditions, seeds, episodes = run.grid.shape
+        row = np.empty(len(decisions), dtype=int)
+        for scene, rows in decisions.scenes.items():
+            row[rows.start : rows.stop] = place[scene]
+        column = run.grid.places(decisions) // episodes
+        digits = np.array([str(code) for code in range(len(run.actions))])
+        letters = {
+            "acted": (digits[decisions.codes("action", run.actions)], ABSENT),
+            "ended": (self._details.ends[n], ABSENT),
+            "asked": (np.where(decisions.flags("triggered"), "1", "0"), "0"),
+        }
+        texts = {}
+        for name, (values, absent) in letters.items():
+            table = np.full((len(self.ids), conditions * seeds), absent)
+            table[row, column] = values
+            texts[name] = "".join(table.ravel().tolist())
+        return texts
+
+    def _statuses(self, run: Run, scene: str) -> int:
+        """Return which statuses the answers of a scene have, a bit for each, the first lowest."""
+        statuses = list(map(str, Status))
+        of_scene = {answer.status for answer in run.answers_by_scene.get(scene, ())}
+        return sum(1 << statuses.index(status) for status in of_scene if status in statuses)
+
+    def _ego_answers(self, run: Run) -> dict[str, Any]:
         """Return the ego's own answers, to be read beside those of other runs.
 
         `said` has a letter a scene, the likeliest action; `sure` its probability in percent.
         """
-        own = [
-            next(
-                (answer for answer in run.answers_by_scene.get(scene, ()) if answer.role == "ego"),
-                None,
-            )
-            for scene in self.ids
-        ]
-        intents = [answer.intent if answer else None for answer in own]
-        likeliest = [str(intent.index(max(intent))) if intent else UNREAD for intent in intents]
-        return {
-            "said": "".join(
-                letter if answer else ABSENT for letter, answer in zip(likeliest, own, strict=True)
-            ),
-            "sure": [round(100 * min(max(intent), 1.0)) if intent else 0 for intent in intents],
-        }
+        letters, percents = list[str](), list[int]()
+        for scene in self.ids:
+            answers = run.answers_by_scene.get(scene, ())
+            answer = next((answer for answer in answers if answer.role == "ego"), None)
+            if answer is None or not answer.intent:
+                letters.append(ABSENT if answer is None else UNREAD)
+                percents.append(0)
+            else:
+                largest = max(answer.intent)
+                letters.append(str(answer.intent.index(largest)))
+                percents.append(round(100 * min(largest, 1.0)))
+        return {"said": "".join(letters), "sure": percents}
 
     def lacks(self) -> dict[str, str]:
         """Return what these scenes could show and do not, in a word, and why."""
@@ -165,10 +168,32 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        return [
-            Part(self._details, self.ids[at : at + AT_ONCE])
-            for at in range(0, len(self.ids), AT_ONCE)
-        ]
+        """Return all scenes in parts of `AT_ONCE`, each to be packed alone."""
+        starts = range(0, len(self.ids), AT_ONCE)
+        return [Part(self._details, self.ids[start : start + AT_ONCE]) for start in starts]
+
+
+def _places(runs: Sequence[Run]) -> dict[str, tuple[int | str | None, ...]]:
+    """Return by scene its episode, step and danger, in order of episode, step and agent.
+
+    Where several agents decide, who does comes last.
+    """
+    places: dict[str, tuple[int, int, str | None, str | None]] = {}
+    for run in reversed(runs):
+        episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
+        danger, agent = run.decisions.labels("danger"), run.decisions.labels("agent")
+        for scene, rows in run.decisions.scenes.items():
+            row = rows.start
+            places[scene] = int(episode[row]), int(step[row]), danger[row], agent[row]
+
+    def order(scene: str) -> tuple[int, int, str, str]:
+        number, step, _, agent = places[scene]
+        return number, step, agent or "", scene
+
+    ordered = {scene: places[scene] for scene in sorted(places, key=order)}
+    if any(agent for *_, agent in places.values()):
+        return dict(ordered)
+    return {scene: place[:3] for scene, place in ordered.items()}
 
 
 def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
@@ -177,17 +202,18 @@ def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
     """
     from harness.evaluate.replay import scenes_of  # loads the simulator
 
-    of_run: dict[int, list[str]] = {}
+    names_of: dict[int, list[str]] = {}  # by the place of the run that is played again
     for name in names:
-        here = [n for n, run in enumerate(runs.runs) if name in run.decisions.scenes]
+        places = [n for n, run in enumerate(runs.runs) if name in run.decisions.scenes]
         # A run without helpers, such as a driver's, has fewer viewers.
-        of_run.setdefault(max(here, key=lambda n: runs.runs[n].decisions.helpers), []).append(name)
-    scenes = {
-        name: scene
-        for n, mine in of_run.items()
-        for name, scene in zip(mine, scenes_of(runs.runs[n], mine), strict=True)
-        if scene.id == name
-    }
+        most_viewers = max(places, key=lambda n: runs.runs[n].decisions.helpers)
+        names_of.setdefault(most_viewers, []).append(name)
+    scenes = {}
+    for place, names_of_run in names_of.items():
+        played = scenes_of(runs.runs[place], names_of_run)
+        for name, scene in zip(names_of_run, played, strict=True):
+            if scene.id == name:
+                scenes[name] = scene
     return {name: scenes[name] for name in names if name in scenes}
 
 
@@ -199,26 +225,27 @@ def failures(run: Run) -> dict[str, int]:
     them fail, the last of the first. With several agents it is one of each that decides in that
     step.
     """
-    d = run.decisions
-    failed = np.array([not episode.success for episode in run.episodes])[run.grid.places(d)]
-    seeds, episodes, steps, agents = (
-        d.whole("seed"),
-        d.whole("episode"),
-        d.whole("step"),
-        d.labels("agent"),
-    )
-    telling: dict[int, tuple[bool, int, dict[str | None, tuple[str, int]]]] = {}
-    for scene, rows in d.scenes.items():
-        here = failed[rows.start : rows.stop]
-        number = int(episodes[rows.start])
-        if here.any():
-            parts, step = not here.all(), int(steps[rows.start])
-            if number not in telling or (parts, step) > telling[number][:2]:
-                telling[number] = parts, step, {}
-            if (parts, step) == telling[number][:2]:
-                found = scene, int(seeds[rows.start + int(here.argmax())])
-                telling[number][2][agents[rows.start]] = found
-    return dict(each for *_, by_agent in telling.values() for each in by_agent.values())
+    decisions = run.decisions
+    failed = np.array([not episode.success for episode in run.episodes])
+    failed = failed[run.grid.places(decisions)]
+    seeds, episodes = decisions.whole("seed"), decisions.whole("episode")
+    steps, agents = decisions.whole("step"), decisions.labels("agent")
+    # By episode: whether others do not fail from there, and the step; by agent, its scene and seed.
+    latest: dict[int, tuple[bool, int]] = {}
+    beginnings: dict[int, dict[str | None, tuple[str, int]]] = {}
+    for scene, rows in decisions.scenes.items():
+        of_scene = failed[rows.start : rows.stop]
+        if not of_scene.any():
+            continue
+        episode = int(episodes[rows.start])
+        rank = (not of_scene.all(), int(steps[rows.start]))
+        if episode not in latest or rank > latest[episode]:
+            latest[episode] = rank
+            beginnings[episode] = {}
+        if rank == latest[episode]:
+            seed = int(seeds[rows.start + int(of_scene.argmax())])
+            beginnings[episode][agents[rows.start]] = scene, seed
+    return dict(pair for by_agent in beginnings.values() for pair in by_agent.values())
 
 
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
@@ -228,37 +255,33 @@ def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
     failure, or the first; answers that were recovered or failed. The rest is spread evenly. Where
     one kind is scarce, the sample is larger.
     """
-    d = run.decisions
-    action, seeds = d.codes("action", run.actions), d.whole("seed")
-    disagreement, answer = [], []
-    for scene, rows in d.scenes.items():
-        mine = seeds[rows.start : rows.stop] == failed.get(scene, int(seeds[rows.start]))
-        if len(set(action[rows.start : rows.stop][mine].tolist())) > 1:
-            disagreement.append(scene)
-        if any(a.verdict != "strict" for a in run.answers_by_scene.get(scene, ())):
-            answer.append(scene)
+    decisions = run.decisions
+    action, seeds = decisions.codes("action", run.actions), decisions.whole("seed")
+    disagreements, repaired = [], []
+    for scene, rows in decisions.scenes.items():
+        seeds_of_scene = seeds[rows.start : rows.stop]
+        with_seed = seeds_of_scene == failed.get(scene, int(seeds[rows.start]))
+        actions = set(action[rows.start : rows.stop][with_seed].tolist())
+        if len(actions) > 1:
+            disagreements.append(scene)
+        if any(answer.verdict != "strict" for answer in run.answers_by_scene.get(scene, ())):
+            repaired.append(scene)
     chosen: list[str] = []
-    for kind, room in (
-        (list(failed), n // 4),
-        (disagreement, n // 4),
-        (answer, n // 4),
-        (list(d.scenes), n),
-    ):
-        left = [scene for scene in kind if scene not in chosen]
+    quarter = n // 4
+    kinds = [(list(failed), quarter), (disagreements, quarter), (repaired, quarter)]
+    for scenes, room in [*kinds, (list(decisions.scenes), n)]:
+        left = [scene for scene in scenes if scene not in chosen]
         chosen += spread(left, min(room, n - len(chosen)))
-    return [scene for scene in d.scenes if scene in chosen]
+    return [scene for scene in decisions.scenes if scene in chosen]
 
 
 def lost(run: Run) -> list[str]:
-    """Decision points of a frozen run whose action, with some seed and condition,
-    gives success away.
+    """Return the decision points of a frozen run at which success is given away,
+    under some condition and with some seed.
     """
     regret = np.nan_to_num(run.decisions["regret"]) == 1.0
-    return [
-        scene
-        for scene, rows in run.decisions.scenes.items()
-        if regret[rows.start : rows.stop].any()
-    ]
+    scenes = run.decisions.scenes
+    return [scene for scene, rows in scenes.items() if regret[rows.start : rows.stop].any()]
 
 
 def spread(items: Sequence[str], n: int) -> list[str]:

@@ -17,6 +17,7 @@ from harness.backends.registry import reads_prompts
 from harness.coordination.operating_point import questions
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
+from harness.core.figures import known
 from harness.core.files import digest
 from harness.core.image import Image
 from harness.core.places import text
@@ -28,7 +29,7 @@ from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
 from harness.prompts.versions import Prompt
-from harness.report.drawing.geometry import conflict_points, spots, view_of
+from harness.report.drawing.geometry import conflict_points, north_up, spots, view_of
 from harness.report.library import packed, picture
 from harness.report.remarks import LeftOut
 from harness.report.runs import Runs
@@ -41,6 +42,7 @@ from harness.world import scenarios
 from harness.world.perception.camera import frame
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import Conflict
+from harness.world.state import VehicleState
 
 BLOCK = 24  # scenes that are compressed and read together
 
@@ -101,11 +103,14 @@ OF_MESSAGE = ("delivered", "on_time", "arrival_ms", "weight", "trust", "attacker
 
 
 def prompts_of(run: Run) -> Sent | None:
-    """Gives the chat messages that a viewer was sent;
-    None if one of its prompts is neither here nor kept.
+    """Return a function that gives the chat messages which a viewer was sent in a scene,
+    with the messages that it had heard.
+
+    None if one of the run's prompts is neither here nor kept.
     """
-    manifest, prompts = run.manifest, dict[str, Prompt]()
-    failed = set[str]()
+    manifest = run.manifest
+    prompts: dict[str, Prompt] = {}  # by version
+    failed: set[str] = set()  # versions
     for agent in (manifest.agent(0), *manifest.helpers):
         prompt = prompt_of(run, agent["prompt"])
         if prompt is None:
@@ -144,35 +149,42 @@ class Details:
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
         """Return the same with no more of the runs than these scenes need."""
-        replayed = {name: self.replayed[name] for name in ids if name in self.replayed}
-        left_out = [{name: of[name] for name in ids if name in of} for of in self.left_out]
+        scenes = set(ids)
+        replayed = {name: scene for name, scene in self.replayed.items() if name in scenes}
+        left_out = []
+        for of_run in self.left_out:
+            left_out.append({name: some for name, some in of_run.items() if name in scenes})
         return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed, left_out=left_out)
 
     def blocks(self, ids: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
-        """Details of these scenes, so many a block."""
+        """Yield the details of scenes, `BLOCK` at a time.
+
+        Raises UserError if a run does not fit its dataset.
+        """
         forest, scenes = None, self.replayed
         if dataset := self.runs.dataset:
             for run in self.runs.runs:
                 check_scenes(run, dataset, ids)
             scenes = dict(zip(ids, dataset.scenes(ids), strict=True))
-            shown = {scene.record.episode for scene in scenes.values()}
             # A small dataset's trees are laid out once, and a large one's where they are shown.
-            forest = (
-                dataset if len(dataset.trees) <= TREES_AT_ONCE else dataset.of_episodes(shown)
-            ).forest
-        for at in range(0, len(ids), BLOCK):
-            yield [self._detail(name, scenes.get(name), forest) for name in ids[at : at + BLOCK]]
+            if len(dataset.trees) > TREES_AT_ONCE:
+                dataset = dataset.of_episodes({each.record.episode for each in scenes.values()})
+            forest = dataset.forest
+        for start in range(0, len(ids), BLOCK):
+            block = ids[start : start + BLOCK]
+            yield [self._detail(name, scenes.get(name), forest) for name in block]
 
     @cached_property
     def _sent(self) -> list[Sent | None]:
         return [self.prompts(run) for run in self.runs.runs]
 
     def without_prompts(self) -> list[Run]:
+        """Return the runs whose prompts are not known."""
         return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
 
     @cached_property
     def ends(self) -> list[Any]:
-        """What each decision of each run led to, a letter a decision (n,)."""
+        """Letters that say what each decision of each run led to, (n,) a run."""
         return [_ends(run) for run in self.runs.runs]
 
     @cached_property
@@ -185,87 +197,121 @@ class Details:
         return [run.decisions.whole("episode") for run in self.runs.runs]
 
     def _detail(self, name: str, scene: Scene | None, forest: Forest | None) -> dict[str, Any]:
-        sent: dict[str, Any] = {}
-        runs = [self._of_run(n, name, scene, sent) for n in range(len(self.runs.runs))]
-        asked = {
-            tuple(m["from"] for m in d["messages"]) for run in runs if run for d in run["decisions"]
-        }
+        prompts: dict[str, Any] = {}  # by digest
+        runs = [self._of_run(n, name, scene, prompts) for n in range(len(self.runs.runs))]
+        world = pictures = None
+        if scene:
+            scenario = scene.seat or self.runs.scenario
+            world = _world(scenario, scene, _helpers_asked(runs))
+            pictures = cameras(scenario, scene) if name in self.framed else False
         return {
-            "world": scene and _world(scene.seat or self.runs.scenario, scene, asked),
-            "cameras": scene
-            and name in self.framed
-            and cameras(scene.seat or self.runs.scenario, scene),
+            "world": world,
+            "cameras": pictures,
             "outcomes": forest and _outcomes(forest, name),
             "runs": runs,
-            "prompts": list(sent.values()),
+            "prompts": list(prompts.values()),
         }
 
     def _of_run(
-        self, n: int, name: str, scene: Scene | None, sent: dict[str, Any]
+        self, n: int, name: str, scene: Scene | None, prompts: dict[str, Any]
     ) -> dict[str, Any] | None:
-        run, prompts = self.runs.runs[n], self._sent[n]
+        """Return what a run has of a scene; None where it has nothing.
+
+        The chat messages of its answers are added to `prompts`, once for all answers to them.
+        """
+        run = self.runs.runs[n]
         rows = run.decisions.scenes.get(name)
         if rows is None:
             return None
-        answers = []
-        by_viewer = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
-        for answer in by_viewer.values():
-            if scene and answer.viewer not in scene.viewers:
-                raise UserError(
-                    f"{printable(run.path / 'answers.jsonl')} has an answer of "
-                    f"{printable(answer.viewer)} in "
-                    f"scene {printable(name)}, where nobody of that name answers; make the run "
-                    "again"
-                )
-            shown = {
-                key: v
-                for key in KEPT
-                if (v := getattr(answer, key)) is not None
-                and v is not False
-                and v is not UNSET
-                and v != ()
-            }
-            shown |= {key: text(shown[key]) for key in ("error", "detail") if key in shown}
-            asked: int | None = None  # place among the prompts; False for one that is left out
-            agent = run.agent(answer)
-            if not (self.full or reads_prompts(str(agent["model"]["engine"]))):
-                asked = False
-            # Shuffled messages are in the details of another scene.
-            elif scene and prompts and source_of(name, answer.heard) == name:
-                heard = messages_of(by_viewer, answer.heard, run.actions)
-                as_shown = as_asked(scene.seat or self.runs.scenario, scene, answer)
-                messages = prompts(as_shown, answer.viewer, heard)
-                key = digest(messages)
-                if answer.prompt_sha256 == key:
-                    sent.setdefault(key, messages)
-                    asked = list(sent).index(key)
-            if answer.image_sha256:
-                pictured = questions()[answer.question].pictured
-                shown["picture"] = agent["image"] if pictured else "blank"
-            if run.manifest.helpers:
-                shown["agent"] = " · ".join(
-                    (agent["model"]["name"], agent["prompt"]["version"], agent["answer"])
-                )
-            if run.manifest.latency.speeds:
-                shown["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
-            elif run.manifest.helpers:
-                shown["took_s"] = run.seconds(answer)
-            spans_read = _read_in(answer, run) if answer.repairs else []
-            answers.append({**shown, "viewer": answer.key, "spans": spans_read, "prompt": asked})
-        decisions: dict[Any, dict[str, Any]] = {}  # seeds with the same decision share an entry
+        by_key = {answer.key: answer for answer in run.answers_by_scene.get(name, ())}
+        answers = [self._answer(n, name, scene, by_key, each, prompts) for each in by_key.values()]
+        detail: dict[str, Any] = {"answers": answers, "decisions": self._decisions(n, rows)}
+        if self.runs.live:  # in frozen scenes each action has its outcome
+            episodes = run.episodes_of(int(self._episodes[n][rows.start]))
+            detail["ends"] = [_end(episode) for episode in episodes]
+        if left_out := self.left_out[n].get(name):
+            detail["left_out"] = left_out
+        return detail
+
+    def _answer(
+        self,
+        n: int,
+        name: str,
+        scene: Scene | None,
+        by_key: Mapping[str, Answer],
+        answer: Answer,
+        prompts: dict[str, Any],
+    ) -> dict[str, Any]:
+        """Return what the page shows of one of the answers `by_key` of a scene.
+
+        Raises UserError if nobody of the viewer's name answers there.
+        """
+        run = self.runs.runs[n]
+        if scene and answer.viewer not in scene.viewers:
+            raise UserError(
+                f"{printable(run.path / 'answers.jsonl')} has an answer of "
+                f"{printable(answer.viewer)} in scene {printable(name)}, "
+                "where nobody of that name answers; make the run again"
+            )
+        fields = _fields(answer)
+        agent = run.agent(answer)
+        if answer.image_sha256:
+            pictured = questions()[answer.question].pictured
+            fields["picture"] = agent["image"] if pictured else "blank"
+        if run.manifest.helpers:
+            names = agent["model"]["name"], agent["prompt"]["version"], agent["answer"]
+            fields["agent"] = " · ".join(names)
+        if run.manifest.latency.speeds:
+            fields["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
+        elif run.manifest.helpers:
+            fields["took_s"] = run.seconds(answer)
+        return {
+            **fields,
+            "viewer": answer.key,
+            "spans": _read_in(answer, run) if answer.repairs else [],
+            "prompt": self._prompt(n, name, scene, by_key, answer, prompts),
+        }
+
+    def _prompt(
+        self,
+        n: int,
+        name: str,
+        scene: Scene | None,
+        by_key: Mapping[str, Answer],
+        answer: Answer,
+        prompts: dict[str, Any],
+    ) -> int | None:
+        """Return the place of an answer's chat messages among `prompts`, which they are added to.
+
+        None where they are not known; False where the page leaves them out.
+        """
+        run, messages_sent = self.runs.runs[n], self._sent[n]
+        if not (self.full or reads_prompts(str(run.agent(answer)["model"]["engine"]))):
+            return False
+        # Shuffled messages are in the details of another scene.
+        if not scene or not messages_sent or source_of(name, answer.heard) != name:
+            return None
+        heard = messages_of(by_key, answer.heard, run.actions)
+        view = as_asked(scene.seat or self.runs.scenario, scene, answer)
+        messages = messages_sent(view, answer.viewer, heard)
+        sha256 = digest(messages)
+        if answer.prompt_sha256 != sha256:
+            return None
+        prompts.setdefault(sha256, messages)
+        return list(prompts).index(sha256)
+
+    def _decisions(self, n: int, rows: Iterable[int]) -> list[dict[str, Any]]:
+        """Return the decisions of some rows of a run; seeds with the same one share an entry."""
+        decisions: dict[Any, dict[str, Any]] = {}
         for index in rows:
             row, end = self._rows[n].row(index), str(self.ends[n][index])
-            seed, *same = row.values()
-            if (alike := (*same, end)) not in decisions:
-                decisions[alike] = {**_shown(self._rows[n], row), "end": end, "seeds": []}
-            decisions[alike]["seeds"].append(seed)
-        detail: dict[str, Any] = {"answers": answers, "decisions": list(decisions.values())}
-        if self.runs.live:  # in frozen scenes each action has its outcome
-            ended = run.episodes_of(int(self._episodes[n][rows.start]))
-            detail["ends"] = [_end(end) for end in ended]
-        if left_out := self.left_out[n].get(name):
-            detail |= {"left_out": left_out}
-        return detail
+            seed, *values = row.values()
+            entry = decisions.get((*values, end))
+            if entry is None:
+                entry = {**_shown(self._rows[n], row), "end": end, "seeds": []}
+                decisions[(*values, end)] = entry
+            entry["seeds"].append(seed)
+        return list(decisions.values())
 
 
 @dataclass(frozen=True)
@@ -282,27 +328,47 @@ class Part:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
+        """Return the details of each block of scenes, compressed."""
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 
 def _columns(d: Decisions) -> list[str]:
-    of_messages = [
-        f"{name}_{n}" for n in range(1, d.helpers + 1) for name in ("helper", *OF_MESSAGE)
-    ]
-    return ["seed", *SHOWN, *OF_DRIVEN, *(f"fused_{action}" for action in d.actions), *of_messages]
+    policy = [f"fused_{action}" for action in d.actions]
+    places = range(1, d.helpers + 1)
+    messages = [f"{name}_{place}" for place in places for name in ("helper", *OF_MESSAGE)]
+    return ["seed", *SHOWN, *OF_DRIVEN, *policy, *messages]
 
 
 def _shown(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row of decisions for the page, with its policy and its messages as lists."""
+    messages = []
+    for place in range(1, d.helpers + 1):
+        helper = row[f"helper_{place}"]
+        if helper is not None:
+            values = {name: row[f"{name}_{place}"] for name in OF_MESSAGE}
+            messages.append({"from": helper, **values})
     return {
         **{name: row[name] for name in SHOWN},
         **{name: row[name] for name in OF_DRIVEN if row[name] is not None},
         "fused": [row[f"fused_{action}"] for action in d.actions],
-        "messages": [
-            {"from": helper, **{name: row[f"{name}_{n}"] for name in OF_MESSAGE}}
-            for n in range(1, d.helpers + 1)
-            if (helper := row[f"helper_{n}"]) is not None
-        ],
+        "messages": messages,
     }
+
+
+def _helpers_asked(runs: Iterable[dict[str, Any] | None]) -> set[tuple[str, ...]]:
+    """Return the ids of the helpers whom the ego asked together in some decision of these runs."""
+    decisions = [decision for run in runs if run for decision in run["decisions"]]
+    return {tuple(message["from"] for message in each["messages"]) for each in decisions}
+
+
+def _fields(answer: Answer) -> dict[str, Any]:
+    """Return those fields of an answer that the page shows and that say something."""
+    fields = {}
+    for name in KEPT:
+        value = getattr(answer, name)
+        if value not in (None, UNSET, ()) and value is not False:
+            fields[name] = text(value) if name in ("error", "detail") else value
+    return fields
 
 
 def _read_in(answer: Answer, run: Run) -> list[tuple[int, int]]:
@@ -317,15 +383,17 @@ def _end(e: Episode) -> dict[str, Any]:
 
 
 def _ends(run: Run) -> Any:
-    """What each decision led to, a letter a decision (n,);
-    in the closed loop, what its episode came to.
+    """Return a letter for what each decision led to, (n,);
+    in the closed loop, for how its episode ended.
     """
-    d = run.decisions
+    decisions = run.decisions
     if run.world == "closed-loop":
         letters = {"": GOOD, "late": SLOW}
-        return np.array([letters.get(e.failure, BAD) for e in run.episodes])[run.grid.places(d)]
-    safe = np.where(np.nan_to_num(d["delay_s"]) > 0, SLOW, GOOD)
-    return np.where(d.flags("value"), np.where(d.flags("safe"), safe, BAD), BLAMELESS)
+        of_episodes = np.array([letters.get(episode.failure, BAD) for episode in run.episodes])
+        return of_episodes[run.grid.places(decisions)]
+    of_safe = np.where(np.nan_to_num(decisions["delay_s"]) > 0, SLOW, GOOD)
+    of_avoidable = np.where(decisions.flags("safe"), of_safe, BAD)
+    return np.where(decisions.flags("value"), of_avoidable, BLAMELESS)
 
 
 # A camera's picture in a page: half as wide and high as a model is shown it, and in 32 shades of
@@ -334,71 +402,72 @@ FRAME_PX = 256, 128
 SHADES, HALF_A_SHADE = np.uint8(0xF8), np.uint8(0x04)
 
 
-def _world(scenario: Scenario, scene: Scene, asked: Iterable[tuple[str, ...]]) -> dict[str, Any]:
+def _world(
+    scenario: Scenario, scene: Scene, helpers_asked: Iterable[tuple[str, ...]]
+) -> dict[str, Any]:
     """Return what is where, in m to the east and to the north, and what each viewer sees of it.
 
-    Of each viewer, too, the part that is shown of it:
-    for whom the ego asked in each of some decisions.
+    Of each viewer, too, the part of the world that is drawn,
+    for each set of helpers that the ego asked in some decision.
     """
     state, danger = scene.state, scene.record.danger.vehicle
-    zone_m, heard = scenario.road().zone_m, sorted({(), *asked})
+    zone_m, sets_of_helpers = scenario.road().zone_m, sorted({(), *helpers_asked})
+    viewers = {}
+    for viewer, graph in scene.graphs.items():
+        crossed = conflict_points(state, graph)
+        views = {}
+        for ids in sets_of_helpers:
+            view = view_of(spots(state, zone_m, graph, (danger, *ids), crossed))
+            corner_and_width = (view.west_m, view.south_m, view.width_m)
+            views[" ".join(ids)] = [round(metres, 1) for metres in corner_and_width]
+        viewers[viewer] = {
+            "role": graph.role,
+            "seen": [*graph.seen],
+            "occluded": [*graph.occluded],
+            "conflicts": _conflicts(*crossed),
+            "views": views,
+        }
     return {
         "time_s": round(state.time_s, 3),
-        "vehicles": [
-            {
-                "id": v.id,
-                "kind": v.kind,
-                "part": "danger" if v.id == danger else v.part,
-                "x": round(v.x_m, 2),
-                "y": round(-v.y_m, 2),
-                "heading": round(-v.heading_rad, 4),
-                "length": v.length_m,
-                "width": v.width_m,
-                "speed": round(v.speed_mps, 2),
-                "crashed": v.crashed,
-            }
-            for v in state.vehicles
-        ],
+        "vehicles": [_vehicle(vehicle, danger) for vehicle in state.vehicles],
         "buildings": [
-            {"id": b.id, "corners": (b.corners() * [1.0, -1.0]).round(1).tolist()}
-            for b in state.buildings
+            {"id": building.id, "corners": north_up(building.corners()).round(1).tolist()}
+            for building in state.buildings
         ],
-        "viewers": {
-            viewer: {
-                "role": graph.role,
-                "seen": [*graph.seen],
-                "occluded": [*graph.occluded],
-                "conflicts": _conflicts(*crossed),
-                "views": {
-                    " ".join(ids): [
-                        round(view.west_m, 1),
-                        round(view.south_m, 1),
-                        round(view.width_m, 1),
-                    ]
-                    for ids in heard
-                    for view in [view_of(spots(state, zone_m, graph, (danger, *ids), crossed))]
-                },
-            }
-            for viewer, graph in scene.graphs.items()
-            for crossed in [conflict_points(state, graph)]
-        },
+        "viewers": viewers,
+    }
+
+
+def _vehicle(vehicle: VehicleState, danger: str | None) -> dict[str, Any]:
+    return {
+        "id": vehicle.id,
+        "kind": vehicle.kind,
+        "part": "danger" if vehicle.id == danger else vehicle.part,
+        "x": round(vehicle.x_m, 2),
+        "y": round(-vehicle.y_m, 2),
+        "heading": round(-vehicle.heading_rad, 4),
+        "length": vehicle.length_m,
+        "width": vehicle.width_m,
+        "speed": round(vehicle.speed_mps, 2),
+        "crashed": vehicle.crashed,
     }
 
 
 def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
-    """Of each viewer, what its cameras see and boxes around what its sensors list
-    (`Frame.boxes`).
+    """Return by viewer what its cameras see, as a picture of `FRAME_PX`,
+    and boxes around what its sensors list (`Frame.boxes`).
     """
-    shown = {}
+    pictures = {}
     for viewer, graph in scene.graphs.items():
         seen = frame(scenario, scene.state, viewer, FRAME_PX)
+        image = Image(seen.pixels & SHADES | HALF_A_SHADE)
         boxes = seen.boxes()
-        shown[viewer] = {
+        pictures[viewer] = {
             "size": FRAME_PX,
-            "picture": picture(Image(seen.pixels & SHADES | HALF_A_SHADE).png(), "png"),
+            "picture": picture(image.png(), "png"),
             "boxes": [[name, *box] for name in graph.seen for box in boxes.get(name, ())],
         }
-    return shown
+    return pictures
 
 
 def _conflicts(conflicts: Sequence[Conflict], points: Floats) -> list[dict[str, Any]]:
@@ -412,19 +481,17 @@ def _outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
     """Return what each action leads to at a decision point if the full-view driver takes the
     rest.
     """
-    n = forest.place[name]
-    last = forest.then_full_view[n]
-    in_time = forest.succeeds(last, forest.tree[n])
-    rows = zip(
-        forest.actions, last.tolist(), in_time, forest.safe[n], forest.delay_s[n], strict=True
-    )
-    return [
-        {
-            **msgspec.to_builtins(end := forest.end(edge)),
-            "action": action,
-            "safe": bool(safe),
-            "result": "late" if end.result == "cleared" and not success else end.result,
-            "delay_s": None if np.isnan(delay_s) else round(float(delay_s), 3),
-        }
-        for action, edge, success, safe, delay_s in rows
-    ]
+    place = forest.place[name]
+    last_edges = forest.then_full_view[place]
+    in_time = forest.succeeds(last_edges, forest.tree[place])
+    outcomes = []
+    for n, action in enumerate(forest.actions):
+        end = forest.end(int(last_edges[n]))
+        late = end.result == "cleared" and not in_time[n]
+        outcome = msgspec.to_builtins(end)
+        outcome["action"] = action
+        outcome["safe"] = bool(forest.safe[place, n])
+        outcome["result"] = "late" if late else end.result
+        outcome["delay_s"] = known(round(float(forest.delay_s[place, n]), 3))
+        outcomes.append(outcome)
+    return outcomes
