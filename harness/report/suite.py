@@ -54,8 +54,7 @@ class Line:
 
 
 def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> list[Line]:
-    """The families, then their mean. Holm's method corrects families' gains together,
-    and means' together.
+    """Return a line for each family, then one for their mean.
 
     Args:
         suite: what was run.
@@ -65,52 +64,74 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     """
     if datasets is None:  # else they were just made
         refuse(suite)
-        datasets = {family: dataset_of(run) for family, run in suite.runs.items()}
-        for family, dataset in datasets.items():
-            if dataset.scenario.name != family:
-                raise UserError(
-                    f"{printable(suite.path)} contradicts itself: {SUITE} has a run of "
-                    f"{printable(dataset.scenario.name)} as that of {printable(family)}; make the "
-                    "suite again"
-                )
-    gains, lead = BASELINE in suite.conditions, lead_of(suite)
-    of_trees = {
-        family: in_trees(datasets[family].of_episodes(run.grid.episodes))
-        for family, run in suite.runs.items()
-    }
-    drivers = {
-        family: {name: scores[lead] for name, scores in of.items()}
-        for family, of in of_trees.items()
-    }
-    p_values = {
-        (family, condition): p
-        for family, run in suite.runs.items()
-        if gains
-        for condition, p in words.p_values(run, BASELINE).items()
-    }
-    of_mean = {(MEAN, c): p for c, p in words.p_values(suite, BASELINE).items()} if gains else {}
-    corrected = {
-        key: p
-        for of in (p_values, of_mean)
-        for key, p in zip(of, holm(list(of.values())), strict=True)
-    }
+        datasets = _datasets(suite)
+    metric = lead_of(suite)
+    p_values = _p_of_gains(suite)
+    lines, drivers = list[Line](), list[dict[str, Score]]()
+    for family, run in suite.runs.items():
+        references = in_trees(datasets[family].of_episodes(run.grid.episodes))
+        drivers.append({name: scores[metric] for name, scores in references.items()})
+        cells = _cells(run, suite.conditions, metric, p_values.get(family, {}))
+        lines.append(Line(family, run, drivers[-1], cells))
+    means = {}
+    for name in drivers[0]:
+        if all(name in of_family for of_family in drivers):
+            means[name] = mean([of_family[name] for of_family in drivers])
+    cells = _cells(suite, suite.conditions, metric, p_values.get(MEAN, {}))
+    return [*lines, Line(MEAN, None, means, cells)]
 
-    def cells(name: str, of: Run | SuiteRun) -> dict[str, Cell]:
-        by_condition = {}
-        for c in suite.conditions:
-            gain, p = of.score(c, GAINS[lead]), corrected.get((name, c), 1.0)
-            better = "better" if gain and (gain.value or 0.0) > 0 else "worse"
-            by_condition[c] = Cell(of.score(c, lead), gain, better if p <= LEVEL else "")
-        return by_condition
 
-    names = [
-        name for name in next(iter(drivers.values())) if all(name in of for of in drivers.values())
-    ]
-    means = {name: mean([of[name] for of in drivers.values()]) for name in names}
-    return [
-        *(Line(name, run, drivers[name], cells(name, run)) for name, run in suite.runs.items()),
-        Line(MEAN, None, means, cells(MEAN, suite)),
-    ]
+def _datasets(suite: SuiteRun) -> dict[str, Dataset]:
+    """Return the dataset of each family's run.
+
+    Raises UserError if one is of another family.
+    """
+    datasets = {family: dataset_of(run) for family, run in suite.runs.items()}
+    for family, dataset in datasets.items():
+        if dataset.scenario.name != family:
+            raise UserError(
+                f"{printable(suite.path)} contradicts itself: {SUITE} has a run of "
+                f"{printable(dataset.scenario.name)} as that of {printable(family)}; make the "
+                "suite again"
+            )
+    return datasets
+
+
+def _p_of_gains(suite: SuiteRun) -> dict[str, dict[str, float]]:
+    """Return by family, and `MEAN`, the p of each condition's gain over `BASELINE`.
+
+    Holm's method corrects those of all families together, and those of the mean together.
+    """
+    if BASELINE not in suite.conditions:
+        return {}
+    keys, p_values = list[tuple[str, str]](), list[float]()  # family and condition
+    for family, run in suite.runs.items():
+        for condition, p in words.p_values(run, BASELINE).items():
+            keys.append((family, condition))
+            p_values.append(p)
+    corrected: dict[str, dict[str, float]] = {}
+    for (family, condition), p in zip(keys, holm(p_values), strict=True):
+        corrected.setdefault(family, {})[condition] = p
+    of_mean = words.p_values(suite, BASELINE)
+    corrected[MEAN] = dict(zip(of_mean, holm(list(of_mean.values())), strict=True))
+    return corrected
+
+
+def _cells(
+    run: Run | SuiteRun,
+    conditions: Sequence[str],
+    metric: str,
+    p_values: Mapping[str, float],
+) -> dict[str, Cell]:
+    """Return by condition the cell of a run's line; a gain without a p-value has no verdict."""
+    cells = {}
+    for condition in conditions:
+        gain = run.score(condition, GAINS[metric])
+        verdict = ""
+        if p_values.get(condition, 1.0) <= LEVEL:
+            verdict = "better" if gain and (gain.value or 0.0) > 0 else "worse"
+        cells[condition] = Cell(run.score(condition, metric), gain, verdict)
+    return cells
 
 
 def seeds_of(run: Run) -> str:
@@ -128,7 +149,7 @@ def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
 
 
 def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> str:
-    """The page of one suite's run, or of several;
+    """Return the page of one suite's run, or of several;
     `place` gives the link to the page of a family's run.
     """
     return document([_section(suite, rows, place) for suite, rows in suites])
@@ -155,27 +176,27 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
 def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
     """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
-    lead = lead_of(suite)
-    scores = {f"{IN_WORDS[lead]} with {c}": suite.score(c, lead) for c in suite.conditions}
-    gain = suite.score(best, GAINS[lead]) if base == BASELINE else None
+    metric = lead_of(suite)
+    scores = {}
+    for condition in suite.conditions:
+        scores[f"{IN_WORDS[metric]} with {condition}"] = suite.score(condition, metric)
+    gain = suite.score(best, GAINS[metric]) if base == BASELINE else None
     scores[f"more with {best} than with {base}"] = gain
     return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
 
 
-def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
+def _families(lines: Sequence[Line], place: Place, metric: str) -> Table:
+    """Return the table of families × conditions by the headline metric, a row for each line."""
     mean = lines[-1]
     of_conditions = colours.conditions(mean.cells)
     key = Markup('<span class="key-colour" style="background:{}"></span>{}')
     conditions = [key.format(colour, name) for name, colour in of_conditions.items()]
-    rows = [
-        (
-            _named(line, place),
-            *map(_cell, line.cells.values()),
-            _picture(line, of_conditions),
-            *(words.cell(line.drivers[name]) for name in mean.drivers),
-        )
-        for line in lines
-    ]
+    rows = []
+    for line in lines:
+        cells = [_cell(cell) for cell in line.cells.values()]
+        drivers = [words.cell(line.drivers[name]) for name in mean.drivers]
+        rows.append((_named(line, place), *cells, _picture(line, of_conditions), *drivers))
+    has_gains = any(cell.gain for cell in mean.cells.values())
     gains = (
         f"; below it the gain over {BASELINE}, paired by episode. ✓ and ✗ mark a gain and a loss "
         "beyond chance: p of the gain, from its interval, is at most 0.05 after Holm's "
@@ -183,8 +204,8 @@ def _families(lines: Sequence[Line], place: Place, lead: str) -> Table:
         "for all conditions"
     )
     note = (
-        f"{IN_WORDS[lead].capitalize()} with its 95 % "
-        f"interval{gains * any(cell.gain for cell in mean.cells.values())}. The mean gives each "
+        f"{IN_WORDS[metric].capitalize()} with its 95 % interval{gains * has_gains}. "
+        "The mean gives each "
         "family the same weight, however many episodes it has. Its interval is combined from the "
         "intervals of the families (Zou and Donner 2008), and that of a gain is of the episodes "
         "of all families together. It is about other episodes of these families, not about other "
@@ -219,44 +240,36 @@ def _cell(cell: Cell) -> Markup:
 
 def _metrics(suite: SuiteRun) -> Table:
     """Return the means over families of every metric, with its meaning."""
-    metrics = [
-        entry(m) for m in dict.fromkeys(s.metric for s in suite.scores if s.condition != "all")
-    ]
-    rows = [
-        (
-            Markup("{}<small>{}</small>").format(metric.label, metric.meaning),
-            *(words.cell(suite.score(c, metric.name)) for c in suite.conditions),
-        )
-        for metric in metrics
-    ]
+    names = dict.fromkeys(score.metric for score in suite.scores if score.condition != "all")
+    rows = []
+    for metric in map(entry, names):
+        name = Markup("{}<small>{}</small>").format(metric.label, metric.meaning)
+        scores = [suite.score(condition, metric.name) for condition in suite.conditions]
+        rows.append((name, *(words.cell(score) for score in scores)))
+    title, heads = "All metrics, means over families", ["metric", *suite.conditions]
     note = "A dash means that at least one family has no value."
-    return Table(
-        "All metrics, means over families", ["metric", *suite.conditions], rows, note, folded=True
-    )
+    return Table(title, heads, rows, note, folded=True)
 
 
 def _picture(line: Line, of_conditions: Mapping[str, str]) -> Markup:
-    """Return the success rates of a line and their intervals, from 0 to 100 %;
+    """Draw the success rates of a line and their intervals, from 0 to 100 %;
     drivers are thin lines.
     """
     height = STEP * (len(line.cells) + 1)
-    parts = [
-        f'<path class="driver" d="M{WIDTH * (d.value or 0.0):.1f} 2V{height - 2}"/>'
-        for d in line.drivers.values()
-    ]
+    parts = []
+    for driver in line.drivers.values():
+        x = WIDTH * (driver.value or 0.0)
+        parts.append(f'<path class="driver" d="M{x:.1f} 2V{height - 2}"/>')
     for n, (condition, cell) in enumerate(line.cells.items(), 1):
         s = cell.success
         if s and s.value is not None and s.low is not None and s.high is not None:
-            x, low, high = (WIDTH * end for end in (s.value, s.low, s.high))
-            parts.append(
-                f'<g style="color:{of_conditions[condition]}"><path d="M{low:.1f} '
-                f'{n * STEP}H{high:.1f}"/>'
-                f'<circle cx="{x:.1f}" cy="{n * STEP}" r="3"/></g>'
-            )
+            y = n * STEP
+            interval = f'<path d="M{WIDTH * s.low:.1f} {y}H{WIDTH * s.high:.1f}"/>'
+            value = f'<circle cx="{WIDTH * s.value:.1f}" cy="{y}" r="3"/>'
+            parts.append(f'<g style="color:{of_conditions[condition]}">{interval}{value}</g>')
+    size = f'viewBox="-4 0 {WIDTH + 8} {height}" width="{WIDTH + 8}" height="{height}"'
+    frame = f"M0 0V{height}M{WIDTH / 2} 0V{height}M{WIDTH} 0V{height}"
     return Markup(
-        f'<svg class="line" viewBox="-4 0 {WIDTH + 8} {height}" width="{WIDTH + 8}" '
-        f'height="{height}" '
-        'aria-hidden="true">'
-        f'<path class="frame" d="M0 0V{height}M{WIDTH / 2} 0V{height}M{WIDTH} 0V{height}"/>'
-        f"{''.join(parts)}</svg>"
+        f'<svg class="line" {size} aria-hidden="true">'
+        f'<path class="frame" d="{frame}"/>{"".join(parts)}</svg>'
     )
