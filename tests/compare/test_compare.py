@@ -23,7 +23,7 @@ from harness.core.multiplicity import holm
 from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
-from harness.report.compare.pair import ORDER, TOLD, pair
+from harness.report.compare.pair import ORDER, SETTINGS, pair
 from harness.runs.metrics import BALANCED, METRICS, ONE_OPTIMAL
 
 Said = tuple[int, str, str]
@@ -343,7 +343,7 @@ def test_settings_in_which_runs_differ_are_told(runs: tuple[Path, Path]) -> None
 
 def test_settings_are_told_in_their_order() -> None:
     others = ("extensions", "identity", "versions")
-    assert (*ORDER, *others) == TOLD
+    assert (*ORDER, *others) == SETTINGS
 
 
 def test_a_setting_of_an_extension_in_which_runs_differ_is_told(runs: tuple[Path, Path]) -> None:

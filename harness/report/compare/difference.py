@@ -4,8 +4,10 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
@@ -14,6 +16,7 @@ from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
+from harness.runs.folder import Run
 from harness.runs.leading import lead_of
 from harness.runs.metrics import (
     ADJUSTED,
@@ -124,12 +127,12 @@ class AnswersHeld:
     @property
     def verdicts(self) -> int:
         """How many answers to the same question were read with another verdict."""
-        return sum(before != after for before, after in (each.verdicts for each in self.changed))
+        return sum(len(set(answer.verdicts)) > 1 for answer in self.changed)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """B against A."""
+    """What changed from run A to run B."""
 
     pair: Pair  # the two runs
     # that differ: name, A's value, B's, or None
@@ -143,28 +146,41 @@ class Comparison:
 
 
 def compare(pair: Pair) -> Comparison:
-    """Hold B against A."""
-    a, b = ({answer.id: answer for answer in side.run.answers} for side in (pair.a, pair.b))
-    both = [request for request in a if request in b]
+    """Return what changed from A to B: settings, prompts, metrics, episodes and answers."""
     conditions = [_in_condition(pair, name) for name in pair.conditions]
-    lost = {
-        f.scene: LOST_BY.index(f.lost_by) for c in reversed(conditions) for f in reversed(c.flips)
-    }
-    both.sort(key=lambda request: lost.get(a[request].scene, len(LOST_BY)))
-    flipped: dict[tuple[str, str, str], list[str]] = {}
-    for request in both:
-        before, after = a[request].verdict, b[request].verdict
-        if before != after:
-            flipped.setdefault((a[request].role, before, after), []).append(request)
+    answers = _answers_of_both(pair, conditions)
     return Comparison(
         pair=pair,
         settings=tuple(_settings(pair)),
         conditions=_corrected(conditions),
-        answers=tuple(AnswersFlipped(*how, tuple(ids)) for how, ids in sorted(flipped.items())),
-        answers_in_both=dict(Counter(a[request].role for request in both)),
-        held=_held([(a[request], b[request]) for request in both]),
+        answers=_answers_flipped(answers),
+        answers_in_both=dict(Counter(before.role for before, _ in answers)),
+        held=_held(answers),
         prompts=_prompts(pair),
     )
+
+
+def _answers_of_both(pair: Pair, conditions: Sequence[InCondition]) -> list[tuple[Answer, Answer]]:
+    """Return the answers of both runs to each request that they share.
+
+    First come those of scenes where B gave success away, then those where A did.
+    """
+    rank: dict[str, int] = {}  # by scene: of its first flip
+    for condition in conditions:
+        for flip in condition.flips:
+            rank.setdefault(flip.scene, LOST_BY.index(flip.lost_by))
+    after = {answer.id: answer for answer in pair.b.run.answers}
+    answers = [(answer, after[answer.id]) for answer in pair.a.run.answers if answer.id in after]
+    return sorted(answers, key=lambda both: rank.get(both[0].scene, len(LOST_BY)))
+
+
+def _answers_flipped(answers: Sequence[tuple[Answer, Answer]]) -> tuple[AnswersFlipped, ...]:
+    """Return the answers whose verdict changed, by role and both verdicts."""
+    requests: dict[tuple[str, str, str], list[str]] = {}
+    for a, b in answers:
+        if a.verdict != b.verdict:
+            requests.setdefault((a.role, a.verdict, b.verdict), []).append(a.id)
+    return tuple(AnswersFlipped(*key, tuple(ids)) for key, ids in sorted(requests.items()))
 
 
 def _held(answers: Sequence[tuple[Answer, Answer]]) -> AnswersHeld:
@@ -184,81 +200,62 @@ def _question(answer: Answer) -> tuple[str, str | None]:
 
 def _prompts(pair: Pair) -> PromptChange | str | None:
     """Return what differs between the egos' prompts, and between the first helpers'."""
-    a, b = (
-        [side.run.manifest.agent(place)["prompt"] for place in (0, 1)] for side in (pair.a, pair.b)
-    )
-    if [prompt["sha256"] for prompt in a] == [prompt["sha256"] for prompt in b]:
+    stated_a, stated_b = pair.a.prompts, pair.b.prompts
+    if [prompt["sha256"] for prompt in stated_a] == [prompt["sha256"] for prompt in stated_b]:
         return None
-    here = []
-    sides = (("A", pair.a, a), ("B", pair.b, b))
-    for name, side, prompt in ((name, side, each) for name, side, of in sides for each in of):
-        version = prompt_of(side.run, prompt)
-        if version is None:
-            return (
-                f"what differs between the prompts is not known: {name}'s "
-                f"{printable(prompt['version'], 40)} "
-                f"with sha256 {printable(prompt['sha256'], 13)} is not here"
-            )
-        here.append(version)
-    return change(of_swarm(*here[:2]), of_swarm(*here[2:]))
+    swarms = []
+    for name, side in (("A", pair.a), ("B", pair.b)):
+        prompts = []
+        for stated in side.prompts:
+            prompt = prompt_of(side.run, stated)
+            if prompt is None:
+                return (
+                    f"what differs between the prompts is not known: {name}'s "
+                    f"{printable(stated['version'], 40)} "
+                    f"with sha256 {printable(stated['sha256'], 13)} is not here"
+                )
+            prompts.append(prompt)
+        swarms.append(of_swarm(*prompts))
+    return change(*swarms)
 
 
 def _corrected(conditions: Sequence[InCondition]) -> tuple[InCondition, ...]:
-    """Correct the p-values of the primary metrics,
-    as they count among each other in all conditions.
-    """
-    p_values = [
-        p for c in conditions for d in c.differences if d.primary and (p := d.p_value) is not None
-    ]
+    """Correct the p-values of the primary metrics together, over all conditions."""
+    p_values = []
+    for condition in conditions:
+        primary = [each for each in condition.differences if each.primary]
+        p_values += [each.p_value for each in primary if each.p_value is not None]
     corrected = iter(holm(p_values))
-
-    def with_p(d: Difference) -> Difference:
-        return replace(d, p_corrected=next(corrected)) if d.primary and d.p_value is not None else d
-
-    return tuple(replace(c, differences=tuple(map(with_p, c.differences))) for c in conditions)
+    result = []
+    for condition in conditions:
+        differences = []
+        for each in condition.differences:
+            if each.primary and each.p_value is not None:
+                each = replace(each, p_corrected=next(corrected))
+            differences.append(each)
+        result.append(replace(condition, differences=tuple(differences)))
+    return tuple(result)
 
 
 def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
+    """Yield each setting that differs, with its value in A and in B; None where it has none."""
     a, b = pair.a.settings, pair.b.settings
-    left_out = tuple(
-        f"condition.{name}."
-        for side in (pair.a, pair.b)
-        for name in side.run.conditions
-        if name not in pair.conditions
-    )
+    # A description changes nothing, and the sample behind a time is no setting.
+    prefixes = ["model.description", "latency.sample."]
+    for side in (pair.a, pair.b):
+        alone = [name for name in side.run.conditions if name not in pair.conditions]
+        prefixes += [f"condition.{name}." for name in alone]
     for name in {**a, **b}:
-        # A description changes nothing, and the sample behind a time is no setting.
-        if a.get(name) != b.get(name) and not name.startswith(
-            ("model.description", "latency.sample.", *left_out)
-        ):
+        if a.get(name) != b.get(name) and not name.startswith(tuple(prefixes)):
             yield name, a.get(name), b.get(name)
 
 
 def _in_condition(pair: Pair, condition: str) -> InCondition:
     shared = {name: pair.values(pair.a, name, condition) for name in pair.a.values}
     differences = [_difference(pair, name, condition) for name in known_in(shared)]
-    names = {metric.percentile: metric.name for metric in METRICS.values()}
-    before, after = (pair.latencies(side, condition) for side in (pair.a, pair.b))
-    differences += [
-        Difference(
-            names[percent], a, b, change, p_of_bootstrap(change.value, change.low, change.high)
-        )
-        for percent, a, b, change in percentiles.differences(before, after, len(pair.episodes))
-    ]
-    judged_a, judged_b = (pair.judged(side, condition) for side in (pair.a, pair.b))
-    for metric in METRICS.values():
-        if metric.name == ONE_OPTIMAL:  # it says what others are of, and is no figure of a policy
-            first, second = float(len(judged_a.sure)), float(len(judged_b.sure))
-            n = len(pair.episodes) if first or second else 0
-            count = Estimate(second - first, math.nan, math.nan, n, 0)
-            differences.append(Difference(metric.name, first, second, count, None))
-        elif metric.pooled:
-            first, second, change = reliability.difference(
-                judged_a, judged_b, metric.pooled, len(pair.episodes)
-            )
-            p = p_of_bootstrap(change.value, change.low, change.high)
-            differences.append(Difference(metric.name, first, second, change, p))
-    a, b = (pair.values(side, SUCCESS, condition) for side in (pair.a, pair.b))
+    differences += _percentiles(pair, condition)
+    differences += _pooled(pair, condition)
+    a, b = pair.values(pair.a, SUCCESS, condition), pair.values(pair.b, SUCCESS, condition)
     differences += _adjusted(pair, condition, a.T, b.T)
     decisions, flipped = _decision_flips(pair, condition)
     return InCondition(
@@ -271,21 +268,50 @@ def _in_condition(pair: Pair, condition: str) -> InCondition:
     )
 
 
-def _difference(pair: Pair, metric: str, condition: str) -> Difference:
-    def values(name: str) -> tuple[Floats, Floats]:
-        a, b = (pair.values(side, name, condition) for side in (pair.a, pair.b))
-        unknown = np.isnan(a) | np.isnan(b)
-        return np.where(unknown, np.nan, a), np.where(unknown, np.nan, b)
+def _percentiles(pair: Pair, condition: str) -> Iterator[Difference]:
+    """Yield the differences of the percentiles of latency."""
+    names = {metric.percentile: metric.name for metric in METRICS.values()}
+    before, after = pair.latencies(pair.a, condition), pair.latencies(pair.b, condition)
+    differences = percentiles.differences(before, after, len(pair.episodes))
+    for percent, a, b, estimate in differences:
+        p = p_of_bootstrap(estimate.value, estimate.low, estimate.high)
+        yield Difference(names[percent], a, b, estimate, p)
 
-    halves = {name: values(name) for name in entry(metric).halves or (metric,)}
-    before, after = (
-        float(np.mean([known_mean(known_mean(half[side], 1), 0) for half in halves.values()]))
-        for side in (0, 1)
-    )
+
+def _pooled(pair: Pair, condition: str) -> Iterator[Difference]:
+    """Yield the differences of metrics that are of all decisions together, and their number."""
+    episodes = len(pair.episodes)
+    judged_a, judged_b = pair.judged(pair.a, condition), pair.judged(pair.b, condition)
+    for metric in METRICS.values():
+        if metric.name == ONE_OPTIMAL:  # it says what others are of, and is no figure of a policy
+            a, b = float(len(judged_a.sure)), float(len(judged_b.sure))
+            count = Estimate(b - a, math.nan, math.nan, episodes if a or b else 0, 0)
+            yield Difference(metric.name, a, b, count, None)
+        elif metric.pooled:
+            a, b, estimate = reliability.difference(judged_a, judged_b, metric.pooled, episodes)
+            p = p_of_bootstrap(estimate.value, estimate.low, estimate.high)
+            yield Difference(metric.name, a, b, estimate, p)
+
+
+def _difference(pair: Pair, metric: str, condition: str) -> Difference:
+    """Return the difference of a metric, over the episodes and seeds in which both know it.
+
+    Of a mean of halves, each half is paired on its own.
+    """
+    halves = list[tuple[Floats, Floats]]()  # values of A and of B, (E, S)
+    means_a, means_b = list[Floats](), list[Floats]()
+    for name in entry(metric).halves or (metric,):
+        a, b = pair.values(pair.a, name, condition), pair.values(pair.b, name, condition)
+        unknown = np.isnan(a) | np.isnan(b)
+        a, b = np.where(unknown, np.nan, a), np.where(unknown, np.nan, b)
+        halves.append((a, b))
+        means_a.append(known_mean(known_mean(a, 1), 0))
+        means_b.append(known_mean(known_mean(b, 1), 0))
 
     def change(level: float) -> Estimate:
-        return difference(metric, [(b, a) for a, b in halves.values()], level)
+        return difference(metric, [(b, a) for a, b in halves], level)
 
+    before, after = float(np.mean(means_a)), float(np.mean(means_b))
     return Difference(metric, before, after, change(LEVEL), p_value(change))
 
 
@@ -302,7 +328,8 @@ def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Diff
             return pool.difference(by, b, a, level) or by.difference(b, a, level)
 
         if corrected := pool.difference(by, b, a):
-            before, after = (pool.estimate(by, side) or by.estimate(side) for side in (a, b))
+            before = pool.estimate(by, a) or by.estimate(a)
+            after = pool.estimate(by, b) or by.estimate(b)
             name = ADJUSTED[by.metric]
             yield Difference(name, before.value, after.value, corrected, p_value(change))
 
@@ -310,12 +337,13 @@ def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Diff
 def _flips(pair: Pair, condition: str, which: Bools) -> Iterator[Flip]:
     """Yield those (E, S) that flip, one an episode and way of ending."""
     for episode, row in zip(pair.episodes, which, strict=True):
-        seeds: dict[tuple[str, str], list[int]] = {}
+        seeds_of: dict[tuple[str, str], list[int]] = {}  # by the endings in A and B
         for seed in np.array(pair.seeds)[row].tolist():
-            a, b = (side.ends[condition, seed, episode] for side in (pair.a, pair.b))
-            how = ("success" if a.success else a.failure, "success" if b.success else b.failure)
-            seeds.setdefault(how, []).append(seed)
-        yield from (Flip(episode, tuple(in_seeds), *how) for how, in_seeds in sorted(seeds.items()))
+            a, b = pair.a.ends[condition, seed, episode], pair.b.ends[condition, seed, episode]
+            endings = ("success" if a.success else a.failure, "success" if b.success else b.failure)
+            seeds_of.setdefault(endings, []).append(seed)
+        for endings, seeds in sorted(seeds_of.items()):
+            yield Flip(episode, tuple(seeds), *endings)
 
 
 def _decision_flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip, ...]]:
@@ -323,45 +351,48 @@ def _decision_flips(pair: Pair, condition: str) -> tuple[int, tuple[DecisionFlip
     list the flips by `LOST_BY`, then by most seeds.
     """
     names = sorted({*pair.a.run.decisions.scenes, *pair.b.run.decisions.scenes})
-    (keys_a, rows_a), (keys_b, rows_b) = (
-        _keys(pair, side, condition, names) for side in (pair.a, pair.b)
-    )
+    keys_a, rows_a = _keys(pair, pair.a, condition, names)
+    keys_b, rows_b = _keys(pair, pair.b, condition, names)
     _, of_a, of_b = np.intersect1d(keys_a, keys_b, assume_unique=True, return_indices=True)
     rows_a, rows_b = rows_a[of_a], rows_b[of_b]
     a, b = pair.a.run.decisions, pair.b.run.decisions
-    acted_a, acted_b = (
-        np.array(side.run.actions)[side.run.decisions.codes("action", side.run.actions)[rows]]
-        for side, rows in ((pair.a, rows_a), (pair.b, rows_b))
-    )
+    action_a, action_b = _actions(pair.a.run, rows_a), _actions(pair.b.run, rows_b)
     lost_a, lost_b = a.flags("regret")[rows_a], b.flags("regret")[rows_b]
     lost_by = np.where(lost_a == lost_b, 2, np.where(lost_b, 0, 1))
     scene, episode = a.codes("scene", names)[rows_a], a.whole("episode")[rows_a]
     seed = a.whole("seed")[rows_a]
-    seeds: dict[tuple[int, int, str, str, int], list[int]] = {}
-    for n in np.flatnonzero(acted_a != acted_b).tolist():
-        how = int(lost_by[n]), int(scene[n]), str(acted_a[n]), str(acted_b[n]), int(episode[n])
-        seeds.setdefault(how, []).append(int(seed[n]))
-    ordered = sorted(seeds.items(), key=lambda item: (item[0][0], -len(item[1]), item[0]))
-    return len(of_a), tuple(
-        DecisionFlip(names[place], number, tuple(in_seeds), before, after, LOST_BY[by])
-        for (by, place, before, after, number), in_seeds in ordered
-    )
+    # By places in `LOST_BY` and in `names`, actions of A and B, and episode.
+    seeds_of: dict[tuple[int, int, str, str, int], list[int]] = {}
+    for n in np.flatnonzero(action_a != action_b).tolist():
+        key = int(lost_by[n]), int(scene[n]), str(action_a[n]), str(action_b[n]), int(episode[n])
+        seeds_of.setdefault(key, []).append(int(seed[n]))
+
+    def order(key: tuple[int, int, str, str, int]) -> tuple[Any, ...]:
+        return key[0], -len(seeds_of[key]), key
+
+    flips = []
+    for key in sorted(seeds_of, key=order):
+        by, place, before, after, number = key
+        seeds = tuple(seeds_of[key])
+        flips.append(DecisionFlip(names[place], number, seeds, before, after, LOST_BY[by]))
+    return len(of_a), tuple(flips)
+
+
+def _actions(run: Run, rows: Ints) -> NDArray[np.str_]:
+    """Return the names of the actions of some rows of decisions, (n,)."""
+    return np.array(run.actions)[run.decisions.codes("action", run.actions)[rows]]
 
 
 def _keys(pair: Pair, side: Side, condition: str, names: Sequence[str]) -> tuple[Ints, Ints]:
     """Return a number for each decision in a condition, the same in both runs,
     and the decision's row.
     """
-    run = side.run
-    d = run.decisions
-    rows = np.flatnonzero(d.codes("condition", run.conditions) == run.conditions.index(condition))
-    rows = rows[np.isin(d.whole("episode")[rows], pair.episodes)]
-    scene, episode, seed = (
-        d.codes("scene", names)[rows],
-        d.whole("episode")[rows],
-        d.whole("seed")[rows],
-    )
-    place = np.searchsorted(pair.episodes, episode) * len(pair.seeds) + np.searchsorted(
-        pair.seeds, seed
-    )
-    return scene * (len(pair.episodes) * len(pair.seeds)) + place, rows
+    run, decisions = side.run, side.run.decisions
+    conditions = decisions.codes("condition", run.conditions)
+    rows = np.flatnonzero(conditions == run.conditions.index(condition))
+    rows = rows[np.isin(decisions.whole("episode")[rows], pair.episodes)]
+    scene = decisions.codes("scene", names)[rows]
+    episode = np.searchsorted(pair.episodes, decisions.whole("episode")[rows])
+    seed = np.searchsorted(pair.seeds, decisions.whole("seed")[rows])
+    seeds, episodes = len(pair.seeds), len(pair.episodes)
+    return (scene * episodes + episode) * seeds + seed, rows

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -24,7 +25,7 @@ from harness.runs.reliability import Judged
 from harness.runs.settings import COMPARED
 from harness.world.parameters import DIALS
 
-# The order in which settings are told; one that is not here comes after them.
+# The order in which settings are listed; one that is not here comes after them.
 ORDER = (
     "model",
     "prompt",
@@ -41,7 +42,7 @@ ORDER = (
     "dtype",
     "latency",
 )
-TOLD = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
+SETTINGS = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
 
 
 def where(run: Run) -> str:
@@ -66,6 +67,11 @@ class Side:
         """How each episode ended, by condition, seed and number."""
         return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
+    @property
+    def prompts(self) -> list[dict[str, Any]]:
+        """The prompts of the ego and of the first helper, as the manifest states them."""
+        return [self.run.manifest.agent(place)["prompt"] for place in (0, 1)]
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -80,38 +86,40 @@ class Pair:
     def values(self, side: Side, metric: str, condition: str) -> Floats:
         """Return a metric of the episodes that both have, (E, S)."""
         grid = side.run.grid
-        seeds, episodes = map(grid.seeds.index, self.seeds), map(grid.episodes.index, self.episodes)
+        seeds = [grid.seeds.index(seed) for seed in self.seeds]
+        episodes = [grid.episodes.index(episode) for episode in self.episodes]
         of_condition = side.values[metric][grid.conditions.index(condition)]
-        return np.asarray(of_condition[np.ix_(list(seeds), list(episodes))].T)
+        return np.asarray(of_condition[np.ix_(seeds, episodes)].T)
 
     @cached_property
     def pool(self) -> Pool | None:
         """The layouts that both might have come to, and how hard they are;
         None where there are no more.
         """
-        a, b = (
-            {layout.episode: layout for layout in side.run.layouts} for side in (self.a, self.b)
-        )
+        a = {layout.episode: layout for layout in self.a.run.layouts}
+        b = {layout.episode: layout for layout in self.b.run.layouts}
         if any(b.get(episode, layout) != layout for episode, layout in a.items()):
             return None  # of one dataset both say the same, unless somebody changed a file
         both = {*(a or self.a.run.grid.episodes)} & {*(b or self.b.run.grid.episodes)}
-        known = [layout for episode, layout in {**a, **b}.items() if episode in both]
-        return Pool.of(known, self.episodes) if len(known) > len(self.episodes) else None
+        layouts = [layout for episode, layout in {**a, **b}.items() if episode in both]
+        return Pool.of(layouts, self.episodes) if len(layouts) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
         """Return the decisions in `episodes` with exactly one optimal action,
         by their place there.
         """
         rows, place = self._rows(side, condition)
-        p, safe = (side.run.decisions.of_actions(name)[rows] for name in ("fused", "safe"))
-        return Judged.of(p, safe == 1.0, place)
+        policy = side.run.decisions.of_actions("fused")[rows]
+        safe = side.run.decisions.of_actions("safe")[rows]
+        return Judged.of(policy, safe == 1.0, place)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
-        """Of each seed, the episodes' places in `episodes` and the latencies in ms of their
-        decisions.
+        """Return for each seed the latencies of its decisions, in ms,
+        with the places of their episodes in `episodes`.
         """
         rows, place = self._rows(side, condition)
-        seed, latency_ms = (side.run.decisions[name][rows] for name in ("seed", "latency_ms"))
+        seed = side.run.decisions["seed"][rows]
+        latency_ms = side.run.decisions["latency_ms"][rows]
         return [(place[seed == s], latency_ms[seed == s]) for s in self.seeds]
 
     def _rows(self, side: Side, condition: str) -> tuple[Ints, Ints]:
@@ -146,7 +154,7 @@ def pair(a: Path, b: Path) -> Pair:
     if first.manifest.world.pinned != second.manifest.world.pinned:
         scenes = " and ".join(printable(where(run), 60) for run in (first, second))
         raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
-    seeds_a, seeds_b = (sorted(run.manifest.seeds) for run in (first, second))
+    seeds_a, seeds_b = sorted(first.manifest.seeds), sorted(second.manifest.seeds)
     if seeds_a != seeds_b:
         seeds = " and ".join(printable(each, 40) for each in (seeds_a, seeds_b))
         raise UserError(f"{shown} have different seeds ({seeds}); make both with the same --seeds")
@@ -163,16 +171,15 @@ def pair(a: Path, b: Path) -> Pair:
 
 
 def _side(run: Run) -> Side:
-    stated = msgspec.json.decode(msgspec.json.encode(run.manifest))
-    opened = {**stated["settings"], **stated}  # a model, say, is told by what was opened
-    named = {key: opened[key] for key in TOLD}
+    manifest = msgspec.json.decode(msgspec.json.encode(run.manifest))
+    values = {**manifest["settings"], **manifest}  # a model, say, as it was opened
+    stated = {name: values[name] for name in SETTINGS}
     if run.world == "closed-loop":
-        parameters = stated["world"]["scenario"]["parameters"]
-        named["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
+        parameters = manifest["world"]["scenario"]["parameters"]
+        stated["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
     # Through the class, which gives a setting that the run does not know the value it had then.
-    points = [OperatingPoint.from_dict(condition).record() for condition in stated["conditions"]]
-    named["condition"] = {point["name"]: point for point in points}
-    settings = {name: str(value) for name, value in facts(nameless(named)) if value is not None}
-    return Side(
-        run, settings, by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes)
-    )
+    points = [OperatingPoint.from_dict(condition).record() for condition in manifest["conditions"]]
+    stated["condition"] = {point["name"]: point for point in points}
+    settings = {name: str(value) for name, value in facts(nameless(stated)) if value is not None}
+    metrics = by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes)
+    return Side(run, settings, metrics)
