@@ -105,19 +105,7 @@ def build(
     if audits and not shard:
         for plugin in AUDITS.values():
             plugin.ready()
-    config = {
-        "scenario": scenario.name,
-        "actions": list(scenario.actions),
-        "parameters": json.loads(canonical_json(scenario.parameters.stated())),
-        "episodes": episodes,
-        "seed": seed,
-        "purpose": purpose(seed, episodes),
-        "versions": {
-            "harness": __version__,
-            **{name: version(name) for name in ("highway-env", "numpy", "shapely")},
-        },
-        **({"environment": environment.config(scenario.name)} if scenario.is_environment else {}),
-    }
+    config = _settings(scenario, episodes, seed)
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
             f"--out {printable(out)} cannot name a dataset; end it in letters, digits, '.', '_' or "
@@ -147,6 +135,25 @@ def build(
         manifest = _write_dataset(scenario, out, place, config, workers, progress, audits, more)
         work.tidy(out)
     return manifest
+
+
+def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
+    """Return what a manifest states of how its dataset is built."""
+    versions = {"harness": __version__}
+    for package in ("highway-env", "numpy", "shapely"):
+        versions[package] = version(package)
+    settings = {
+        "scenario": scenario.name,
+        "actions": list(scenario.actions),
+        "parameters": json.loads(canonical_json(scenario.parameters.stated())),
+        "episodes": episodes,
+        "seed": seed,
+        "purpose": purpose(seed, episodes),
+        "versions": versions,
+    }
+    if scenario.is_environment:
+        settings["environment"] = environment.config(scenario.name)
+    return settings
 
 
 def merge(
@@ -185,12 +192,13 @@ def _freeze_missing(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> None:
-    todo = [e for e in episodes if not (place / part_of(e)).is_file()]
-    progress(len(episodes) - len(todo))
+    """Write the file of each layout that is not yet in the working folder `place`."""
+    missing = [episode for episode in episodes if not (place / part_of(episode)).is_file()]
+    progress(len(episodes) - len(missing))
     size = TOGETHER
     if isinstance(workers, int):  # no process may have nothing to do
-        size = max(1, min(size, ceil(len(todo) / workers)))
-    chunks = [todo[at : at + size] for at in range(0, len(todo), size)]
+        size = max(1, min(size, ceil(len(missing) / workers)))
+    chunks = [missing[at : at + size] for at in range(0, len(missing), size)]
 
     def keep(index: int, layouts: list[bytes]) -> None:
         for episode, data in zip(chunks[index], layouts, strict=True):
@@ -216,31 +224,32 @@ def _write_dataset(
     audits: bool,
     more: Callable[[int], None],
 ) -> dict[str, Any]:
-    episodes, seed = config["episodes"], config["seed"]
+    """Write all files of a dataset from the layouts in `place`; return its manifest."""
+    name, episodes, seed = out.absolute().name, config["episodes"], config["seed"]
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
-    audited = list[str]()
+    findings = list[str]()
     for plugin in AUDITS.values() if audits else ():
         more(episodes)
-        audited.append(plugin.found(scenario, episodes, seed, progress, workers))
+        findings.append(plugin.found(scenario, episodes, seed, progress, workers))
     command = _command(scenario, episodes, seed, audits)
     files = {
-        "README.md": _readme(out.absolute().name, command, config, forest, audited).encode(),
+        "README.md": _readme(name, command, config, forest, findings).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
         "tree.schema.json": _pretty(tree_schema()),
         "manifest.schema.json": _pretty(manifest_schema()),
     }
     manifest = {
         "format": "swarmdrive-dataset/2",
-        "name": out.absolute().name,
+        "name": name,
         **config,
         "nodes": sum(len(level) for tree in trees for level in tree.levels),
-        "files": {name: sha256_bytes(data) for name, data in files.items()},
-        "trees_sha256": list(map(sha256_bytes, texts)),
+        "files": {file: sha256_bytes(data) for file, data in files.items()},
+        "trees_sha256": [sha256_bytes(text) for text in texts],
     }
-    for name, data in files.items():
-        write_whole(out / name, data)
+    for file, data in files.items():
+        write_whole(out / file, data)
     write_whole(out / "manifest.json", _pretty(manifest))
     return manifest
 
@@ -248,25 +257,24 @@ def _write_dataset(
 def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> list[bytes]:
     """Return the file of each layout, and drive those that are checked."""
     frozen = freeze(scenario, {episode: seed + episode for episode in episodes})
-    checked, files = [], []
+    trees, files = [], []
     for episode, (levels, scenes) in zip(episodes, frozen, strict=True):
-        texts = [
-            "".join(canonical_json(msgspec.to_builtins(record)) + "\n" for record in level).encode()
-            for level in scenes
-        ]
+        texts = []
+        for level in scenes:
+            lines = [canonical_json(msgspec.to_builtins(record)) + "\n" for record in level]
+            texts.append("".join(lines).encode())
         for line in b"".join(texts).splitlines():  # a record that breaks its own form is a bug
             msgspec.json.decode(line, type=record_type(scenario))
-        tree = Tree(
-            episode, seed + episode, scenes[0][0].danger, levels, list(map(sha256_bytes, texts))
-        )
+        digests = [sha256_bytes(text) for text in texts]
+        tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, digests)
         data = BytesIO()
         with ZipFile(data, "w") as file:
             file.writestr(_entry(tree_name(episode)), msgspec.json.encode(tree))
             for step, text in enumerate(texts):
                 file.writestr(_entry(level_name(episode, step)), text)
         files.append(data.getvalue())
-        if episode % CHECKED_EVERY == 0:
-            checked.append(tree)
+        trees.append(tree)
+    checked = [tree for tree in trees if tree.episode % CHECKED_EVERY == 0]
     if checked:
         _check(scenario, checked)
     return files
@@ -277,21 +285,20 @@ def _check(scenario: Scenario, trees: Sequence[Tree]) -> None:
     bug.
     """
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
-    driven = drive_all(scenario, forest.seeds.tolist())
+    layouts = drive_all(scenario, forest.seeds.tolist())
     for driver in DRIVERS:
-        last, success = (
-            forest.last_edge(forest.drivers[driver]).tolist(),
-            forest.driver_success(driver),
-        )
-        for n, outcomes in enumerate(driven):
-            end, outcome = forest.end(last[n]), outcomes[driver]
-            in_tree = bool(success[n]), end.time_s, end.partner, end.fault
+        last_edges = forest.last_edge(forest.drivers[driver]).tolist()
+        success = forest.driver_success(driver).tolist()
+        for n, outcomes in enumerate(layouts):
+            end, outcome = forest.end(last_edges[n]), outcomes[driver]
+            in_tree = success[n], end.time_s, end.partner, end.fault
             if in_tree != (outcome.success, outcome.time_s, outcome.partner, outcome.fault):
                 seed = trees[n].episode_seed
                 raise RuntimeError(f"layout {seed}: {driver} drives to {outcome}, walks to {end}")
 
 
 def _join_layouts(work: Path, episodes: int, layouts: Path) -> list[bytes]:
+    """Write the layouts' files in the folder `work` to one file; return the text of each tree."""
     trees = []
     with replacing(layouts) as part, ZipFile(part, "w") as file:
         for episode in range(episodes):
@@ -327,6 +334,7 @@ def _pretty(value: Any) -> bytes:
 
 
 def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
+    """Return the command that builds a dataset."""
     default, p = scenarios.get(scenario.name).parameters, scenario.parameters
     name = shlex.quote(scenarios.argument(scenario))
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != default.decision_lag_s else ""
@@ -335,15 +343,17 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
 
 
 def _readme(
-    name: str, command: str, config: dict[str, Any], forest: Forest, audited: Sequence[str]
+    name: str, command: str, config: dict[str, Any], forest: Forest, findings: Sequence[str]
 ) -> str:
-    seeds, nodes, rate = config["episodes"], len(forest.ids), 100 * forest.value[forest.root].mean()
-    drivers = "\n".join(
-        f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |"
-        for driver in forest.drivers
-    )
+    """Return a dataset's card; `findings` are those of its audits."""
+    seeds, nodes = config["episodes"], len(forest.ids)
+    rate = 100 * forest.value[forest.root].mean()
+    rows = []
+    for driver in forest.drivers:
+        rows.append(f"| `{driver}` | {100 * forest.driver_success(driver).mean():.1f} |")
+    drivers = "\n".join(rows)
     parameters = config["parameters"]
-    audit_text = "\n\n".join(audited) or "Not audited for tells."
+    audit_text = "\n\n".join(findings) or "Not audited for tells."
     return f"""# {name}
 
 Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:

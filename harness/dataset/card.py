@@ -79,37 +79,14 @@ def readme(name: str, tables: Sequence[Table]) -> str:
     so none of them adds a key or a heading.
     """
     released = all(t.released for t in tables)
-    head = {
-        "license": "apache-2.0" if released else "unknown",
-        "pretty_name": name,
-        "language": ["en"],
-        "task_categories": ["text-generation", "reinforcement-learning", "robotics"],
-        "tags": [*TAGS, "croissant"],
-        "size_categories": [hub_size(sum(t.rows for t in tables))],
-        "configs": [
-            {"config_name": t.name, "data_files": [{"split": t.split, "path": t.path}]}
-            for t in tables
-        ],
-    }
+    head = _front_matter(name, tables)
     return _CARD.format(
-        head="\n".join(f"{key}: {json.dumps(value)}" for key, value in head.items()),
+        head=_lines(f"{key}: {json.dumps(value)}" for key, value in head.items()),
         name=name,
         first=tables[0],
         rows=sum(t.rows for t in tables),
         size=_megabytes(*tables),
-        tables=_lines(
-            _row(
-                f"`{t.name}`",
-                _code(t.title),
-                t.manifest.episodes,
-                t.rows,
-                t.layouts,
-                t.split,
-                _megabytes(t),
-                _code(t.prompt),
-            )
-            for t in tables
-        ),
+        tables=_lines(_row(*_cells(t)) for t in tables),
         columns=_lines(_row(f"`{c.name}`", f"`{c.kind}`", c.meaning) for c in COLUMNS),
         references=_lines(_references(tables)),
         limits=_lines(f"- {limit}" for limit in limits(tables)),
@@ -117,6 +94,37 @@ def readme(name: str, tables: Sequence[Table]) -> str:
         version=__version__,
         paper=PAPER,
         sources=_lines(f"- `{t.name}`, manifest sha256 `{t.dataset_sha256}`" for t in tables),
+    )
+
+
+def _front_matter(name: str, tables: Sequence[Table]) -> dict[str, Any]:
+    """Return the keys by which the hub lists a dataset and loads its tables."""
+    configs = []
+    for t in tables:
+        files = [{"split": t.split, "path": t.path}]
+        configs.append({"config_name": t.name, "data_files": files})
+    return {
+        "license": "apache-2.0" if all(t.released for t in tables) else "unknown",
+        "pretty_name": name,
+        "language": ["en"],
+        "task_categories": ["text-generation", "reinforcement-learning", "robotics"],
+        "tags": [*TAGS, "croissant"],
+        "size_categories": [hub_size(sum(t.rows for t in tables))],
+        "configs": configs,
+    }
+
+
+def _cells(t: Table) -> Sequence[object]:
+    """Return a table's row in the list of the card's tables."""
+    return (
+        f"`{t.name}`",
+        _code(t.title),
+        t.manifest.episodes,
+        t.rows,
+        t.layouts,
+        t.split,
+        _megabytes(t),
+        _code(t.prompt),
     )
 
 
@@ -168,71 +176,79 @@ def croissant(name: str, tables: Sequence[Table]) -> str:
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": name,
-        "description": "Decisions in cooperative driving, with the "
-        "exact safety and value of every action.",
+        "description": (
+            "Decisions in cooperative driving, with the exact safety and value of every action."
+        ),
         "url": PAPER,
         "citeAs": PAPER,
         "isLiveDataset": False,
         "keywords": TAGS,
         "rai:dataLimitations": list(limits(tables)),
-        "distribution": [
-            {
-                "@type": "cr:FileObject",
-                "@id": t.path,
-                "name": t.name,
-                "contentUrl": t.path,
-                "contentSize": f"{t.bytes} B",
-                "encodingFormat": "application/x-parquet",
-                "sha256": t.sha256,
-            }
-            for t in tables
-        ],
-        "recordSet": [
-            {
-                "@type": "cr:RecordSet",
-                "@id": t.name,
-                "name": t.name,
-                "description": f"{t.rows} decision points, {t.layouts}",
-                "field": [_field(t, column) for column in COLUMNS],
-            }
-            for t in tables
-        ],
+        "distribution": [_file(t) for t in tables],
+        "recordSet": [_record_set(t) for t in tables],
     }
     if all(t.released for t in tables):
         document["license"] = LICENCE
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
+def _file(table: Table) -> dict[str, Any]:
+    """Return Croissant's description of a table's file."""
+    return {
+        "@type": "cr:FileObject",
+        "@id": table.path,
+        "name": table.name,
+        "contentUrl": table.path,
+        "contentSize": f"{table.bytes} B",
+        "encodingFormat": "application/x-parquet",
+        "sha256": table.sha256,
+    }
+
+
+def _record_set(table: Table) -> dict[str, Any]:
+    """Return Croissant's description of a table's rows."""
+    return {
+        "@type": "cr:RecordSet",
+        "@id": table.name,
+        "name": table.name,
+        "description": f"{table.rows} decision points, {table.layouts}",
+        "field": [_field(table, column) for column in COLUMNS],
+    }
+
+
 def _field(table: Table, column: Column) -> dict[str, Any]:
-    listed = pa.types.is_list(column.kind)
-    inner = column.kind.value_type if listed else column.kind
+    """Return Croissant's description of a column, and of the parts of a structure."""
+    is_list = pa.types.is_list(column.kind)
+    kind = column.kind.value_type if is_list else column.kind
+    name = f"{table.name}/{column.name}"
+    source = {"fileObject": {"@id": table.path}, "extract": {"column": column.name}}
     field: dict[str, Any] = {
         "@type": "cr:Field",
-        "@id": f"{table.name}/{column.name}",
+        "@id": name,
         "name": column.name,
         "description": column.meaning,
-        "source": {"fileObject": {"@id": table.path}, "extract": {"column": column.name}},
+        "source": source,
     }
-    if listed:
+    if is_list:
         field["repeated"] = True
-    if not pa.types.is_struct(inner):
-        return {**field, "dataType": KINDS[str(inner)]}
-    return {
-        **field,
-        "subField": [
-            {
-                "@type": "cr:Field",
-                "@id": f"{field['@id']}/{part.name}",
-                "name": part.name,
-                "dataType": KINDS[str(part.type)],
-                "source": {**field["source"], "transform": {"jsonPath": part.name}},
-            }
-            for part in inner
-        ],
-    }
+    if not pa.types.is_struct(kind):
+        field["dataType"] = KINDS[str(kind)]
+        return field
+    field["subField"] = []
+    for part in kind:
+        sub_field = {
+            "@type": "cr:Field",
+            "@id": f"{name}/{part.name}",
+            "name": part.name,
+            "dataType": KINDS[str(part.type)],
+            "source": {**source, "transform": {"jsonPath": part.name}},
+        }
+        field["subField"].append(sub_field)
+    return field
 
 
 def _references(tables: Sequence[Table]) -> Iterator[str]:
+    """Yield the lines of the table of reference drivers."""
     names = list(dict.fromkeys(name for t in tables for name in t.references))
     yield _row("table", "n", *(f"`{name}`" for name in names))
     yield _row(*["---"] * (2 + len(names)))
@@ -244,19 +260,23 @@ def _references(tables: Sequence[Table]) -> Iterator[str]:
 def hub_size(rows: int) -> str:
     """Return the hub's word for a number of rows, such as `10K<n<100K`."""
     words = [f"{n // 10**6}M" if n >= 10**6 else f"{n // 1000}K" for n in SIZES]
-    bounds = [low for low, least in zip(words, SIZES, strict=True) if rows >= least]
-    if not bounds:
+    reached = sum(rows >= least for least in SIZES)
+    if not reached:
         return f"n<{words[0]}"
-    return f"n>{words[-1]}" if len(bounds) == len(words) else f"{bounds[-1]}<n<{words[len(bounds)]}"
+    if reached == len(words):
+        return f"n>{words[-1]}"
+    return f"{words[reached - 1]}<n<{words[reached]}"
 
 
 def _row(*cells: object) -> str:
-    return f"| {' | '.join(map(str, cells))} |"
+    """Return a row of a Markdown table."""
+    return f"| {' | '.join(str(cell) for cell in cells)} |"
 
 
 def _code(text: str) -> str:
     """Return a text as code in a cell of a table, whatever is in it."""
-    return f"`{' '.join(text.replace('`', chr(39)).replace('|', chr(92) + '|').split())}`"
+    safe = text.replace("`", "'").replace("|", "\\|")
+    return f"`{' '.join(safe.split())}`"
 
 
 def _megabytes(*tables: Table) -> str:

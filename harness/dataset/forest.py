@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.dataset.schema import Edge, End, Tree
+from harness.dataset.schema import Branching, Edge, End, Tree
 from harness.world.conflict_measures import columns
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import RATINGS, ROUNDING_S
@@ -56,70 +56,68 @@ class Forest:
     def of(
         cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters
     ) -> "Forest":
+        """Return the arrays of some trees of one scenario, with its actions and parameters."""
         action_index = {action: n for n, action in enumerate(actions)}
-        starts, total = [], 0  # the first index of each level of each tree
-        for tree in trees:
-            starts.append([total := total + size for size in (0, *map(len, tree.levels))])
-        child: list[list[int]] = []
-        edge: list[list[int]] = []
+        points: list[Branching] = []
+        roots, tree_of_point, step_of_point = list[int](), list[int](), list[int]()
+        child_rows, edge_rows = list[list[int]](), list[list[int]]()
         edges: list[Edge] = []
-        points = [point for tree in trees for level in tree.levels for point in level]
-        following = [
-            start
-            for tree, tree_starts in zip(trees, starts, strict=True)
-            for level, start in zip(tree.levels, tree_starts[1:], strict=True)
-            for _ in level
-        ]
-        for point, start in zip(points, following, strict=True):
-            taken, leads = [-1] * len(actions), [-1] * len(actions)
-            for branch in point.edges:
-                to = -1 if branch.to is None else start + branch.to
-                for action in branch.actions:
-                    taken[action_index[action]], leads[action_index[action]] = len(edges), to
-                edges.append(branch)
-            edge.append(taken)
-            child.append(leads)
-        sizes = [list(map(len, tree.levels)) for tree in trees]
+        for n, tree in enumerate(trees):
+            roots.append(len(points))
+            for step, level in enumerate(tree.levels):
+                following = len(points) + len(level)  # the first point of the next level
+                for point in level:
+                    children, point_edges = [-1] * len(actions), [-1] * len(actions)
+                    for edge in point.edges:
+                        child = -1 if edge.to is None else following + edge.to
+                        for action in edge.actions:
+                            children[action_index[action]] = child
+                            point_edges[action_index[action]] = len(edges)
+                        edges.append(edge)
+                    child_rows.append(children)
+                    edge_rows.append(point_edges)
+                tree_of_point += [n] * len(level)
+                step_of_point += [step] * len(level)
+                points += level
+        drivers: dict[str, Ints] = {}
+        for name in points[0].drivers:
+            drivers[name] = np.array([action_index[point.drivers[name]] for point in points])
         return cls(
             actions,
-            np.array([parameters.allowance_s(t.danger.sector) for t in trees]),
+            np.array([parameters.allowance_s(tree.danger.sector) for tree in trees]),
             parameters.time_limit_s,
-            np.array([t.episode for t in trees]),
-            np.array([t.episode_seed for t in trees]),
-            tuple(t.danger.sector for t in trees),
-            np.array([tree_starts[0] for tree_starts in starts]),
+            np.array([tree.episode for tree in trees]),
+            np.array([tree.episode_seed for tree in trees]),
+            tuple(tree.danger.sector for tree in trees),
+            np.array(roots),
             tuple(point.scene for point in points),
-            np.repeat(np.arange(len(trees)), list(map(sum, sizes))),
-            np.concatenate([np.repeat(np.arange(len(s)), s) for s in sizes]),
-            np.array(child),
-            np.array(edge),
+            np.array(tree_of_point),
+            np.array(step_of_point),
+            np.array(child_rows),
+            np.array(edge_rows),
             tuple(edges),
-            {
-                name: np.array([action_index[p.drivers[name]] for p in points])
-                for name in points[0].drivers
-            },
+            drivers,
         )
 
     @cached_property
     def place(self) -> Mapping[str, int]:
+        """The index of each decision point by its id."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
     def cleared_s(self) -> Floats:
         """When each edge reaches the goal, (edges,); inf if it ends otherwise or leads on."""
-        return np.array(
-            [
-                edge.end.time_s if edge.end and edge.end.result == "cleared" else np.inf
-                for edge in self.edges
-            ]
-        )
+        times_s = np.full(len(self.edges), np.inf)
+        for n, edge in enumerate(self.edges):
+            if edge.end and edge.end.result == "cleared":
+                times_s[n] = edge.end.time_s
+        return times_s
 
     @cached_property
     def harms(self) -> Bools:
         """Whether each edge ends in a collision or off the road, (edges,)."""
-        return np.array(
-            [edge.end is not None and RATINGS[edge.end.result] == "unsafe" for edge in self.edges]
-        )
+        ends = [edge.end for edge in self.edges]
+        return np.array([end is not None and RATINGS[end.result] == "unsafe" for end in ends])
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
@@ -127,13 +125,14 @@ class Forest:
         as columns of decisions.
         """
 
-        def known(measure_s: float | UnsetType | None) -> float:
-            return np.nan if measure_s is UNSET else np.inf if measure_s is None else measure_s
+        def number(measure_s: float | UnsetType | None) -> float:
+            if measure_s is UNSET:
+                return np.nan
+            return np.inf if measure_s is None else measure_s
 
-        ttc_s, pet_s = zip(
-            *((known(edge.ttc_s), known(edge.pet_s)) for edge in self.edges), strict=True
-        )
-        return columns(np.array(ttc_s), np.array(pet_s))
+        ttc_s = np.array([number(edge.ttc_s) for edge in self.edges])
+        pet_s = np.array([number(edge.pet_s) for edge in self.edges])
+        return columns(ttc_s, pet_s)
 
     @cached_property
     def earliest_s(self) -> Floats:
@@ -180,9 +179,9 @@ class Forest:
         return last
 
     def _levels_backwards(self) -> list[Ints]:
-        return [
-            np.flatnonzero(self.step == step) for step in reversed(range(int(self.step.max()) + 1))
-        ]
+        """Return the decision points of each step, the last step first."""
+        last = int(self.step.max())
+        return [np.flatnonzero(self.step == step) for step in range(last, -1, -1)]
 
     @cached_property
     def reference_s(self) -> Floats:
@@ -211,10 +210,9 @@ class Forest:
         """The seconds by which a safe action puts off the earliest success, (N, A);
         NaN if it is not safe.
         """
+        soonest_s = self.earliest_s.min(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
-            return np.where(
-                self.safe, self.earliest_s - self.earliest_s.min(axis=-1, keepdims=True), np.nan
-            )
+            return np.where(self.safe, self.earliest_s - soonest_s, np.nan)
 
     def last_edge(self, chosen: Ints) -> Ints:
         """Return the edge at which each episode ends, (E,),
@@ -247,6 +245,7 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
+        """Return how the episode ends at an edge that ends it."""
         end = self.edges[edge].end
         assert end is not None
         return end

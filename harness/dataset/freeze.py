@@ -45,19 +45,13 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
         episodes, worlds = zip(*level, strict=True)
         out_edges, following = edges(worlds, episodes)
         states = [world.state() for world in worlds]
-        records = records_of(
-            scenario,
-            [
-                (world, state, episode, (state.ego, *state.helpers))
-                for world, state, episode in zip(worlds, states, episodes, strict=True)
-            ],
-        )
-        drivers = _drivers(
-            scenario, states, [record.graphs[record.state.ego.id] for record in records]
-        )
-        for tree in (trees[episode] for episode in dict.fromkeys(episodes)):
-            tree.branchings.append([])
-            tree.scenes.append([])
+        viewers = [(state.ego, *state.helpers) for state in states]
+        records = records_of(scenario, list(zip(worlds, states, episodes, viewers, strict=True)))
+        ego_graphs = [record.graphs[record.state.ego.id] for record in records]
+        drivers = _drivers(scenario, states, ego_graphs)
+        for episode in dict.fromkeys(episodes):
+            trees[episode].branchings.append([])
+            trees[episode].scenes.append([])
         for world, record, actions, out in zip(worlds, records, drivers, out_edges, strict=True):
             tree = trees[record.episode]
             tree.branchings[-1].append(Branching(record.scene, actions, out))
@@ -79,17 +73,18 @@ def edges(
     for world in waiting:
         world.journeys = {agent: journey.anew() for agent, journey in world.journeys.items()}
     lockstep.advance(waiting, [p.due_frame(world.step) + p.lag_frames for world in waiting])
-    parts_of_world = [list(_branches(world)) for world in waiting]
-    branches = [branch for parts in parts_of_world for _, branch in parts]
-    lockstep.advance(branches, [p.due_frame(branch.step) for branch in branches])
+    branches_of_world = [list(_branches(world)) for world in waiting]
+    advancing = [branch for branches in branches_of_world for _, branch in branches]
+    lockstep.advance(advancing, [p.due_frame(branch.step) for branch in advancing])
     following: dict[int, dict[str, tuple[int, World]]] = {episode: {} for episode in episodes}
-    out_edges = [
-        [_edge(*part, episode, following[episode]) for part in parts]
-        for parts, episode in zip(parts_of_world, episodes, strict=True)
-    ]
-    return out_edges, [
-        (episode, world) for episode, of in following.items() for _, world in of.values()
-    ]
+    out_edges: list[list[Edge]] = []
+    for branches, episode in zip(branches_of_world, episodes, strict=True):
+        by_id = following[episode]
+        out_edges.append([_edge(actions, branch, episode, by_id) for actions, branch in branches])
+    points: list[tuple[int, World]] = []
+    for episode, by_id in following.items():
+        points += [(episode, world) for _, world in by_id.values()]
+    return out_edges, points
 
 
 def _branches(world: World) -> Iterator[tuple[list[str], World]]:
@@ -107,6 +102,11 @@ def _branches(world: World) -> Iterator[tuple[list[str], World]]:
 def _edge(
     actions: list[str], branch: World, episode: int, following: dict[str, tuple[int, World]]
 ) -> Edge:
+    """Return the edge of some actions, after which a world is `branch`.
+
+    `following` has the points of the next level by their ids, each with its place; a new one is
+    added.
+    """
     outcome, end, child = branch.outcome, None, None
     if outcome.ended:
         assert outcome.time_s is not None
@@ -116,28 +116,28 @@ def _edge(
         # Where several edges lead to one state, the post-encroachment times after it are by the
         # past of the first. No tree that ships has such edges.
         child, _ = following.setdefault(scene_id(episode, branch.state()), (len(following), branch))
-    gap_m = round(outcome.least_gap_m, 3)
-    conflicts_s = rounded(branch.journey.conflicts.ttc_s), rounded(branch.journey.conflicts.pet_s)
+    journey = branch.journey
     return Edge(
         actions,
         child,
         end,
-        gap_m,
-        branch.journey.hard_brakings,
+        round(outcome.least_gap_m, 3),
+        journey.hard_brakings,
         outcome.other_crashes,
-        *conflicts_s,
+        rounded(journey.conflicts.ttc_s),
+        rounded(journey.conflicts.pet_s),
     )
 
 
 def _drivers(
-    scenario: Scenario, states: Sequence[WorldState], seen: Sequence[SceneGraph]
+    scenario: Scenario, states: Sequence[WorldState], ego_graphs: Sequence[SceneGraph]
 ) -> list[dict[str, str]]:
-    """Return each reference driver's action at some decision points;
-    `seen` has the ego's scene graphs.
-    """
-    known = list(zip(seen, truth_graphs(scenario, states), strict=True))
-    actions = iter(choices(scenario, [(driver, *graphs) for graphs in known for driver in DRIVERS]))
-    return [dict(zip(DRIVERS, actions, strict=False)) for _ in known]
+    """Return each reference driver's action at some decision points, by the driver's name."""
+    cases = []
+    for graph, truth in zip(ego_graphs, truth_graphs(scenario, states), strict=True):
+        cases += [(driver, graph, truth) for driver in DRIVERS]
+    actions = iter(choices(scenario, cases))
+    return [dict(zip(DRIVERS, actions, strict=False)) for _ in states]
 
 
 def record_of(
@@ -158,10 +158,11 @@ def records_of(
     """Return the record of some decision points of one scenario."""
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
     graphs, zone_m = iter(scene_graphs(scenario, looks)), scenario.road().zone_m
-    return [
-        _record(world, state, episode, {viewer.id: next(graphs) for viewer in viewers}, zone_m)
-        for world, state, episode, viewers in points
-    ]
+    records = []
+    for world, state, episode, viewers in points:
+        graph_of = {viewer.id: next(graphs) for viewer in viewers}
+        records.append(_record(world, state, episode, graph_of, zone_m))
+    return records
 
 
 def _record(
@@ -169,8 +170,9 @@ def _record(
     state: WorldState,
     episode: int,
     graphs: dict[str, SceneGraph],
-    zone: tuple[float, float],
+    zone_m: tuple[float, float],
 ) -> Record:
+    """Return the record of a decision point, with distances to the conflict zone at `zone_m`."""
     ego_id, *helpers = graphs
     ego = state.vehicle(ego_id)
     known_states = {name: known(state, name, ego_id) for name in graphs}
@@ -182,7 +184,7 @@ def _record(
         danger=Danger(world.layout.danger, world.layout.danger_id),
         state=state,
         graphs=graphs,
-        distance_m={name: _distance_m(v, *zone) for name, v in known_states.items()},
+        distance_m={name: _distance_m(v, *zone_m) for name, v in known_states.items()},
         range_m={name: _distance_m(known_states[name], ego.x_m, ego.y_m) for name in helpers},
     )
 

@@ -167,17 +167,17 @@ class Dataset:
     @property
     def lost(self) -> int:
         """In how many episodes the ego collides before its first action, whatever that is."""
-        lag_s = self.scenario.parameters.decision_lag_s
-        firsts = [
-            [self.forest.edges[n].end for n in edges]
-            for edges in self.forest.edge[self.forest.root]
-        ]
-        return sum(
-            all(end and end.result == "collision" and end.time_s <= lag_s for end in ends)
-            for ends in firsts
-        )
+        lag_s, forest = self.scenario.parameters.decision_lag_s, self.forest
+        before_any = np.zeros(len(forest.edges), dtype=bool)  # whether each edge ends so
+        for n, edge in enumerate(forest.edges):
+            end = edge.end
+            if end and end.result == "collision" and end.time_s <= lag_s:
+                before_any[n] = True
+        first_edges = forest.edge[forest.root]
+        return int(before_any[first_edges].all(axis=1).sum())
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
+        """Return the dataset with those of its episodes that have these numbers."""
         if len(numbers) == len(self.episodes) and set(numbers) == set(self.episodes):
             return self
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
@@ -199,15 +199,14 @@ class Dataset:
         action, actions = constant(self.scenario), open_loop(self.scenario)
         for start in range(0, len(self.trees), TREES_AT_ONCE):
             forest = self.of_episodes(self.episodes[start : start + TREES_AT_ONCE]).forest
-            for name in forest.drivers:
-                parts.setdefault(name, []).append(forest.driver_success(name).astype(float))
+            success = {name: forest.driver_success(name).astype(float) for name in forest.drivers}
             if action in forest.actions:
-                parts.setdefault(CONSTANT, []).append(forest.constant_success(action).astype(float))
+                success[CONSTANT] = forest.constant_success(action).astype(float)
             if actions and set(actions) <= set(forest.actions):
-                parts.setdefault(OPEN_LOOP, []).append(
-                    forest.sequence_success(actions).astype(float)
-                )
-            parts.setdefault(UNIFORM, []).append(forest.uniform_success())
+                success[OPEN_LOOP] = forest.sequence_success(actions).astype(float)
+            success[UNIFORM] = forest.uniform_success()
+            for name, values in success.items():
+                parts.setdefault(name, []).append(values)
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
@@ -272,10 +271,9 @@ class Dataset:
         ids = self.forest.ids
         matches = [name for name in ids if name.startswith(scene_id)] if scene_id else []
         if len(matches) != 1:
-            shown = (matches or ids)[:12]
-            raise unknown(
-                "scene", scene_id, shown, " … (first dozen)" if len(matches or ids) > 12 else ""
-            )
+            candidates = matches or ids
+            rest = " … (first dozen)" if len(candidates) > 12 else ""
+            raise unknown("scene", scene_id, candidates[:12], rest)
         return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
@@ -365,11 +363,10 @@ class _Folder:
     def __call__(self, number: int) -> Tree:
         if number in self._kept:
             return self._kept[number]
+        sound = self.trusted or number in self._checked
         try:
             with opened(self.path) as file:
-                tree = read_tree(
-                    file, self.manifest, number, self.trusted or number in self._checked
-                )
+                tree = read_tree(file, self.manifest, number, sound)
         except Damaged as damage:
             raise unusable(self.path, str(damage)) from None
         self._checked.add(number)

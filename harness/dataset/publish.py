@@ -75,6 +75,7 @@ def publish(
 def _table(
     data: Dataset, folder: Path, ask: Callable[[Scenario], tuple[str, Chat]], progress: Progress
 ) -> Table:
+    """Write the table of a dataset to a folder; return what the card says of it."""
     scenario, file, count = data.scenario, folder / path_of(data.name), 0
     prompt, chat = ask(scenario)
     with pq.ParquetWriter(file, SCHEMA, compression="zstd") as writer:
@@ -102,33 +103,31 @@ def _table(
 def _rows(data: Dataset, chat: Chat) -> list[dict[str, Any]]:
     """Return the decision points of a few layouts as rows."""
     forest = data.forest
-    ids = [*forest.ids, None]  # -1 leads nowhere
-    ends = [edge.end.result if edge.end else None for edge in forest.edges]
-    of_trees = zip(
-        forest.safe.tolist(),
-        forest.avoids_harm.tolist(),
-        forest.worth.tolist(),
-        [list(map(known, delays_s)) for delays_s in forest.delay_s.tolist()],
-        [[ids[n] for n in child] for child in forest.child.tolist()],
-        [[ends[n] for n in edge] for edge in forest.edge.tolist()],
-        strict=True,
-    )
-    keys = ("safe", "avoids_harm", "value", "delay_s", "next_scene", "result")
-    chosen = {name: places.tolist() for name, places in forest.drivers.items()}
     actions = list(forest.actions)
-    return [
-        {
-            **_row(scene, chat),
-            "scenario": data.scenario.name,
-            "actions": actions,
-            **dict(zip(keys, of_actions, strict=True)),
-            "drivers": _json({name: actions[places[n]] for name, places in chosen.items()}),
-        }
-        for n, (scene, of_actions) in enumerate(zip(data.scenes(forest.ids), of_trees, strict=True))
-    ]
+    ids = [*forest.ids, None]  # -1 leads nowhere
+    results = [edge.end.result if edge.end else None for edge in forest.edges]
+    safe, avoids_harm = forest.safe.tolist(), forest.avoids_harm.tolist()
+    worth, delays_s = forest.worth.tolist(), forest.delay_s.tolist()
+    children, edges = forest.child.tolist(), forest.edge.tolist()
+    choices = {name: places.tolist() for name, places in forest.drivers.items()}
+    rows = []
+    for n, scene in enumerate(data.scenes(forest.ids)):
+        row = _row(scene, chat)
+        row["scenario"] = data.scenario.name
+        row["actions"] = actions
+        row["safe"] = safe[n]
+        row["avoids_harm"] = avoids_harm[n]
+        row["value"] = worth[n]
+        row["delay_s"] = [known(delay_s) for delay_s in delays_s[n]]
+        row["next_scene"] = [ids[child] for child in children[n]]
+        row["result"] = [results[edge] for edge in edges[n]]
+        row["drivers"] = _json({name: actions[places[n]] for name, places in choices.items()})
+        rows.append(row)
+    return rows
 
 
 def _row(scene: Scene, chat: Chat) -> dict[str, Any]:
+    """Return the columns of a decision point that its scene tells without its tree."""
     record, viewers = scene.record, scene.viewers
     return {
         "scene": scene.id,

@@ -64,9 +64,8 @@ def differences(dataset: Dataset) -> Iterator[str]:
     """
     if find_spec("highway_env") is None:
         return
-    numbers = _other_starts(dataset, drawn(dataset, BEGUN)) or _other_trees(
-        dataset, drawn(dataset, REBUILT)
-    )
+    numbers = _other_starts(dataset, drawn(dataset, BEGUN))
+    numbers = numbers or _other_trees(dataset, drawn(dataset, REBUILT))
     if numbers:
         from importlib.metadata import version
 
@@ -90,11 +89,12 @@ def _other_starts(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     ids = [forest.ids[root] for root in forest.root.tolist()]
     first = dict(zip(dataset.episodes, ids, strict=True))
     dataset.scenes([first[number] for number in numbers])  # checks their content
-    return [
-        n
-        for n in sorted(numbers)
-        if scene_id(n, World.start(scenario, seed + n).state()) != first[n]
-    ]
+    differing = []
+    for number in sorted(numbers):
+        start = World.start(scenario, seed + number).state()
+        if scene_id(number, start) != first[number]:
+            differing.append(number)
+    return differing
 
 
 def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
@@ -102,21 +102,19 @@ def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     from harness.dataset.freeze import freeze
 
     seeds = {number: dataset.manifest.seed + number for number in numbers}
-    wrong = list[int]()
-    for number, frozen in zip(numbers, freeze(dataset.scenario, seeds), strict=True):
+    differing = list[int]()
+    for number, rebuilt in zip(numbers, freeze(dataset.scenario, seeds), strict=True):
         tree = dataset.trees.read(number)
-        # Their content is checked, too
-        there = dataset.scenes([point.scene for level in tree.levels for point in level])
-        built = [record for level in frozen.scenes for record in level]
+        records = [record for level in rebuilt.scenes for record in level]
+        ids = [point.scene for level in tree.levels for point in level]
+        scenes = dataset.scenes(ids)  # checks their content
         if (
-            tree.danger != built[0].danger
-            or _courses(frozen.branchings, tree) != _courses(tree.levels, tree)
-            or any(
-                _seen(ours) != _seen(scene.record) for ours, scene in zip(built, there, strict=True)
-            )
+            tree.danger != records[0].danger
+            or _courses(rebuilt.branchings, tree) != _courses(tree.levels, tree)
+            or [_seen(record) for record in records] != [_seen(scene.record) for scene in scenes]
         ):
-            wrong.append(number)
-    return wrong
+            differing.append(number)
+    return differing
 
 
 def _courses(levels: Sequence[Sequence[Branching]], stated: Tree) -> list[list[object]]:
@@ -125,14 +123,17 @@ def _courses(levels: Sequence[Sequence[Branching]], stated: Tree) -> list[list[o
 
     Without what an older dataset, as its tree is stated, does not have of an edge.
     """
-    later = {"ttc_s": UNSET, "pet_s": UNSET} if stated.levels[0][0].edges[0].ttc_s is UNSET else {}
-    return [
-        [
-            (point.scene, point.drivers, [replace(edge, **later) for edge in point.edges])
-            for point in of
-        ]
-        for of in levels
-    ]
+    has_conflicts = stated.levels[0][0].edges[0].ttc_s is not UNSET
+    courses = []
+    for level in levels:
+        points: list[object] = []
+        for point in level:
+            edges = point.edges
+            if not has_conflicts:
+                edges = [replace(edge, ttc_s=UNSET, pet_s=UNSET) for edge in edges]
+            points.append((point.scene, point.drivers, edges))
+        courses.append(points)
+    return courses
 
 
 def _seen(record: Record) -> tuple[object, ...]:
@@ -142,13 +143,11 @@ def _seen(record: Record) -> tuple[object, ...]:
 
 def _reported(scenario: str) -> Iterator[Dataset]:
     """Yield the released datasets of a scenario, all of which are of report seeds."""
+    pinned = released().values()
     for path in sorted(folder("datasets").glob("*/manifest.json")):
         manifest, sha256 = read_manifest(path.parent)
-        if (
-            sha256 in released().values()
-            and manifest.scenario == scenario
-            and manifest.purpose == "report"
-        ):
+        of_scenario = manifest.scenario == scenario and manifest.purpose == "report"
+        if sha256 in pinned and of_scenario:
             yield load(path.parent)
 
 
@@ -157,8 +156,11 @@ def _starts(dataset: Dataset) -> dict[str, str]:
     whatever the seeds are.
     """
     forest = dataset.forest
-    scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
-    return {digest([*map(_coarse, scene.state.vehicles)]): scene.id for scene in scenes}
+    ids = {}
+    for scene in dataset.scenes([forest.ids[root] for root in forest.root.tolist()]):
+        vehicles = [_coarse(vehicle) for vehicle in scene.state.vehicles]
+        ids[digest(vehicles)] = scene.id
+    return ids
 
 
 def _coarse(vehicle: VehicleState) -> dict[str, object]:

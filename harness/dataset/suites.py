@@ -36,18 +36,20 @@ def named(text: str) -> Suite | None:
         return None
     name, files = text.removeprefix(PREFIX), entries("datasets", "suites.toml")
     results = each(map(str, files), lambda file: _tables(Path(file)))
-    wrong = [read for read in results.values() if isinstance(read, UserError)]
-    tables = [
-        (file, key, table)
-        for file, read in results.items()
-        if not isinstance(read, UserError)
-        for key, table in read.items()
-    ]
-    matches = [(file, table) for file, key, table in tables if key == name]
-    if not matches and wrong:
-        raise wrong[0]
+    errors: list[UserError] = []
+    names: set[str] = set()
+    matches: list[tuple[str, Any]] = []
+    for file, tables in results.items():
+        if isinstance(tables, UserError):
+            errors.append(tables)
+            continue
+        names |= tables.keys()
+        if name in tables:
+            matches.append((file, tables[name]))
+    if not matches and errors:
+        raise errors[0]
     if not matches:
-        raise unknown("suite", name, {key for _, key, _ in tables})
+        raise unknown("suite", name, names)
     if len(matches) > 1:
         raise UserError(
             f"suite {printable(name)} is in this project and ships with the harness; give yours "

@@ -78,26 +78,24 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             f"[trees_sha256] has {len(manifest.trees_sha256)} digests for {manifest.episodes} "
             "episodes"
         )
-    expected = asdict(scenario.parameters)
+    usual = asdict(scenario.parameters)
     for name, value in manifest.parameters.items():
-        if name not in expected:
-            yield f"[parameters]: {unknown('parameter', name, expected)}"
-        elif any(
-            isinstance(value, a) != isinstance(expected[name], b)
-            for a, b in ((list, tuple), (str, str))
-        ):
-            yield (
-                f"[parameters]: {name} = {printable(value)}; wanted is a value such as "
-                f"{expected[name]}"
-            )
-    if missing := expected.keys() - dict(LATER).keys() - manifest.parameters.keys():
+        if name not in usual:
+            yield f"[parameters]: {unknown('parameter', name, usual)}"
+            continue
+        example = usual[name]
+        other_list = isinstance(value, list) != isinstance(example, tuple)
+        other_text = isinstance(value, str) != isinstance(example, str)
+        if other_list or other_text:
+            yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {example}"
+    if missing := usual.keys() - dict(LATER).keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
-    if scenario.is_environment and manifest.environment != (
-        here := environment.config(scenario.name)
-    ):
-        differing = sorted(
-            k for k, v in here.items() if (manifest.environment or {}).get(k, here) != v
-        )
+    if not scenario.is_environment:
+        return
+    here, stated = environment.config(scenario.name), manifest.environment
+    if stated != here:
+        there = stated or {}
+        differing = sorted(key for key, value in here.items() if there.get(key, here) != value)
         yield (
             "[environment]: here its configuration has another "
             f"{', '.join(differing) or 'set of keys'}"
@@ -127,13 +125,14 @@ def check(path: Path) -> list[str]:
 
 
 def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[str], int]:
+    """Return what is wrong with a tree and its scenes, and how many decision points it has."""
     try:
         tree = read_tree(file, manifest, episode)
         problems = []
         for step, level in enumerate(tree.levels):
             for line, point in zip(read_level(file, tree, step), level, strict=True):
                 problems += decoded(line, manifest, point.scene)[1]
-        return problems, sum(map(len, tree.levels))
+        return problems, sum(len(level) for level in tree.levels)
     except Damaged as error:
         return [str(error)], 0
 
@@ -244,48 +243,45 @@ def level_name(episode: int, step: int) -> str:
 
 def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str]:
     """Return where a tree contradicts itself or the manifest in ways that no type can state."""
-    actions, points = Counter(manifest.actions), [point for level in tree.levels for point in level]
+    actions = Counter(manifest.actions)
+    points = [point for level in tree.levels for point in level]
     edges = [edge for point in points for edge in point.edges]
-    continuing = [
-        (edge.to, len(following))
-        for level, following in zip(tree.levels, [*tree.levels[1:], []], strict=True)
-        for point in level
-        for edge in point.edges
-        if edge.to is not None
-    ]
     ids = [point.scene for point in points]
     chosen = {action for point in points for action in point.drivers.values()}
+    ids_fit, children_exist = True, True
+    for step, level in enumerate(tree.levels):
+        ids_fit &= all(point.scene.startswith(f"{number:05d}-{step}-") for point in level)
+        following = tree.levels[step + 1] if step + 1 < len(tree.levels) else []
+        leads_to = [edge.to for point in level for edge in point.edges]
+        children_exist &= all(child is None or child < len(following) for child in leads_to)
+    one_edge_an_action = True
+    for point in points:
+        on_edges = Counter(action for edge in point.edges for action in edge.actions)
+        one_edge_an_action &= on_edges == actions
+    measures = [each for edge in edges for each in (edge.ttc_s, edge.pet_s)]
+    collisions = [edge for edge in edges if edge.end and edge.end.result == "collision"]
     conditions = {
         "its number is not that of its folder": tree.episode == number,
         "its seed is not the manifest's, counted on": tree.episode_seed == manifest.seed + number,
         "the first level is not the start alone": len(tree.levels[0]) == 1,
         "there is not a digest a level": len(tree.scenes_sha256) == len(tree.levels),
         "two decision points have one id": len(set(ids)) == len(ids),
-        "an id is not <episode>-<step>-<digest>": all(
-            point.scene.startswith(f"{number:05d}-{step}-")
-            for step, level in enumerate(tree.levels)
-            for point in level
-        ),
+        "an id is not <episode>-<step>-<digest>": ids_fit,
         "a reference driver is missing": all(
             point.drivers.keys() == set(DRIVERS) for point in points
         ),
         "a reference driver's action is not one of the manifest's": chosen <= actions.keys(),
-        "the edges of a decision point are not one an action": all(
-            Counter(action for edge in point.edges for action in edge.actions) == actions
-            for point in points
-        ),
+        "the edges of a decision point are not one an action": one_edge_an_action,
         "an edge leads nowhere, or goes on after the end": all(
             (edge.to is None) != (edge.end is None) for edge in edges
         ),
-        "an edge leads to a decision point that is not there": all(to < n for to, n in continuing),
-        "some edges have measures of conflicts, and some have not": len(
-            {each is msgspec.UNSET for edge in edges for each in (edge.ttc_s, edge.pet_s)}
-        )
-        <= 1,
+        "an edge leads to a decision point that is not there": children_exist,
+        "some edges have measures of conflicts, and some have not": (
+            len({measure is msgspec.UNSET for measure in measures}) <= 1
+        ),
         "a collision is no conflict": all(
             edge.ttc_s is msgspec.UNSET or (edge.ttc_s, edge.pet_s) == (0.0, 0.0)
-            for edge in edges
-            if edge.end and edge.end.result == "collision"
+            for edge in collisions
         ),
     }
     return [problem for problem, holds in conditions.items() if not holds]
@@ -334,16 +330,16 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     viewers = {v.id for v in state.vehicles if v.part != "other"}
     nodes = {node.id for graph in graphs.values() for node in graph.nodes}
     conflicts = [conflict for graph in graphs.values() for conflict in graph.conflicts]
-    speeds, road, snapshot = (
-        manifest.parameters["target_speeds_mps"],
-        scenario.road(),
-        record.snapshot,
-    )
-    own_snapshot = snapshot if isinstance(snapshot, Snapshot) else None
+    named = nodes | {conflict.vehicle for conflict in conflicts}
+    egos = [n for n, v in enumerate(state.vehicles) if v.part == "ego"]
+    road, speeds = scenario.road(), manifest.parameters["target_speeds_mps"]
+    # None in an environment, whose snapshots are other ones
+    snapshot = record.snapshot if isinstance(record.snapshot, Snapshot) else None
     conditions = {
         "it is the scene of another decision point": record.scene == name,
-        "there is no target speed of that index": isinstance(speeds, list)
-        and (not own_snapshot or own_snapshot.speed_index < len(speeds)),
+        "there is no target speed of that index": (
+            isinstance(speeds, list) and (not snapshot or snapshot.speed_index < len(speeds))
+        ),
         "scene is not <episode>-<step>-<digest>": record.scene.startswith(
             f"{record.episode:05d}-{record.step}-"
         ),
@@ -351,10 +347,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "state is of another step": state.step == record.step,
         "state is of another episode seed": state.episode_seed == record.episode_seed,
         "two vehicles have one id": len(set(ids)) == len(ids),
-        "the ego is not the first vehicle alone": [
-            n for n, v in enumerate(state.vehicles) if v.part == "ego"
-        ]
-        == [0],
+        "the ego is not the first vehicle alone": egos == [0],
         "graphs are not those of the ego and the helpers": graphs.keys() == viewers,
         "a graph is of another viewer": all(
             graph.viewer == viewer for viewer, graph in graphs.items()
@@ -363,11 +356,9 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
         "a conflict is on a path that does not meet the ego's": all(
             (c.sector, c.route) in (road.crossings if c.meets else road.paths) for c in conflicts
         ),
-        "a graph names a vehicle that is not there": nodes | {c.vehicle for c in conflicts}
-        <= set(ids),
+        "a graph names a vehicle that is not there": named <= set(ids),
         "ranges are not those of the helpers": record.range_m.keys() == viewers - {ids[0]},
         "the dangerous vehicle is not there": record.danger.vehicle in (None, *ids),
-        "sections are not one a vehicle": not own_snapshot
-        or len(own_snapshot.sections) == len(ids),
+        "sections are not one a vehicle": not snapshot or len(snapshot.sections) == len(ids),
     }
     return [problem for problem, holds in conditions.items() if not holds]
