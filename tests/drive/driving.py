@@ -80,16 +80,18 @@ def driven(
     of: Spec,
     episodes: Sequence[int] = (0,),
     backend: Backend | None = None,
-    infer_s: float | None = None,
+    infers: float | Latency | None = None,
 ) -> Driven:
-    """Walk some episodes of the closed loop, every inference taking `infer_s`,
+    """Walk some episodes of the closed loop, every inference taking so many seconds,
     or what it would in a run.
     """
     assert isinstance(of.source, LiveSource)
     opened = backend or open_backend(of.ego.card, batch_size=of.settings.batch_size)
     latency = known(of.settings.latency, of.agents, [opened])
-    if infer_s is not None:
-        latency = Latency("card", "test", infer_s, infer_s, infer_s)
+    if isinstance(infers, Latency):
+        latency = infers
+    elif infers is not None:
+        latency = Latency("card", "test", infers, infers, infers)
     assert latency is not None, "no test measures"
     asker = Asker(of, lambda: opened, latency)
     world = LiveWorld(

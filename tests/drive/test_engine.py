@@ -45,7 +45,7 @@ def test_an_episode_played_by_hand():
 
     script = Script(line)
     run = spec(points=(ALONE, POINTS["6g"]), seeds=(0,), first_seed=NO_DANGER)
-    made = driven(run, backend=script, infer_s=0.1)
+    made = driven(run, backend=script, infers=0.1)
     alone, helped = made.episodes
 
     mine, its = decisions(made, "single-local"), decisions(made, "6g")
@@ -108,7 +108,7 @@ def test_a_decision_acts_in_its_frame_and_not_before():
 
 def test_a_decision_still_open_when_the_next_is_due_goes_on_and_the_next_is_skipped():
     run = spec(points=(ALONE,), seeds=(0,), first_seed=NO_DANGER)
-    made = driven(run, backend=Script(lambda viewer, step: SLOWER), infer_s=1.3)
+    made = driven(run, backend=Script(lambda viewer, step: SLOWER), infers=1.3)
     [episode] = made.episodes
     acts_at_s = {step: d.acts_at_s for step, d in decisions(made, "single-local").items()}
     assert acts_at_s == {0: 1.3, 2: 3.3, 4: 5.3}
@@ -127,14 +127,14 @@ def test_a_decision_still_open_when_the_next_is_due_goes_on_and_the_next_is_skip
 
 def test_a_decision_that_is_ready_when_the_next_is_due_acts_first():
     run = spec(points=(ALONE,), seeds=(0,), first_seed=NO_DANGER)
-    made = driven(run, backend=Script(lambda viewer, step: IDLE), infer_s=1.0)
+    made = driven(run, backend=Script(lambda viewer, step: IDLE), infers=1.0)
     [episode] = made.episodes
     assert (list(decisions(made, "single-local")), episode.skipped) == ([0, 1, 2, 3, 4, 5], 0)
 
 
 def test_an_episode_that_ends_while_a_decision_is_open_records_it_and_never_acts_on_it():
     run = spec(points=(ALONE,), seeds=(0,), first_seed=FROM_LEFT)  # cruising ends in a collision
-    made = driven(run, backend=Script(lambda viewer, step: IDLE), infer_s=0.9)
+    made = driven(run, backend=Script(lambda viewer, step: IDLE), infers=0.9)
     [episode] = made.episodes
     _, last = max(decisions(made, "single-local").items())
     assert (episode.failure, episode.never_acted, last.acted) == ("collision", 1, False)
@@ -277,7 +277,7 @@ def test_messages_that_the_egos_model_fuses_take_a_second_inference():
     script = Script(
         lambda viewer, step: (UNSURE if viewer == "v1" else FASTER) if step == 1 else IDLE, SLOWER
     )
-    made = driven(run, backend=script, infer_s=0.1)
+    made = driven(run, backend=script, infers=0.1)
     plain, fused = decisions(made, "6g"), decisions(made, calling.name)
     fusion_ms = column(made, "fusion_ms", calling.name)
     assert (plain[1].action, plain[1].acts_at_s) == ("FASTER", 1.12)
@@ -293,8 +293,8 @@ def test_a_language_model_in_float32_drives_alike_in_any_company():
     pytest.importorskip("transformers", reason="needs the transformers extra")
     points = [ALONE, named_point("6g:consensus=ego-prompt")]
     tiny = spec("swarm-tiny:transformers", points, (0,), first_seed=FROM_LEFT, latency="paper")
-    together = driven(tiny, (0, 1), infer_s=0.145)
-    alone = [driven(tiny.changed(batch_size=1), (e,), infer_s=0.145) for e in (0, 1)]
+    together = driven(tiny, (0, 1), infers=0.145)
+    alone = [driven(tiny.changed(batch_size=1), (e,), infers=0.145) for e in (0, 1)]
     episodes = [episode for made in alone for episode in made.episodes]
     assert sorted(map(repr, together.episodes)) == sorted(map(repr, episodes))
     answers = [answer for made in alone for answer in made.answers]

@@ -85,7 +85,7 @@ def test_what_no_page_can_hold_is_left_out(
 ) -> None:
     asked(monkeypatch, odd=Odd(beside), mine=Says())
     said = [text for text in remarks.sentences(runs) if "said" in text or "odd" in text]
-    assert said == ["odd: its package failed: no text", "<b>said</b> of 1"]
+    assert said == ["odd: its package failed: its answer holds what is no text", "<b>said</b> of 1"]
     assert remarks.left_out(runs.runs[0]) == {"00000-0": [{"item": "v1"}]}
 
 

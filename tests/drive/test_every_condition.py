@@ -1,0 +1,166 @@
+"""Every condition that can be typed runs, frozen and driven, or is refused in one line.
+
+Conditions are drawn from the settings of all parts, those of extensions too. So what two of them
+settle between each other is tried, whoever says it.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from driving import driven, spec
+from evaluating import says, spec_of, walked
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness.backends.base import Completion, Request
+from harness.coordination.contents import CONTENTS
+from harness.coordination.encodings import ENCODINGS
+from harness.coordination.operating_point import (
+    OperatingPoint,
+    more_parts,
+    named_point,
+    typed_settings,
+)
+from harness.coordination.parts import EDGES, FALLBACKS
+from harness.coordination.rules import names
+from harness.coordination.schedules import SCHEDULES
+from harness.core.errors import UserError
+from harness.core.extensions import control_settings
+from harness.dataset.load import Dataset, load
+from harness.evaluate.spec import Spec
+from harness.radio.networks import names as networks
+from harness.radio.profiles import CHANNELS
+from harness.runs.decisions import Decisions
+from harness.runs.records import Latency
+
+Place = tuple[int, int]  # episode and seed
+# What frozen scenes assume; a second answer would come after it.
+AT_THE_LAG = Latency("card", "declared: for this test", 0.145, 0.145, 0.0)
+NUMBERS = {bool: ("true", "false"), int: ("0", "1", "2"), float: ("0", "0.05", "0.5", "1", "40")}
+WORDS: Mapping[str, Sequence[str]] = {
+    "edge": EDGES,
+    "encoding": ENCODINGS,
+    "schedule": tuple(SCHEDULES.built_in),
+    "content": tuple(CONTENTS),
+    "consensus": names(),
+    "fallback": FALLBACKS,
+    "round_trip": tuple(networks()),
+    "messages": [setting.partition("=")[2] for setting in control_settings().values()],
+    "defence": ("quoted", "schema", "majority", "quoted+schema+majority"),
+}
+
+
+@pytest.fixture(scope="module")
+def two(two_path: Path) -> Dataset:
+    return load(two_path)
+
+
+class Sees:
+    """Brakes where it sees somebody, goes on where it does not, and heeds what it hears."""
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        return [self._say(request) for request in requests]
+
+    def _say(self, request: Request) -> Completion:
+        seen = bool(request.view.nodes) if request.view else "SLOWER" in str(request.messages)
+        p = (0.6, 0.3, 0.1) if seen else (0.2, 0.5, 0.3)
+        return Completion(request.id, says(p, request.role), None, None, "stop", None, 1)
+
+    def identity(self) -> dict[str, Any]:
+        return {"engine": "sees"}
+
+
+def values_of(setting: str) -> Sequence[str]:
+    """Return some values of a setting, as they are typed."""
+    for kind in more_parts().values():
+        if setting in kind.named:
+            return tuple(kind.named[setting]())
+    if setting in WORDS:
+        return WORDS[setting]
+    kinds = getattr(OperatingPoint.types()[setting], "__args__", (OperatingPoint.types()[setting],))
+    number = next((kind for kind in kinds if kind in NUMBERS), None)
+    assert number, f"give WORDS some values of {setting}"
+    return NUMBERS[number]
+
+
+SETTINGS = {setting: values for setting in typed_settings() if (values := values_of(setting))}
+
+
+@st.composite
+def conditions(draw: st.DrawFn) -> tuple[str, list[str]]:
+    """Draw a condition as it is typed, with its settings."""
+    profile = draw(st.sampled_from(sorted(CHANNELS)))
+    chosen = draw(st.lists(st.sampled_from(sorted(SETTINGS)), min_size=1, max_size=4, unique=True))
+    typed = [f"{setting}={draw(st.sampled_from(SETTINGS[setting]))}" for setting in chosen]
+    return f"{profile}:{','.join(typed)}", chosen
+
+
+def allowed(typed: str, chosen: Sequence[str], dataset: Dataset) -> Spec | None:
+    """Return an evaluation under a condition; None if it is refused, as people are told."""
+    try:
+        point = named_point(typed)
+        return spec_of(dataset, "swarm-tiny", "v12", points=(point,), seeds=(0,))
+    except UserError as error:
+        said = str(error)
+        assert "\n" not in said
+        assert any(setting in said for setting in chosen), said
+        return None
+
+
+def unknown_or_finite(decisions: Decisions) -> Iterator[str]:
+    """Yield the columns with a number that is neither finite nor null."""
+    for field in decisions.table.schema:
+        if pa.types.is_floating(field.type):
+            for value in decisions.table[field.name].to_pylist():
+                if value is not None and not abs(value) < float("inf"):
+                    yield field.name
+
+
+def told(decisions: Decisions) -> tuple[dict[Place, list[Any]], set[Place]]:
+    """What was decided in each episode, and the episodes in which a decision took longer than
+    frozen scenes assume.
+    """
+    way: dict[Place, list[Any]] = {}
+    late = set[Place]()
+    for d in decisions.records(0, len(decisions)):
+        place = d.episode, d.seed
+        way.setdefault(place, []).append((d.step, d.scene, d.action, d.fused, d.latency_ms))
+        if d.off_lag:
+            late.add(place)
+    return {place: sorted(steps) for place, steps in way.items()}, late
+
+
+@pytest.mark.slow
+def test_a_condition_is_played_or_refused_in_one_line(two: Dataset) -> None:
+    @settings(max_examples=25)
+    @given(drawn=conditions())
+    def holds(drawn: tuple[str, list[str]]) -> None:
+        frozen = allowed(*drawn, two)
+        if frozen is None:
+            return
+        once, again = walked(frozen, Sees()), walked(frozen, Sees())
+        assert once.decisions.table.equals(again.decisions.table)
+        assert not list(unknown_or_finite(once.decisions))
+        assert once.answers == again.answers
+
+    holds()
+
+
+@pytest.mark.exhaustive
+def test_a_condition_that_is_played_is_driven_alike(two: Dataset) -> None:
+    @settings(max_examples=60)
+    @given(drawn=conditions())
+    def holds(drawn: tuple[str, list[str]]) -> None:
+        frozen = allowed(*drawn, two)
+        if frozen is None or frozen.points[0].elsewhere:
+            return
+        live = spec("swarm-tiny", frozen.points, (0,), prompt="v12", first_seed=two.manifest.seed)
+        expected, late = told(walked(frozen, Sees(), AT_THE_LAG).decisions.rounded())
+        drive = driven(live, range(len(two.episodes)), Sees(), AT_THE_LAG)
+        for place, steps in told(drive.decisions)[0].items():
+            assert place in late or steps == expected[place]
+
+    holds()
