@@ -128,3 +128,8 @@ def test_frozen_says_what_driven_says(small: Dataset, tmp_path: Path) -> None:
         ).out
     )
     assert [e.witnesses for e in done.episodes] == [e.layout_seed % 4 for e in done.episodes]
+    for k, metric in enumerate(NAMES):
+        [own] = [e.success for e in done.episodes if e.witnesses == k]
+        score = done.score("single-local", metric)
+        assert score is not None
+        assert (score.value, score.n, score.n_excluded) == (own, 1, 3)

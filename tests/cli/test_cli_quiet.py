@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -44,6 +45,13 @@ def test_quiet_prints_nothing_and_writes_the_same(
         if args is not once:
             Path("loud").rename(f"loud-{name}")
     assert harness("eval", "--dataset", small_path, "--dry-run", "--quiet") == (0, "", "")
+
+
+@pytest.mark.slow
+def test_a_quiet_study_prints_nothing(harness: Callable[..., Said], two_run: Path) -> None:
+    shutil.copytree(two_run, "run")
+    sweep = ("study", "sweep", "run", "--over", "tau", "--grid", "0.9", "--condition", "6g")
+    assert harness(*sweep, "--seeds", "0", "--quiet", "--out", "swept") == (0, "", "")
 
 
 @pytest.mark.slow

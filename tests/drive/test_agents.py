@@ -227,27 +227,38 @@ def test_every_decision_point_comes_out_again_from_the_seat_of_who_decided(drive
     assert [scene.id for scene in scenes_of(there, names)] == names
 
 
-@pytest.mark.exhaustive
-def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def two_models(once: Callable[..., Path]) -> Path:
+    """Egos are the proxy and take 100 ms; the others never yield, and take 300 ms."""
     cruise = Agent(cards.resolve("cruise"), versions.load("v4"))
     point = named_point("single-local")
     spec = live_spec_of(prompt="v4", points=(point,), seeds=(0,))
     spec = replace(spec, source=LiveSource(50_000, 1, ALL), helpers=(cruise,))
-    spec = spec.changed(latency="ego=0.1,helper=0.3")
-    there = folder.read(run(spec, tmp_path / "run").out)
-    egos = {
-        World.start(scenarios.get(ALL), seed).vehicles[0].spawn.id for seed in range(50_000, 50_001)
-    }
-    table, page = there.decisions, details(render(gather([tmp_path / "run"]), full=True))
+    return once("two-models", lambda out: run(spec.changed(latency="ego=0.1,helper=0.3"), out))
+
+
+@pytest.mark.slow
+def test_a_vehicle_decides_with_its_own_model_and_takes_that_ones_time(two_models: Path) -> None:
+    there = folder.read(two_models)
+    egos = {World.start(scenarios.get(ALL), 50_000).vehicles[0].spawn.id}
+    table = there.decisions
     for d in table.records(0, len(table)):
         [answer] = [a for a in there.answers_by_scene[d.scene] if a.role == "ego"]
-        assert page[d.scene]["runs"][0]["answers"][0]["took_s"] == pytest.approx(
-            d.latency_ms / 1000
-        )
         model = there.agent(answer)["model"]["name"]
         assert d.latency_ms == {"proxy": 100.0, "cruise": 300.0}[model]
         assert d.action == "IDLE" or model == "proxy", "who never yields"
         assert (model == "proxy") == (d.agent in egos)
+
+
+@pytest.mark.exhaustive
+def test_a_page_says_how_long_the_model_of_who_decided_took(two_models: Path) -> None:
+    table, page = (
+        folder.read(two_models).decisions,
+        details(render(gather([two_models]), full=True)),
+    )
+    for d in table.records(0, len(table)):
+        took_s = page[d.scene]["runs"][0]["answers"][0]["took_s"]
+        assert took_s == pytest.approx(d.latency_ms / 1000)
 
 
 @pytest.mark.parametrize("model", ["proxy", "right-hand"])

@@ -149,7 +149,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_drawn(
     assert [p.name for p in tmp_path.iterdir()] == ["folder.gif"]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_a_run_ends_with_videos_of_its_first_failures(tmp_path, monkeypatch, capsys):
     pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
     # How each is drawn to its end is tested apart.
