@@ -535,7 +535,7 @@ def test_a_ghost_is_where_it_was_meant_whatever_else_is_moved(
 # The same whatever way
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_one_at_a_time_as_in_batches(pair: Dataset, tmp_path: Path) -> None:
     points = (POINTS["single-local"], OBJECTS, BOTH)
     one, many = (

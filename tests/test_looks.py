@@ -97,6 +97,7 @@ def test_an_interval_of_differences_at_every_look_is_half_as_wide_again_as_at_on
     assert np.isnan(any_time_difference([np.array([]), differences]).low)
 
 
+@pytest.mark.exhaustive
 def test_the_truth_is_held_at_every_look_of_nearly_all_runs() -> None:
     rng, held = np.random.default_rng(1), 0
     for _ in range(60):

@@ -185,7 +185,7 @@ def same_record(one: Path, other: Path) -> bool:
     return answers[0] == answers[1] and same_decisions(one, other)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_replay_is_replayed(proxy_run: Path, small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small, f"replay:{proxy_run}"), tmp_path / "a")
     run(spec_of(small, f"replay:{tmp_path / 'a'}"), tmp_path / "b")

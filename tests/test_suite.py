@@ -275,6 +275,7 @@ def test_the_page_has_families_by_conditions_and_leads_to_each(evaluated: Harnes
     assert Path("again.html").read_text() == page.replace('href="', f'href="{DONE}/')
 
 
+@pytest.mark.exhaustive
 def test_a_loss_has_one_minus_on_the_page(project: Harness) -> None:
     code, _, err = project(*EVAL, "--control", "shuffled-messages")
     assert (code, err) == (0, "")

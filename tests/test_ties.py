@@ -179,7 +179,7 @@ def test_a_frozen_episode_is_the_driven_one(tied: Card, small: Dataset, tmp_path
     assert ends[0] == ends[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_study_of_a_run_draws_as_the_run_did(tied: Card, small: Dataset, tmp_path: Path) -> None:
     for ties in ("drawn", "first"):
         out = run(

@@ -388,7 +388,7 @@ def test_the_loss_of_a_beacon_is_that_of_its_link_when_it_was_sent():
     assert came / n == pytest.approx(0.7, abs=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_times_between_beacons_that_get_through_are_geometric():
     """Mean T / p; the share q is reached after ceil(log(1 - q) / log(1 - p)) periods:
     3 at .95 and p = .7.

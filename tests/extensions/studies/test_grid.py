@@ -21,9 +21,11 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
 from harness.evaluate.spec import Spec
+from harness.extensions.studies.grid.command import _combinations
 from harness.extensions.studies.grid.study import Cell, Grid, front, grid_study, headline, run_cells
 from harness.prompts import versions
 from harness.runs.metrics import BALANCED, LATENCY, SUCCESS
+from harness.runs.settings import Settings
 from harness.runs.success import Success
 from harness.studies.study import write_study
 
@@ -225,6 +227,17 @@ def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
     for name in axes.texts:
         box = name.get_window_extent()
         assert axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1
+
+
+def test_letters_and_reversed_lists_are_of_read_outs_alone() -> None:
+    asked = Settings(
+        model="swarm-tiny", prompt="v2", answer="json,readout", letters="cyclic", flip=True
+    )
+    given = _combinations(asked, "--", ("json", "readout"))
+    assert [(one.answer, one.letters, one.flip) for one in given] == [
+        ("json", None, False),
+        ("readout", "cyclic", True),
+    ]
 
 
 @pytest.mark.exhaustive

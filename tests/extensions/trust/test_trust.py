@@ -91,7 +91,7 @@ def test_a_loss_is_paired_with_the_same_rule_in_peace(bench: Bench) -> None:
     assert bench.price("linear").value == 0
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
     done: Evaluated, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
