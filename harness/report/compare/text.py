@@ -1,6 +1,5 @@
 """A comparison for a terminal, for a pull request and for machines."""
 
-import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -10,13 +9,21 @@ from typing import Any
 import msgspec
 
 from harness.core.errors import printable
+from harness.core.figures import known
 from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
 from harness.prompts.difference import PromptChange
 from harness.report.compare import words
-from harness.report.compare.difference import AnswersHeld, Comparison, Difference, InCondition
+from harness.report.compare.difference import (
+    AnswersFlipped,
+    AnswersHeld,
+    Comparison,
+    Difference,
+    Flip,
+    InCondition,
+)
 from harness.report.compare.gate import Verdict
-from harness.report.compare.pair import where
+from harness.report.compare.pair import Side, where
 from harness.runs.leading import SUCCESS
 
 WIDTH = 80
@@ -33,11 +40,10 @@ def terminal(
 
     Unless `whole`, only those metrics are listed that come first.
     """
-    return "\n".join(
-        piece
-        for text in _lines(comparison, verdicts, most, whole)
-        for piece in wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
-    )
+    lines = []
+    for text in _lines(comparison, verdicts, most, whole):
+        lines += wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
+    return "\n".join(lines)
 
 
 def _lines(
@@ -51,34 +57,44 @@ def _lines(
     yield from (f"  {setting}" for setting in words.settings(comparison))
     yield from words.prompts(comparison)
     yield from words.paces(pair)
-    for c in comparison.conditions:
-        label = printable(c.condition)
-        if len(label) > 25:
-            yield label
-            label = ""
-        yield f"{label:<26}{'A':>8}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>9}"
-        primary, exploratory, more = _groups(c, whole)
-        yield from map(_row, primary)
-        if exploratory:
-            yield "exploratory, p not corrected:"
-            yield from map(_row, exploratory)
-        if more:
-            yield f"{more} more metrics: --all"
-        yield words.success(c, pair)
-        yield from words.adjusted(c)
-        yield from (f"  {way}: {episodes}" for way, episodes in words.both_ways(c, pair, most))
-        yield words.decisions(c, pair)
-        yield from (f"  {how}: {scenes}" for how, scenes in words.given_away(c, pair, most))
+    for condition in comparison.conditions:
+        yield from _metric_lines(condition, whole)
+        yield words.success(condition, pair)
+        yield from words.adjusted(condition)
+        for way, episodes in words.both_ways(condition, pair, most):
+            yield f"  {way}: {episodes}"
+        yield words.decisions(condition, pair)
+        for how, scenes in words.given_away(condition, pair, most):
+            yield f"  {how}: {scenes}"
     yield words.many(comparison)
     held = comparison.held
     yield f"answers: {words.answers_held(held)}"
     if held.changed:
         yield from (f"  {line}" for line in words.first_changed(held.changed[0]))
         yield f"  all, side by side: --html FILE --show {len(held.changed)}"
-    for turned, requests in words.answers_flipped(comparison, most):
-        yield f"answers: {turned}"
+    for change, requests in words.answers_flipped(comparison, most):
+        yield f"answers: {change}"
         yield f"  {requests}"
-    yield from map(words.judged, verdicts)
+    for verdict in verdicts:
+        yield words.judged(verdict)
+
+
+def _metric_lines(condition: InCondition, whole: bool) -> Iterator[str]:
+    """Yield the table of a condition's metrics, a line each, below its name and its heads."""
+    label = printable(condition.condition)
+    if len(label) > 25:
+        yield label
+        label = ""
+    yield f"{label:<26}{'A':>8}{'B':>9}{'B - A':>9} {'[95 % interval]':>18}{'p':>9}"
+    primary, exploratory, more = _groups(condition, whole)
+    for difference in primary:
+        yield _row(difference)
+    if exploratory:
+        yield "exploratory, p not corrected:"
+        for difference in exploratory:
+            yield _row(difference)
+    if more:
+        yield f"{more} more metrics: --all"
 
 
 def _groups(c: InCondition, whole: bool) -> tuple[list[Difference], list[Difference], int]:
@@ -98,61 +114,69 @@ def _row(d: Difference) -> str:
 def markdown(
     comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
 ) -> str:
-    """GitHub's Markdown, in which a run's text is code: no link, no picture, no mention."""
+    """Return the comparison in GitHub's Markdown, in which a run's text is code:
+    no link, no picture, no mention.
+
+    Its arguments are those of `terminal`.
+    """
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
     title = f"{failed} of {len(verdicts)} gates failed" if verdicts else "Comparison of two runs"
     lines = [f"### {title}", ""]
-    lines += [f"- {'❌' if v.failed else '✅'} {code(words.judged(v))}" for v in verdicts]
+    for verdict in verdicts:
+        lines.append(f"- {'❌' if verdict.failed else '✅'} {code(words.judged(verdict))}")
     lines += [f"- {name}: {code(side)}" for name, side in words.sides(pair)]
     lines += [f"- {code(caveat)}" for caveat in words.caveats(pair)]
     lines += [f"- paired: {code(words.paired(pair))}", f"- {words.differing(comparison)}", ""]
-    for c in comparison.conditions:
-        lines += [
-            f"#### {code(c.condition)}",
-            "",
-            *_table(c, whole),
-            "",
-            words.success(c, pair),
-            "",
-        ]
-        lines += [f"- {line}" for line in words.adjusted(c)]
-        lines += [f"- {way}: {code(episodes)}" for way, episodes in words.both_ways(c, pair, most)]
-        lines += ["", words.decisions(c, pair), ""]
-        lines += [f"- {how}: {code(scenes)}" for how, scenes in words.given_away(c, pair, most)]
-        lines += [""]
+    for condition in comparison.conditions:
+        lines += _markdown_of_condition(comparison, condition, most, whole)
     lines += [f"{words.many(comparison)}.", ""]
     lines += ["<details><summary>Answers and settings</summary>", ""]
     lines += [f"- {words.answers_held(comparison.held)}"]
     for changed in comparison.held.changed[:1]:
         lines += [f"- {code(line.strip())}" for line in words.first_changed(changed)]
-    lines += [
-        f"- {code(turned)}: {code(ids)}" for turned, ids in words.answers_flipped(comparison, most)
-    ]
+    for change, ids in words.answers_flipped(comparison, most):
+        lines.append(f"- {code(change)}: {code(ids)}")
     lines += [f"- {code(setting)}" for setting in words.settings(comparison)]
-    lines += [
-        f"- {code(line.strip())}" for line in (*words.prompts(comparison), *words.paces(pair))
-    ]
+    lines += [f"- {code(line.strip())}" for line in words.prompts(comparison)]
+    lines += [f"- {code(line.strip())}" for line in words.paces(pair)]
     return "\n".join([*lines, "", "</details>"])
 
 
-def _table(c: InCondition, whole: bool) -> list[str]:
-    primary, exploratory, more = _groups(c, whole)
-    rows = [
-        f"| {words.SIGNS[text.verdict]} {text.metric} | {text.a} | {text.b} | {text.change} "
-        f"| {text.interval} | {text.p}{'' if d.primary else ' exploratory'} |"
-        for d in (*primary, *exploratory)
-        for text in [words.line(d)]
-    ]
-    head = ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|"]
-    return [*head, *rows, *(["", f"{more} more metrics: --all"] if more else [])]
+def _markdown_of_condition(
+    comparison: Comparison, condition: InCondition, most: int, whole: bool
+) -> list[str]:
+    pair = comparison.pair
+    lines = [f"#### {code(condition.condition)}", "", *_table(condition, whole), ""]
+    lines += [words.success(condition, pair), ""]
+    lines += [f"- {line}" for line in words.adjusted(condition)]
+    for way, episodes in words.both_ways(condition, pair, most):
+        lines.append(f"- {way}: {code(episodes)}")
+    lines += ["", words.decisions(condition, pair), ""]
+    for how, scenes in words.given_away(condition, pair, most):
+        lines.append(f"- {how}: {code(scenes)}")
+    return [*lines, ""]
+
+
+def _table(condition: InCondition, whole: bool) -> list[str]:
+    """Return the Markdown table of a condition's metrics, a line each."""
+    primary, exploratory, more = _groups(condition, whole)
+    lines = ["| metric | A | B | B - A | 95 % interval | p |", "|---|--:|--:|--:|--:|--:|"]
+    for difference in (*primary, *exploratory):
+        row = words.line(difference)
+        name = f"{words.SIGNS[row.verdict]} {row.metric}"
+        p = row.p if difference.primary else f"{row.p} exploratory"
+        cells = (name, row.a, row.b, row.change, row.interval, p)
+        lines.append(f"| {' | '.join(cells)} |")
+    if more:
+        lines += ["", f"{more} more metrics: --all"]
+    return lines
 
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     """Return the gates as test cases, for what shows JUnit's XML."""
-    runs = " against ".join(
-        printable(words.who(side)) for side in (comparison.pair.b, comparison.pair.a)
-    )
+    pair = comparison.pair
+    runs = f"{printable(words.who(pair.b))} against {printable(words.who(pair.a))}"
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
     return test_suite("harness compare", cases)
 
@@ -161,51 +185,36 @@ def junit_of_none(gates: Sequence[str], reason: str) -> str:
     """Return the gates as test cases where they cannot be judged,
     since a model could not be asked.
     """
-    return test_suite(
-        "harness compare", [Case("harness compare", gate, error=reason) for gate in gates]
-    )
+    cases = [Case("harness compare", gate, error=reason) for gate in gates]
+    return test_suite("harness compare", cases)
 
 
 def code(text: str) -> str:
     """Return a text as Markdown's code, whatever backticks it has."""
     text = printable(text, WHOLE)
-    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    longest = max((len(ticks) for ticks in re.findall("`+", text)), default=0)
+    fence = "`" * (1 + longest)
     pad = " " if "`" in text else ""
     return f"{fence}{pad}{text}{pad}{fence}"
 
 
 def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> dict[str, Any]:
-    """For machines: metrics in their own units, null where there is no number."""
-    pair = comparison.pair
+    """Return the comparison as plain values: metrics in their own units, null where there is no
+    number; `most` episodes, requests and so on are listed of each kind.
+    """
+    pair, prompts = comparison.pair, comparison.prompts
     return {
-        **{
-            name: {
-                "run": str(side.run.path),
-                "settings": dict(side.settings),
-                "answer_times": msgspec.to_builtins(side.run.manifest.answer_times),
-            }
-            for name, side in (("a", pair.a), ("b", pair.b))
-        },
+        "a": _side(pair.a),
+        "b": _side(pair.b),
         "caveats": words.caveats(pair),
         "scenes": where(pair.a.run),
         "seeds": list(pair.seeds),
         "episodes": len(pair.episodes),
         "settings": [{"name": name, "a": a, "b": b} for name, a, b in comparison.settings],
-        "prompts": asdict(change)
-        if isinstance(change := comparison.prompts, PromptChange)
-        else change,
+        "prompts": asdict(prompts) if isinstance(prompts, PromptChange) else prompts,
         "conditions": [_in_condition(c, most) for c in comparison.conditions],
         "answers_in_both": comparison.answers_in_both,
-        "answers": [
-            {
-                "role": t.role,
-                "a": t.a,
-                "b": t.b,
-                "count": len(t.requests),
-                "requests": t.requests[:most],
-            }
-            for t in comparison.answers
-        ],
+        "answers": [_answers_flipped(flipped, most) for flipped in comparison.answers],
         "answers_changed": {
             "count": len(comparison.held.changed),
             "verdicts": comparison.held.verdicts,
@@ -213,55 +222,82 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
             "asked_otherwise": comparison.held.other,
             "listed": changed_answers(comparison.held, most),
         },
-        "gates": [
-            {
-                "gate": v.gate,
-                "passed": not v.failed,
-                "failed_in": [{"condition": name, "value": value} for name, value in v.failed],
-            }
-            for v in verdicts
-        ],
-        "passed": not any(v.failed for v in verdicts),
+        "gates": [_gate(verdict) for verdict in verdicts],
+        "passed": not any(verdict.failed for verdict in verdicts),
     }
+
+
+def _side(side: Side) -> dict[str, Any]:
+    return {
+        "run": str(side.run.path),
+        "settings": dict(side.settings),
+        "answer_times": msgspec.to_builtins(side.run.manifest.answer_times),
+    }
+
+
+def _answers_flipped(flipped: AnswersFlipped, most: int) -> dict[str, Any]:
+    return {
+        "role": flipped.role,
+        "a": flipped.a,
+        "b": flipped.b,
+        "count": len(flipped.requests),
+        "requests": flipped.requests[:most],
+    }
+
+
+def _gate(verdict: Verdict) -> dict[str, Any]:
+    failed_in = [{"condition": name, "value": value} for name, value in verdict.failed]
+    return {"gate": verdict.gate, "passed": not verdict.failed, "failed_in": failed_in}
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
     """Return the answers that changed, each with both verdicts and texts;
     `most` of them, or all.
     """
-    return [
-        dict(zip(ANSWERS, (each.request, each.role, *each.verdicts, each.a, each.b), strict=True))
-        for each in held.changed[:most]
-    ]
+    rows = []
+    for answer in held.changed[:most]:
+        values = (answer.request, answer.role, *answer.verdicts, answer.a, answer.b)
+        rows.append(dict(zip(ANSWERS, values, strict=True)))
+    return rows
 
 
-def _in_condition(c: InCondition, most: int) -> dict[str, Any]:
-    metrics = {
-        d.metric: {
-            "a": d.a,
-            "b": d.b,
-            "difference": d.change.value,
-            "low": _number(d.change.low),
-            "high": _number(d.change.high),
-            "n": d.change.n,
-            "n_excluded": d.change.n_excluded,
-            "p": d.p_value,
-            "p_holm": d.p_corrected,
-            "primary": d.primary,
-        }
-        for d in c.differences
+def _in_condition(condition: InCondition, most: int) -> dict[str, Any]:
+    metrics = {each.metric: _difference(each) for each in condition.differences}
+    return {
+        "condition": condition.condition,
+        "metrics": metrics,
+        "test": _test(metrics),
+        "gained": _episodes(condition.gained, most),
+        "lost": _episodes(condition.lost, most),
+        "flips": {
+            "count": sum(len(flip.seeds) for flip in condition.flips),
+            "of": condition.decisions,
+            "listed": [asdict(flip) for flip in condition.flips[:most]],
+        },
     }
-    entry: dict[str, Any] = {"condition": c.condition, "metrics": metrics, "test": _test(metrics)}
-    for name, some in (("gained", c.gained), ("lost", c.lost)):
-        listed = [asdict(t) for t in some[:most]]
-        entry[name] = {
-            "count": sum(len(t.seeds) for t in some),
-            "episodes": len(some),
-            "listed": listed,
-        }
-    flips = [asdict(flip) for flip in c.flips[:most]]
-    count = sum(len(flip.seeds) for flip in c.flips)
-    return {**entry, "flips": {"count": count, "of": c.decisions, "listed": flips}}
+
+
+def _difference(d: Difference) -> dict[str, Any]:
+    return {
+        "a": d.a,
+        "b": d.b,
+        "difference": d.change.value,
+        "low": known(d.change.low),
+        "high": known(d.change.high),
+        "n": d.change.n,
+        "n_excluded": d.change.n_excluded,
+        "p": d.p_value,
+        "p_holm": d.p_corrected,
+        "primary": d.primary,
+    }
+
+
+def _episodes(flips: Sequence[Flip], most: int) -> dict[str, Any]:
+    return {
+        "count": sum(len(flip.seeds) for flip in flips),
+        "episodes": len(flips),
+        "listed": [asdict(flip) for flip in flips[:most]],
+    }
 
 
 def _test(metrics: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
@@ -275,7 +311,3 @@ def _test(metrics: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
         "low": success["low"],
         "high": success["high"],
     }
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
