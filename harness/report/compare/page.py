@@ -26,41 +26,45 @@ Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
 def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
-    """Yield the page; `most` episodes and requests are listed of each kind,
+    """Return the page; `most` episodes and requests are listed of each kind,
     with links to the runs' pages.
     """
     pair = comparison.pair
-    lost = {name: _lost(side) for name, side in (("A", pair.a), ("B", pair.b))}
+    sides = {"A": pair.a, "B": pair.b}
+    lost = {name: _lost(side) for name, side in sides.items()}
+
+    def link(side: Side, scene: str, condition: str, seed: int) -> str | None:
+        page = place(side.run)
+        decision = {"scene": scene, "condition": condition, "seed": seed}
+        return page and f"{page}#{urlencode(decision)}"
 
     def links(condition: str, flip: Flip) -> Iterator[tuple[str, str]]:
-        for name, side in (("A", pair.a), ("B", pair.b)):
-            where, scene = place(side.run), lost[name].get((condition, flip.seeds[0], flip.episode))
-            if where and scene:
-                asked = {"scene": scene, "condition": condition, "seed": flip.seeds[0]}
-                yield name, f"{where}#{urlencode(asked)}"
+        """Yield the name of each run, and where its page shows the decision that lost."""
+        seed = flip.seeds[0]
+        for name, side in sides.items():
+            scene = lost[name].get((condition, seed, flip.episode))
+            address = link(side, scene, condition, seed) if scene else None
+            if address:
+                yield name, address
 
     def decided(condition: str, flip: DecisionFlip) -> Iterator[tuple[str, str, str | None]]:
-        """Of each run: what its ego answered there alone, and where its page shows it."""
-        for name, side in (("A", pair.a), ("B", pair.b)):
-            asked = {"scene": flip.scene, "condition": condition, "seed": flip.seeds[0]}
-            where, answers = place(side.run), side.run.answers_by_scene.get(flip.scene, ())
+        """Yield of each run what its ego answered there alone, and where its page shows it."""
+        for name, side in sides.items():
+            answers = side.run.answers_by_scene.get(flip.scene, ())
             raw = next((answer.raw for answer in answers if answer.role == "ego"), "nothing")
-            yield name, printable(raw, RAW), where and f"{where}#{urlencode(asked)}"
+            yield name, printable(raw, RAW), link(side, flip.scene, condition, flip.seeds[0])
 
-    return (
-        environment(TEMPLATES)
-        .get_template("compare.html.j2")
-        .render(
-            comparison=comparison,
-            pair=pair,
-            verdicts=verdicts,
-            most=most,
-            words=words,
-            links=links,
-            decided=decided,
-            marked=marked,
-            forest=_forest(comparison),
-        )
+    template = environment(TEMPLATES).get_template("compare.html.j2")
+    return template.render(
+        comparison=comparison,
+        pair=pair,
+        verdicts=verdicts,
+        most=most,
+        words=words,
+        links=links,
+        decided=decided,
+        marked=marked,
+        forest=_forest(comparison),
     )
 
 
@@ -70,31 +74,29 @@ def beside(out: Path) -> Place:
     A link names no folder of the machine:
     both lie below the current folder, or the page below the file.
     """
-    here, at = Path.cwd(), out.resolve().parent
+    here, folder = Path.cwd(), out.resolve().parent
 
     def place(run: Run) -> str | None:
         page = run.path.resolve() / "report.html"
-        near = page.is_relative_to(at) or all(path.is_relative_to(here) for path in (page, at))
-        return quote(os.path.relpath(page, at)) if near and page.is_file() else None
+        both_here = page.is_relative_to(here) and folder.is_relative_to(here)
+        if not page.is_file() or not (both_here or page.is_relative_to(folder)):
+            return None
+        return quote(os.path.relpath(page, folder))
 
     return place
 
 
 def _lost(side: Side) -> dict[tuple[str, int, int], str]:
-    """By condition, seed and episode the decision that lost it;
-    where none is known to, the last.
+    """Return by condition, seed and episode the scene of the decision that lost it;
+    where none is known to, of the last.
     """
-    run = side.run
-    d = run.decisions
-    condition, seed, episode = (
-        d.codes("condition", run.conditions),
-        d.whole("seed"),
-        d.whole("episode"),
-    )
-    regret = np.nan_to_num(d["regret"]) == 1.0
+    run, decisions = side.run, side.run.decisions
+    condition = decisions.codes("condition", run.conditions)
+    seed, episode = decisions.whole("seed"), decisions.whole("episode")
+    regret = np.nan_to_num(decisions["regret"]) == 1.0
     last: dict[tuple[str, int, int], str] = {}
     losing: dict[tuple[str, int, int], str] = {}
-    for scene, rows in d.scenes.items():
+    for scene, rows in decisions.scenes.items():
         for n in range(rows.start, rows.stop):
             key = run.conditions[condition[n]], int(seed[n]), int(episode[n])
             last[key] = scene
@@ -112,9 +114,13 @@ def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:
         return "rate" if entry(metric).interval == "rate" else metric
 
     by_scale: dict[str, list[Estimate]] = {}
-    for d in (d for c in comparison.conditions for d in c.differences):
-        by_scale.setdefault(scale(d.metric), []).append(d.change)
-    farthest = {name: max(map(abs, reach(changes))) or 1.0 for name, changes in by_scale.items()}
+    for condition in comparison.conditions:
+        for d in condition.differences:
+            by_scale.setdefault(scale(d.metric), []).append(d.change)
+    farthest = {}
+    for name, changes in by_scale.items():
+        low, high = reach(changes)
+        farthest[name] = max(abs(low), abs(high)) or 1.0
 
     def draw(d: Difference) -> Markup:
         most = farthest[scale(d.metric)]

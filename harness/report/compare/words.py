@@ -55,21 +55,19 @@ class Line:
 
 def line(d: Difference) -> Line:
     """Write a difference, with four figures at most; shares in percent."""
-    unit, e = entry(d.metric).unit, d.change
-    interval = (
-        "–"
-        if math.isnan(e.low)
-        else f"[{', '.join(unit.number(x, '+', 4) for x in (e.low, e.high))}]"
-    )
+    unit, change = entry(d.metric).unit, d.change
+    interval = "–"
+    if not math.isnan(change.low):
+        interval = f"[{unit.number(change.low, '+', 4)}, {unit.number(change.high, '+', 4)}]"
     p = d.p_corrected if d.primary else d.p_value
     return Line(
-        verdict(d),
-        f"{d.metric}{' %' if unit.name == '%' else ''}",
-        unit.number(d.a, digits=4),
-        unit.number(d.b, digits=4),
-        unit.number(e.value, "+", 4),
-        interval,
-        "–" if p is None else p_value(p).removeprefix("= "),
+        verdict=verdict(d),
+        metric=f"{d.metric}{' %' if unit.name == '%' else ''}",
+        a=unit.number(d.a, digits=4),
+        b=unit.number(d.b, digits=4),
+        change=unit.number(change.value, "+", 4),
+        interval=interval,
+        p="–" if p is None else p_value(p).removeprefix("= "),
     )
 
 
@@ -101,23 +99,19 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
     def order(d: Difference) -> tuple[bool, float]:
         metric = entry(d.metric)
+        comes_last = metric.better == "neither" or bool(metric.percentile)
         # What changed alike in every episode has no interval.
-        return metric.better == "neither" or bool(
-            metric.percentile
-        ), -1.0 if d.p_value is None else d.p_value
+        return comes_last, -1.0 if d.p_value is None else d.p_value
+
+    def is_clear(d: Difference) -> bool:
+        return _visible(d) and bool(verdict(d) or d.p_value is None)
 
     primary = [d for d in c.differences if d.primary]
-    changed = [
-        d
-        for d in c.differences
-        if not d.primary
-        and d.metric != ONE_OPTIMAL
-        and _visible(d)
-        and (verdict(d) or d.p_value is None)
-    ]
+    exploratory = [d for d in c.differences if not d.primary and d.metric != ONE_OPTIMAL]
+    changed = [d for d in exploratory if is_clear(d)]
     striking = sorted(changed, key=order)[: max(SHOWN - len(primary), 0)]
     if any(entry(d.metric).pooled for d in striking):
-        striking += [d for d in c.differences if d.metric == ONE_OPTIMAL and d not in striking]
+        striking += [d for d in c.differences if d.metric == ONE_OPTIMAL]
     return primary, striking
 
 
@@ -128,22 +122,23 @@ def rest(c: InCondition) -> list[Difference]:
 
 
 def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return how what leads changed in each condition: a sentence and its verdict."""
+    """Return how the headline metric changed in each condition: a sentence and its verdict."""
     outcomes = []
-    for c in comparison.conditions:
-        lead = leading({d.metric for d in c.differences})
-        for d in [d for d in c.differences if d.metric == lead]:
-            row = line(d)
-            p = "" if d.p_corrected is None else f", Holm's p {row.p}"
-            if math.isnan(d.change.low):
-                verdict = "not clear, since there is no interval"
-            else:
-                verdict = (
-                    row.verdict or f"not clear, but within {within(d.change.low, d.change.high)}"
-                )
-            interval = f" {row.interval}".removesuffix(" –")
-            change = f"{IN_WORDS[lead]} {row.change} points{interval}: {verdict}"
-            outcomes.append((f"{c.condition}: {change}{p}", row.verdict))
+    for condition in comparison.conditions:
+        differences = {d.metric: d for d in condition.differences}
+        metric = leading(set(differences))
+        d = differences.get(metric)
+        if d is None:
+            continue
+        row = line(d)
+        if math.isnan(d.change.low):
+            verdict, interval = "not clear, since there is no interval", ""
+        else:
+            bounds = within(d.change.low, d.change.high)
+            verdict, interval = row.verdict or f"not clear, but within {bounds}", f" {row.interval}"
+        p = "" if d.p_corrected is None else f", Holm's p {row.p}"
+        change = f"{IN_WORDS[metric]} {row.change} points{interval}: {verdict}{p}"
+        outcomes.append((f"{condition.condition}: {change}", row.verdict))
     return outcomes
 
 
@@ -154,29 +149,31 @@ def who(side: Side) -> str:
 
 
 def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
-    """`A` and `B`, each with the name of its folder, or its `whole` path, and who answered."""
-    return [
-        (name, f"{side.run.path if whole else side.run.path.name}: {who(side)}")
-        for name, side in (("A", pair.a), ("B", pair.b))
-    ]
+    """Return `A` and `B`, each with the name of its folder, or its `whole` path, and its model,
+    prompt and answer mode.
+    """
+    rows = []
+    for name, side in (("A", pair.a), ("B", pair.b)):
+        folder = side.run.path if whole else side.run.path.name
+        rows.append((name, f"{folder}: {who(side)}"))
+    return rows
 
 
 def paces(pair: Pair) -> list[str]:
     """Return what prefill and decode take, with the run's letter."""
-    sides = (("A", pair.a.run), ("B", pair.b.run))
-    return [
-        f"{name}: {finding.sentence.strip()}"
-        for name, run in sides
-        for finding in findings(run, Kind.PACE)
-    ]
+    sentences = []
+    for name, side in (("A", pair.a), ("B", pair.b)):
+        pace = findings(side.run, Kind.PACE)
+        sentences += [f"{name}: {finding.sentence.strip()}" for finding in pace]
+    return sentences
 
 
 def caveats(pair: Pair) -> list[str]:
     """Return what must be said of the runs before their numbers,
     with the run's letter where it is of one.
     """
-    found = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
-    return [*(finding.sentence for finding in found), *_any_time(pair)]
+    warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
+    return [*(finding.sentence for finding in warnings), *_any_time(pair)]
 
 
 def _any_time(pair: Pair) -> Iterator[str]:
@@ -188,7 +185,8 @@ def _any_time(pair: Pair) -> Iterator[str]:
     for condition in pair.conditions:
         ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
         success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
-        a, b = (pair.values(side, SUCCESS, condition).T for side in (pair.a, pair.b))
+        a = pair.values(pair.a, SUCCESS, condition).T
+        b = pair.values(pair.b, SUCCESS, condition).T
         change = shown(success.any_time_difference(b, a), POINTS, "+")
         yield (
             f"{printable(condition)}: {success.words} B - A {change} points, by an interval of "
@@ -217,11 +215,10 @@ def differing(comparison: Comparison) -> str:
 
 def success(c: InCondition, pair: Pair) -> str:
     """Return how many successes were gained and lost."""
-    gained, lost = (sum(len(t.seeds) for t in flips) for flips in (c.gained, c.lost))
-    of = f"{len(pair.episodes) * len(pair.seeds)} episodes" + (
-        " × seeds" if len(pair.seeds) > 1 else ""
-    )
-    return f"success: {gained} gained, {lost} lost of {of}"
+    gained = sum(len(flip.seeds) for flip in c.gained)
+    lost = sum(len(flip.seeds) for flip in c.lost)
+    unit = "episodes × seeds" if len(pair.seeds) > 1 else "episodes"
+    return f"success: {gained} gained, {lost} lost of {len(pair.episodes) * len(pair.seeds)} {unit}"
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
@@ -245,6 +242,7 @@ def many(comparison: Comparison) -> str:
     if not tested:
         return "no difference has a p: too few episodes, or none of them changed"
     p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
+    exploratory = len(tested) - len(p_values)
     hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
         "p comes from the interval: it is 1 minus the confidence level at which the interval "
@@ -252,8 +250,8 @@ def many(comparison: Comparison) -> str:
         f"differences: the chance that one or more of them is at most {LEVEL} without a real "
         f"difference is {100 * LEVEL:.0f} % at most. {sum(p <= LEVEL for p in p_values)} are at "
         f"most {LEVEL}: {SIGNS[BETTER]} better, {SIGNS[WORSE]} worse. The other "
-        f"{len(tested) - len(p_values)} are exploratory and not corrected: {hints} are at most "
-        f"{LEVEL} ({SIGNS[HINT]}), and {LEVEL * (len(tested) - len(p_values)):.0f} would be by "
+        f"{exploratory} are exploratory and not corrected: {hints} are at most "
+        f"{LEVEL} ({SIGNS[HINT]}), and {LEVEL * exploratory:.0f} would be by "
         "chance alone. Intervals and gates are not corrected"
     )
 
@@ -268,33 +266,35 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
     """Return up to so many episodes, each with how it failed; seeds where it is not all of them."""
-    episodes = [
-        f"{t.episode} {t.a if t.b == 'success' else t.b}{_seeds(t.seeds, pair)}"
-        for t in some[:most]
-    ]
+    episodes = []
+    for flip in some[:most]:
+        failure = flip.a if flip.b == "success" else flip.b
+        episodes.append(f"{flip.episode} {failure}{_seeds(flip.seeds, pair)}")
     return _listed(episodes, len(some), most)
 
 
 def decisions(c: InCondition, pair: Pair) -> str:
     """Return how many decisions flipped, and in how many one run alone gave success away."""
-    n = {by: sum(len(flip.seeds) for flip in c.flips if flip.lost_by == by) for by in LOST_BY}
-    text = f"decisions: {sum(n.values())} flipped of the {c.decisions} that both runs have"
+    count = dict.fromkeys(LOST_BY, 0)
+    for flip in c.flips:
+        count[flip.lost_by] += len(flip.seeds)
+    text = f"decisions: {sum(count.values())} flipped of the {c.decisions} that both runs have"
     if not c.flips or pair.a.run.world == "closed-loop":  # which knows no regret
         return text
-    return f"{text}; B alone gave success away in {n['B']}, A alone in {n['A']}"
+    return f"{text}; B alone gave success away in {count['B']}, A alone in {count['A']}"
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Decisions that flipped and gave success away in one run alone: up to so many of each run."""
-    kinds = {by: [flip for flip in c.flips if flip.lost_by == by] for by in ("B", "A")}
-    return [
-        (
-            f"{by} alone gave success away",
-            _listed([decision_flip(flip, pair) for flip in some[:most]], len(some), most),
-        )
-        for by, some in kinds.items()
-        if some
-    ]
+    """Return the decisions that flipped and gave success away in one run alone:
+    up to so many of each run.
+    """
+    rows = []
+    for run in ("B", "A"):
+        flips = [flip for flip in c.flips if flip.lost_by == run]
+        if flips:
+            scenes = [decision_flip(flip, pair) for flip in flips[:most]]
+            rows.append((f"{run} alone gave success away", _listed(scenes, len(flips), most)))
+    return rows
 
 
 def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
@@ -313,53 +313,50 @@ def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
     change = comparison.prompts
     if change is None or isinstance(change, str):
         return [change] if change else []
-    pair = comparison.pair
-    ego, helper = (
-        [
-            printable(side.run.manifest.agent(place)["prompt"]["version"], 40)
-            for side in (pair.a, pair.b)
-        ]
-        for place in (0, 1)
-    )
-    who = f"prompt {' → '.join(ego)}"
+    ego, helper = _versions(comparison.pair)
+    title = f"prompt {' → '.join(ego)}"
     if ego != helper:
-        who = f"ego's {who}, helper's {' → '.join(helper)}"
-    counts = [
-        f"{file} {t.removed} words removed, {t.added} added" if t.hunks else f"{file} the same"
-        for file, t in change.texts.items()
-    ]
-    lines = [f"{who}: {', '.join(counts)}"]
-    lines += [f"  {name}: {'none' if x is None else x} → {y}" for name, x, y in change.settings]
+        title = f"ego's {title}, helper's {' → '.join(helper)}"
+    counts = []
+    for file, text in change.texts.items():
+        count = f"{text.removed} words removed, {text.added} added" if text.hunks else "the same"
+        counts.append(f"{file} {count}")
+    lines = [f"{title}: {', '.join(counts)}"]
+    for name, before, after in change.settings:
+        lines.append(f"  {name}: {'none' if before is None else before} → {after}")
     hunks = [(file, hunk) for file, text in change.texts.items() for hunk in text.hunks]
     for file, hunk in hunks[:most]:
         lines.append(f"  {file} line {hunk.line_a} → {hunk.line_b}")
-        text = "".join(piece for _, piece in marked(hunk))
-        lines += [f"    {line.strip()}" for line in text.split("\n") if line.strip()]
+        whole = "".join(piece for _, piece in marked(hunk))
+        lines += [f"    {line.strip()}" for line in whole.split("\n") if line.strip()]
     if len(hunks) > most:
-        stated = [
-            side.run.manifest.agent(place)["prompt"]
-            for side in (pair.a, pair.b)
-            for place in (0, 1)
-        ]
-        here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
-        seen = dict.fromkeys(
-            f"`harness prompt compare {a} {b}`" for a, b in (ego, helper) if a != b
-        )
-        shown = " and ".join(seen) if here and seen else "the page of --html has them"
-        lines.append(f"  {len(hunks) - most} more changes: {shown}")
+        lines.append(f"  {len(hunks) - most} more changes: {_where_all_are(comparison.pair)}")
     return lines
+
+
+def _versions(pair: Pair) -> list[tuple[str, str]]:
+    """Return the prompt versions of A and B: of the ego, then of the first helper."""
+    sides = zip(pair.a.prompts, pair.b.prompts, strict=True)
+    return [(printable(a["version"], 40), printable(b["version"], 40)) for a, b in sides]
+
+
+def _where_all_are(pair: Pair) -> str:
+    """Say what shows all changes of the prompts: a command where all of them are here."""
+    stated = [*pair.a.prompts, *pair.b.prompts]
+    here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
+    differing = [(a, b) for a, b in _versions(pair) if a != b]
+    commands = dict.fromkeys(f"`harness prompt compare {a} {b}`" for a, b in differing)
+    return " and ".join(commands) if here and commands else "the page of --html has them"
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
     """Return how many answers of a role changed their verdict, and up to so many of them."""
-    return [
-        (
-            f"{role_word(t.role)} {t.a} → {t.b}: {len(t.requests)} of "
-            f"{comparison.answers_in_both[t.role]}",
-            _listed(t.requests[:most], len(t.requests), most),
-        )
-        for t in comparison.answers
-    ]
+    rows = []
+    for flipped in comparison.answers:
+        n, of = len(flipped.requests), comparison.answers_in_both[flipped.role]
+        change = f"{role_word(flipped.role)} {flipped.a} → {flipped.b}: {n} of {of}"
+        rows.append((change, _listed(flipped.requests[:most], n, most)))
+    return rows
 
 
 def answers_held(held: AnswersHeld) -> str:
@@ -382,11 +379,12 @@ def answers_held(held: AnswersHeld) -> str:
 def first_changed(changed: AnswerChanged) -> list[str]:
     """Return an answer that changed, and the text of both from a little before they part."""
     start = max(_alike(changed.a, changed.b) - BEFORE, 0) if changed.a != changed.b else 0
-    texts = [
-        f"  {name} {verdict}: {'…' if start else ''}{printable(text[start:], EXCERPT) or 'nothing'}"
-        for name, verdict, text in zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)
-    ]
-    return [f"first: {changed.request}, {role_word(changed.role)}", *texts]
+    lines = [f"first: {changed.request}, {role_word(changed.role)}"]
+    answers = zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)
+    for name, verdict, text in answers:
+        excerpt = printable(text[start:], EXCERPT) or "nothing"
+        lines.append(f"  {name} {verdict}: {'…' if start else ''}{excerpt}")
+    return lines
 
 
 def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
@@ -395,11 +393,12 @@ def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
     """
     a, b = changed.a, changed.b
     start = _alike(a, b)
-    end = _alike(a[start:][::-1], b[start:][::-1])
-    return [
-        (name, verdict, text[:start], text[start : len(text) - end], text[len(text) - end :])
-        for name, verdict, text in zip("AB", changed.verdicts, (a, b), strict=True)
-    ]
+    alike_at_end = _alike(a[start:][::-1], b[start:][::-1])
+    rows = []
+    for name, verdict, text in zip("AB", changed.verdicts, (a, b), strict=True):
+        end = len(text) - alike_at_end
+        rows.append((name, verdict, text[:start], text[start:end], text[end:]))
+    return rows
 
 
 def _alike(a: str, b: str) -> int:
@@ -414,7 +413,7 @@ def _listed(some: Sequence[str], n: int, most: int) -> str:
 
 
 def settings(comparison: Comparison) -> list[str]:
-    """Each setting in which the runs differ, with both values."""
+    """Return each setting in which the runs differ, with both values."""
 
     def shown(value: str | None) -> str:
         return "none" if value is None else printable(value, 60)
@@ -427,6 +426,5 @@ def judged(verdict: Verdict, sign: str = "+") -> str:
     gate = printable(verdict.gate)
     if not verdict.failed:
         return f"passed: {gate}"
-    return f"FAILED: {gate} in " + ", ".join(
-        f"{name} ({value:{sign}.4g})" for name, value in verdict.failed
-    )
+    conditions = [f"{name} ({value:{sign}.4g})" for name, value in verdict.failed]
+    return f"FAILED: {gate} in {', '.join(conditions)}"
