@@ -66,37 +66,40 @@ def success_latency(
     """Draw success over latency, a point a run and condition, and the paper's;
     references are lines.
 
-    `label` is what leads, in words.
+    `label` is the headline metric in words.
     """
     untitled = {"legend": {"orient": "top", "title": None}}
+    several_runs = len({row["run"] for row in rows}) > 1
     condition = condition_colours(rows) | untitled
-    shape = (
-        shapes_of(rows, "run" if len({row["run"] for row in rows}) > 1 else "condition") | untitled
-    )
+    shape = shapes_of(rows, "run" if several_runs else "condition") | untitled
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", f"{label} rate")
-    present = {key for row in rows for key, value in row.items() if value is not None}
-    along_x = {"x": {**x, "field": "latency_low"}, "x2": {"field": "latency_high"}, "y": y}
-    along_y = {"x": x, "y": {**y, "field": "low"}, "y2": {"field": "high"}}
-    ends = {"low": along_y, "latency_low": along_x}
-    return layered(
+    conditions = dict.fromkeys(str(row["condition"]) for row in rows)
+    layers = [
         band(*REACTION_MS, "reaction window of the paper, 150 to 250 ms", named=True),
         _references(references, y),
         *rules_at("latency_ms", window_ms, "decision window"),
-        *_paper(dict.fromkeys(str(row["condition"]) for row in rows), x, y),
-        *(interval(**along, color=condition) for end, along in ends.items() if end in present),
-        point(110, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)),
-        rows=rows,
-        height=300,
-    )
+        *_paper(conditions, x, y),
+    ]
+    if any(row.get("low") is not None for row in rows):
+        low, high = {**y, "field": "low"}, {"field": "high"}
+        layers.append(interval(x=x, y=low, y2=high, color=condition))
+    if any(row.get("latency_low") is not None for row in rows):
+        low, high = {**x, "field": "latency_low"}, {"field": "latency_high"}
+        layers.append(interval(x=low, x2=high, y=y, color=condition))
+    layers.append(point(110, x=x, y=y, color=condition, shape=shape, tooltip=tooltip(rows)))
+    return layered(*layers, rows=rows, height=300)
 
 
 def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
     """Return what the paper reports for its own operating points, as a ring with its name."""
-    values = [
-        {"paper": f"paper: {name}", "latency_ms": PAPER[name][0], "success": PAPER[name][1]}
-        for name in conditions
-        if name in PAPER
-    ]
+    values = []
+    for name in conditions:
+        if name in PAPER:
+            latency_ms, success = PAPER[name]
+            row = {"paper": f"paper: {name}", "latency_ms": latency_ms, "success": success}
+            values.append(row)
+    if not values:
+        return []
     ring = {
         "type": "point",
         "shape": "circle",
@@ -110,7 +113,7 @@ def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
         {"mark": ring, "encoding": {"x": x, "y": y, **tip}},
         {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
     ]
-    return [{"data": {"values": values}, "layer": layer}] if values else []
+    return [{"data": {"values": values}, "layer": layer}]
 
 
 def _references(success: Mapping[str, float], y: Spec) -> Spec:
@@ -130,30 +133,26 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
     text = {"type": "text", "align": "right", "dy": -5, "dx": -4, "color": "currentColor"}
     tip = {"tooltip": [{"field": name} for name in ("reference", "success")]}
     named = {"y": y, "x": {"value": "width"}, "text": {"field": "named"}}
-    return {
-        "layer": [
-            {
-                "data": {"values": lines},
-                "mark": {**RULE, "opacity": 0.6},
-                "encoding": {"y": y, **tip},
-            },
-            {"data": {"values": names}, "mark": text, "encoding": named},
-        ]
+    rules: Spec = {
+        "data": {"values": lines},
+        "mark": {**RULE, "opacity": 0.6},
+        "encoding": {"y": y, **tip},
     }
+    labels: Spec = {"data": {"values": names}, "mark": text, "encoding": named}
+    return {"layer": [rules, labels]}
 
 
 def statuses(rows: Rows) -> Spec:
     """Draw statuses of answers, a stacked bar a run and role."""
-    # A run's file may say anything; what is no verdict is no answer.
-    met = {
-        (v if (v := row["verdict"]) in VERDICTS else "failed", str(row["status"])): None
-        for row in rows
-    }
-    colours = {
-        status: shades[n % len(shades)]
-        for verdict, shades in VERDICTS.items()
-        for n, status in enumerate(status for v, status in met if v == verdict)
-    }
+    statuses: dict[str, dict[str, None]] = {verdict: {} for verdict in VERDICTS}
+    for row in rows:
+        # A run's file may say anything; what is no verdict is no answer.
+        verdict = row["verdict"] if row["verdict"] in VERDICTS else "failed"
+        statuses[verdict][str(row["status"])] = None
+    colours = {}
+    for verdict, shades in VERDICTS.items():
+        for n, status in enumerate(statuses[verdict]):
+            colours[status] = shades[n % len(shades)]
     return stacked(rows, "role", "status", colours, "answers")
 
 
@@ -183,27 +182,25 @@ def policies(actions: Sequence[str]) -> Spec:
 
 
 def timeline() -> Spec:
-    """When what happens in one decision; the page fills in `values`:
+    """Draw when what happens in one decision; the page fills in `values`:
     who, what, from, to; and `window`.
     """
-    return layered(
-        {
-            "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
-            "encoding": {
-                "x": {"field": "from", **NUMBER, "title": "ms from the start of the decision"},
-                "x2": {"field": "to"},
-                "y": names_axis("who"),
-                "color": colour("what", TIMES),
-                "tooltip": [{"field": f} for f in ("who", "what", "from", "to")],
-            },
+    spans: Spec = {
+        "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
+        "encoding": {
+            "x": {"field": "from", **NUMBER, "title": "ms from the start of the decision"},
+            "x2": {"field": "to"},
+            "y": names_axis("who"),
+            "color": colour("what", TIMES),
+            "tooltip": [{"field": field} for field in ("who", "what", "from", "to")],
         },
-        {
-            "data": {"name": "window", "values": []},
-            "mark": RULE,
-            "encoding": {"x": {"field": "window_ms", **NUMBER}, "tooltip": {"field": "what"}},
-        },
-        rows=[],
-    )
+    }
+    window: Spec = {
+        "data": {"name": "window", "values": []},
+        "mark": RULE,
+        "encoding": {"x": {"field": "window_ms", **NUMBER}, "tooltip": {"field": "what"}},
+    }
+    return layered(spans, window, rows=[])
 
 
 def stacked(
@@ -214,11 +211,11 @@ def stacked(
 
     Their lengths are shares, or another `amount` of the rows.
     """
-    several, order = len({row["run"] for row in rows}) > 1, list(colours)
-    bars = [
-        {**row, "bar": f"{row['run']}: " * several + str(row[by]), "order": order.index(row[field])}
-        for row in rows
-    ]
+    several_runs, order = len({row["run"] for row in rows}) > 1, list(colours)
+    bars = []
+    for row in rows:
+        name = f"{row['run']}: {row[by]}" if several_runs else str(row[by])
+        bars.append({**row, "bar": name, "order": order.index(row[field])})
     x = {"field": amount, **NUMBER, "stack": "zero", "title": what}
     if amount == "share":
         x |= {"axis": {"format": "%"}, "scale": {"domain": [0, 1]}}
@@ -279,7 +276,6 @@ def bars(
 ) -> Spec:
     """Draw counts over a field in bins of one width, with a shaded budget to be `within`."""
     bars = [{**row, "to": row[field] + width} for row in rows]
-    met = {row[series] for row in rows} if series else set()
     encoding: Spec = {
         "x": {**x_axis(field, title), "bin": {"binned": True, "step": width}},
         "x2": {"field": "to"},
@@ -288,7 +284,8 @@ def bars(
     }
     mark: Spec = {"type": "bar", "opacity": 0.75, "color": ROLES["ego"]}
     if series == "role":
-        encoding["color"] = colour("role", {role: c for role, c in ROLES.items() if role in met})
+        roles = {row["role"] for row in rows}
+        encoding["color"] = colour("role", {name: c for name, c in ROLES.items() if name in roles})
     elif series:
         encoding["color"] = condition_colours(rows)
     layers: list[Spec] = [{"mark": mark, "encoding": encoding}]
@@ -298,9 +295,7 @@ def bars(
 
 
 def named(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row in which no text is one that Vega stumbles over;
-    what is added is not to be seen.
-    """
+    """Return a row in which a text that Vega stumbles over (`TAKEN`) has a space behind it."""
     return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
 
 
@@ -382,14 +377,17 @@ def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
 
 def tooltip(rows: Rows) -> list[Spec]:
     """Return every field of a table in its tooltip."""
-    return [
-        {"field": name, "format": ".3~f"} if isinstance(value, float) else {"field": name}
-        for name, value in (rows[0] if rows else {}).items()
-    ]
+    fields = []
+    for name, value in (rows[0] if rows else {}).items():
+        field = {"field": name}
+        if isinstance(value, float):
+            field["format"] = ".3~f"
+        fields.append(field)
+    return fields
 
 
 def interval(**encoding: Spec) -> Spec:
-    """A line from one end of an interval, along x or y, to the other,
+    """Return a line from one end of an interval, along x or y, to the other,
     which is the channel x2 or y2.
     """
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
@@ -411,7 +409,8 @@ def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
     """Return vertical lines, named at their top where `what` they are is given, in ms."""
     if not at:
         return []
-    data = {"data": {"values": [{field: value, "what": f"{what}, {value:g} ms"} for value in at]}}
+    values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]
+    data = {"data": {"values": values}}
     x: Spec = {"x": {"field": field, **NUMBER}}
     line: Spec = {"mark": RULE, "encoding": x}
     name = {"mark": {**NAME, "dy": -24}, "encoding": {**x, **FOOT, "text": {"field": "what"}}}

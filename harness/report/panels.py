@@ -45,32 +45,32 @@ class Panel:
 def panels(runs: Runs) -> Iterator[Panel]:
     """Yield the charts of which there is anything to draw."""
 
-    def joined(of: Callable[[Run], Table]) -> Table:
-        return [
-            charts.named({"run": name, **row})
-            for name, run in zip(runs.names, runs.runs, strict=True)
-            for row in of(run)
-        ]
+    def joined(table_of: Callable[[Run], Table]) -> Table:
+        rows = []
+        for name, run in zip(runs.names, runs.runs, strict=True):
+            rows += [charts.named({"run": name, **row}) for row in table_of(run)]
+        return rows
 
     points = [c for run in runs.runs for c in run.manifest.conditions if c.get("profile")]
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
-    lead = lead_of(*runs.runs)
-    if rows := joined(lambda run: success(run, lead)):
-        references, scenario = _references(runs, lead), runs.scenario
-        rates = {
-            label(name, scenario): s.value for name, s in references.items() if s.value is not None
-        }
+    metric = lead_of(*runs.runs)
+    if rows := joined(lambda run: success(run, metric)):
+        references, scenario = _references(runs, metric), runs.scenario
+        rates = {}
+        for name, score in references.items():
+            if score.value is not None:
+                rates[label(name, scenario)] = score.value
         yield Panel(
             "success-latency",
             "overview",
-            f"{IN_WORDS[lead].capitalize()} and latency",
+            f"{IN_WORDS[metric].capitalize()} and latency",
             "Each point is a condition; the lines through it are 95 % intervals over episodes. "
             "Rings: what the paper reports, with other scenes and another model. A reply that "
             "arrives after the decision window is not fused."
             + sentences(references, scenario, runs.dataset is not None),
-            charts.success_latency(rows, rates, windows_ms, IN_WORDS[lead]),
+            charts.success_latency(rows, rates, windows_ms, IN_WORDS[metric]),
         )
     if rows := joined(statuses):
         yield Panel(
@@ -180,19 +180,22 @@ def panels(runs: Runs) -> Iterator[Panel]:
         )
 
 
-def _references(runs: Runs, lead: str) -> dict[str, Score]:
-    """Return what leads of the references: from the trees, in closed loop from their own runs."""
+def _references(runs: Runs, metric: str) -> dict[str, Score]:
+    """Return the headline metric of the references: from the trees, in closed loop from their
+    own runs.
+    """
     if runs.dataset is None:
-        return driven(runs.runs, lead)
+        return driven(runs.runs, metric)
     episodes = {number for run in runs.runs for number in run.grid.episodes}
-    return {name: of[lead] for name, of in in_trees(runs.dataset.of_episodes(episodes)).items()}
+    references = in_trees(runs.dataset.of_episodes(episodes))
+    return {name: scores[metric] for name, scores in references.items()}
 
 
-def success(run: Run, lead: str) -> Table:
-    """Return what leads and latency of each condition, of which both are known."""
+def success(run: Run, metric: str) -> Table:
+    """Return the headline metric and latency of each condition of which both are known."""
     rows = []
     for condition in run.conditions:
-        latency, rate = run.score(condition, LATENCY), run.score(condition, lead)
+        latency, rate = run.score(condition, LATENCY), run.score(condition, metric)
         if latency and rate:
             rows.append(
                 {
@@ -212,26 +215,24 @@ def success(run: Run, lead: str) -> Table:
 
 def statuses(run: Run) -> Table:
     """Return how many answers of each role have which status."""
-    order = {status: n for n, status in enumerate(map(str, Status))}
-    roles = [(role_word(a.role), a) for a in run.answers]
-    count = Counter((role, order.get(a.status, -1), a.status, a.verdict) for role, a in roles)
-    of = Counter(role for role, _ in roles)
-    return [
-        {
-            "role": role,
-            "status": status,
-            "verdict": verdict,
-            "count": n,
-            "share": n / of[role],
-            "n": of[role],
-        }
-        for (role, _, status, verdict), n in sorted(count.items())
-    ]
+    order = {str(status): n for n, status in enumerate(Status)}
+    count = Counter[tuple[str, int, str, str]]()  # by role, the status's place, status and verdict
+    total = Counter[str]()  # by role
+    for answer in run.answers:
+        role = role_word(answer.role)
+        count[role, order.get(answer.status, -1), answer.status, answer.verdict] += 1
+        total[role] += 1
+    rows = []
+    for (role, _, status, verdict), n in sorted(count.items()):
+        share, of_role = n / total[role], total[role]
+        row = {"role": role, "status": status, "verdict": verdict, "count": n}
+        rows.append({**row, "share": share, "n": of_role})
+    return rows
 
 
 def reliability(run: Run) -> Table:
     """Return how often the likeliest action was the one optimal action,
-    by how probable fusion held it.
+    by its probability after fusion.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -265,10 +266,11 @@ def errors(run: Run) -> Table:
 def _shares(
     run: Run, bins: Ints, value: Floats, hits: Floats, name: str
 ) -> Iterator[dict[str, Any]]:
-    conditions, episodes = (
-        run.decisions.codes("condition", run.conditions),
-        run.decisions.whole("episode"),
-    )
+    """Yield the share of hits, each (n,), in each bin of decisions, with the bin's mean value
+    as `name`; bins below 0 are left out.
+    """
+    conditions = run.decisions.codes("condition", run.conditions)
+    episodes = run.decisions.whole("episode")
     for n, condition in enumerate(run.conditions):
         for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
             here = (conditions == n) & (bins == place) & ~np.isnan(hits)
@@ -286,10 +288,10 @@ def _shares(
 
 def entropies(run: Run) -> Table:
     """Return how uncertain the ego's own answers are."""
-    p = [a.intent for a in run.answers if a.role == "ego" and a.intent]
-    if not p:
+    intents = [answer.intent for answer in run.answers if answer.role == "ego" and answer.intent]
+    if not intents:
         return []
-    probabilities = np.array(p, dtype=float)
+    probabilities = np.array(intents, dtype=float)
     nats = -np.sum(probabilities * np.log(np.where(probabilities > 0, probabilities, 1.0)), axis=1)
     return _histogram(nats, ENTROPY_NATS, "entropy_nats")
 
@@ -300,11 +302,10 @@ def tokens(run: Run) -> Table:
     for answer in run.answers:
         if answer.prompt_tokens is not None:
             by_role.setdefault(role_word(answer.role), []).append(answer.prompt_tokens)
-    return [
-        {"role": role, **bar}
-        for role, of in by_role.items()
-        for bar in _histogram(of, TOKENS, "tokens")
-    ]
+    rows = []
+    for role, counts in by_role.items():
+        rows += [{"role": role, **bar} for bar in _histogram(counts, TOKENS, "tokens")]
+    return rows
 
 
 def replies(run: Run) -> Table:
@@ -330,28 +331,27 @@ def replies(run: Run) -> Table:
 
 
 def energies(run: Run) -> Table:
-    """What a decision takes in joules, by who takes it, with the total's interval;
-    where all is known.
+    """Return the joules of a decision, by who takes them, with the total's interval;
+    no condition of which one of them is not known.
     """
     rows = []
     for condition in run.conditions:
-        total, helpers, radio = (
-            run.score(condition, n) for n in ("energy_j", "helpers_j", "radio_mj")
-        )
-        if total and helpers and radio:
-            sent, thought = (radio.value or 0.0) / 1000, helpers.value or 0.0
-            joules = ((total.value or 0.0) - thought - sent, thought, sent)
-            of_total = {
-                "total_j": total.value,
-                "low": total.low,
-                "high": total.high,
-                "n": total.n,
-                "interval": total.interval,
-            }
-            rows += [
-                {"condition": condition, "part": part, "joules": of_part, **of_total}
-                for part, of_part in zip(charts.ENERGIES, joules, strict=True)
-            ]
+        total, helpers = run.score(condition, "energy_j"), run.score(condition, "helpers_j")
+        radio = run.score(condition, "radio_mj")
+        if not (total and helpers and radio):
+            continue
+        of_radio, of_helpers = (radio.value or 0.0) / 1000, helpers.value or 0.0
+        of_ego = (total.value or 0.0) - of_helpers - of_radio
+        of_total = {
+            "total_j": total.value,
+            "low": total.low,
+            "high": total.high,
+            "n": total.n,
+            "interval": total.interval,
+        }
+        parts = zip(charts.ENERGIES, (of_ego, of_helpers, of_radio), strict=True)
+        for part, joules in parts:
+            rows.append({"condition": condition, "part": part, "joules": joules, **of_total})
     return rows
 
 
@@ -359,15 +359,14 @@ def arrivals(run: Run) -> Table:
     """Return when replies that are not lost arrive, in ms from the start of the decision."""
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
-    by_condition = {
-        name: arrival_ms[conditions == place] for place, name in enumerate(run.conditions)
-    }
-    return [
-        {"condition": condition, **bar}
-        for condition, of in by_condition.items()
-        if len(known := of[~np.isnan(of)])
-        for bar in _histogram(known, ARRIVAL_MS, "arrival_ms")
-    ]
+    rows = []
+    for place, condition in enumerate(run.conditions):
+        of_condition = arrival_ms[conditions == place]
+        arrived = of_condition[~np.isnan(of_condition)]
+        if len(arrived):
+            bars = _histogram(arrived, ARRIVAL_MS, "arrival_ms")
+            rows += [{"condition": condition, **bar} for bar in bars]
+    return rows
 
 
 def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Table:
