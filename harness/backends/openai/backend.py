@@ -229,21 +229,21 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
     if one failed or is a refusal, that one.
     """
     retries = sum(completion.retries for completion in completions)
-    if broken := next(
-        (completion for completion in completions if completion.finish_reason != "stop"), None
-    ):
-        return replace(broken, request_id=request.id, retries=retries)
+    for completion in completions:
+        if completion.finish_reason != "stop":
+            return replace(completion, request_id=request.id, retries=retries)
 
     def total(values: Iterable[Any]) -> Any:
+        """Return the sum of some values; None if one is not known."""
         known = list(values)
         return None if None in known else sum(known)
 
-    shares = [json.loads(completion.text)["action_distribution"] for completion in completions]
     # The shares come back as the actions' of the first order: each text names its letters by them.
-    letters_p = [
-        [(completion.label_mass or 1.0) * share[action] for action in request.actions]
-        for completion, share in zip(completions, shares, strict=True)
-    ]
+    letters_p = []
+    for completion in completions:
+        shares = json.loads(completion.text)["action_distribution"]
+        mass = completion.label_mass or 1.0
+        letters_p.append([mass * shares[action] for action in request.actions])
     seconds = total(completion.seconds for completion in completions)
     costs = {"seconds": seconds, "first_token_s": seconds, "retries": retries}
     prompt_tokens = total(completion.prompt_tokens for completion in completions)

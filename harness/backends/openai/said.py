@@ -58,8 +58,10 @@ def _text(part: Mapping[str, Any], kind: str) -> str:
 
 def thought(message: Mapping[str, Any]) -> str | None:
     """Return the thought that a server took out of an answer, from the field that has one."""
-    texts = [text for name in THOUGHTS if isinstance(text := message.get(name), str)]
-    return next(filter(None, texts), texts[0] if texts else None)
+    values = [message.get(name) for name in THOUGHTS]
+    texts = [value for value in values if isinstance(value, str)]
+    written = [text for text in texts if text]
+    return next(iter(written or texts), None)
 
 
 def refusal(message: Mapping[str, Any]) -> str | None:

@@ -170,20 +170,26 @@ def _read_out(
         listed = [(spelt(str(t["token"])), math.exp(float(t["logprob"]))) for t in likeliest]
     except (LookupError, TypeError, ValueError, OverflowError):
         return failed(request, "the server gives no log-probabilities")
-    names, total = letters(request.actions), math.fsum(p for _, p in listed)
-    letter_p = {name: math.fsum(p for token, p in listed if token == name) for name in names}
-    mass = math.fsum(letter_p.values())
+    names = letters(request.actions)
+    total = math.fsum(p for _, p in listed)
     if not 0 < total <= 1.001:
         return failed(request, "the server's log-probabilities are none")
+    parts_of: dict[str, list[float]] = {name: [] for name in names}
+    for token, p in listed:
+        if token in parts_of:
+            parts_of[token].append(p)
+    letter_p = {name: math.fsum(parts) for name, parts in parts_of.items()}
+    mass = math.fsum(letter_p.values())
     if not mass:
         return failed(
             request, f"none of the letters {names} is among the {len(listed)} likeliest tokens"
         )
-    missing = set(names) - {token for token, _ in listed}
-    most_p = min(min(p for _, p in listed), max(0.0, 1.0 - total) / max(1, len(missing)))
-    text = stated(
-        request.actions, [most_p if name in missing else letter_p[name] for name in names]
-    )
+    missing = [name for name, parts in parts_of.items() if not parts]
+    least_listed_p = min(p for _, p in listed)
+    rest_p = max(0.0, 1.0 - total) / max(1, len(missing))
+    for name in missing:
+        letter_p[name] = min(least_listed_p, rest_p)
+    text = stated(request.actions, list(letter_p.values()))
     tokens = prompt_tokens, completion_tokens
     return Completion(request.id, text, *tokens, "stop", None, 1, label_mass=min(1.0, mass))
 

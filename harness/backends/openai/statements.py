@@ -77,13 +77,16 @@ async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Mod
 
     A server with one model accepts any name for it.
     """
-    if (entry := entry_of(models, "data", weights)) is None:
+    entry = entry_of(models, "data", weights)
+    if entry is None:
         return Model()
-    listed = {
-        k: v if type(v) is int and abs(v) <= _EXACT else printable(v)
-        for k in _LISTED
-        if (v := entry.get(k))
-    }
+    listed: dict[str, Fact] = {}
+    for name in _LISTED:
+        value = entry.get(name)
+        if type(value) is int and 0 < abs(value) <= _EXACT:
+            listed[name] = value
+        elif value:
+            listed[name] = printable(value)
     facts = {name: value for name, value in entry.items() if name not in _LISTED}
     version, more = await SERVER_KINDS[kind].states(weights, ask)
     facts |= more
