@@ -18,7 +18,6 @@ from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -83,6 +82,7 @@ _TABLE = (
     "CREATE TABLE IF NOT EXISTS completions (key TEXT PRIMARY KEY, answer TEXT NOT NULL) WITHOUT "
     "ROWID"
 )
+_HAS_CODE = "SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')"
 
 
 def default_file() -> Path:
@@ -135,10 +135,11 @@ class CompletionFile:
 
     def add(self, completions: Mapping[str, Completion]) -> None:
         """Store completions by key; a stored one is not replaced."""
-        # JSON in ASCII: a completion may hold a lone surrogate, which cannot be written as UTF-8.
-        rows = [
-            (key, json.dumps({k: getattr(c, k) for k in _KEPT})) for key, c in completions.items()
-        ]
+        rows = []
+        for place, completion in completions.items():
+            answer = {name: getattr(completion, name) for name in _KEPT}
+            # in ASCII: a completion may hold a lone surrogate, which cannot be written as UTF-8
+            rows.append((place, json.dumps(answer)))
         with self._open() as file:
             file.execute("BEGIN IMMEDIATE")
             file.executemany("INSERT OR IGNORE INTO completions VALUES (?, ?)", rows)
@@ -146,14 +147,13 @@ class CompletionFile:
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
+        """Open the file, and make it if there is none."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with closing(sqlite3.connect(self.path, timeout=_WAIT_S, isolation_level=None)) as file:
             file.execute("PRAGMA journal_mode = WAL")
             file.execute("PRAGMA synchronous = NORMAL")
             file.execute(_TABLE)
-            if file.execute(
-                "SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')"
-            ).fetchone():
+            if file.execute(_HAS_CODE).fetchone():
                 raise sqlite3.DatabaseError("it has a view or a trigger, which may never end")
             yield file
 
@@ -194,16 +194,16 @@ def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
     fits. Then answers of all patterns of today are taken, and of no others: another day's said
     nothing of these servers.
     """
-    listed = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
-    fitting = {
-        server: next((p for p in listed if fnmatchcase(server, p)), None) for server in servers
-    }
-    same = {
-        server: f"same as {pattern}" for server, pattern in fitting.items() if pattern is not None
-    }
-    if servers and len(same) == len(fitting):
-        return same, [f"same as {pattern}" for pattern in listed]
-    return {server: server for server in servers}, servers
+    patterns = [pattern.strip() for pattern in os.environ.get(SAME, "").split(",")]
+    same: dict[str, str] = {}
+    for server in servers:
+        fitting = [pattern for pattern in patterns if fnmatchcase(server, pattern)]
+        if not fitting:
+            return {each: each for each in servers}, servers
+        same[server] = f"same as {fitting[0]}"
+    if not servers:
+        return {}, servers
+    return same, [f"same as {pattern}" for pattern in patterns]
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
@@ -235,20 +235,23 @@ class Cached:
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         prompts = self.backend.rendered(requests)
         keys = [self._keys(prompt, r) for prompt, r in zip(prompts, requests, strict=True)]
-        wanted = list(chain.from_iterable(each.values() for each in keys))
-        known = self._try(lambda file: file.find(wanted)) or {}
+        every = [key for by_source in keys for key in by_source.values()]
+        known = self._try(lambda file: file.find(every)) or {}
         if known and self._doubt:
             _say_once(f"harness: {self._doubt}", digest(self._identity))
-        stored = [next((known[k] for k in each.values() if k in known), None) for each in keys]
-        missing = [r for r, there in zip(requests, stored, strict=True) if there is None]
+        stored: list[Completion | None] = []
+        for by_source in keys:
+            matches = [known[key] for key in by_source.values() if key in known]
+            stored.append(matches[0] if matches else None)
+        missing = [r for r, match in zip(requests, stored, strict=True) if match is None]
         answers = iter(self.backend.complete(missing) if missing else [])
         completions, new = list[Completion](), dict[str, Completion]()
-        for request, of_request, there in zip(requests, keys, stored, strict=True):
-            completion = next(answers) if there is None else replace(there, request_id=request.id)
+        for request, by_source, match in zip(requests, keys, stored, strict=True):
+            completion = next(answers) if match is None else replace(match, request_id=request.id)
             completions.append(completion)
             source = self._sources.get(completion.server or "")
-            if source in of_request and completion.error is None and not completion.cached:
-                new[of_request[source]] = completion
+            if source in by_source and completion.error is None and not completion.cached:
+                new[by_source[source]] = completion
         if new:
             self._try(lambda file: file.add(new))
         return completions

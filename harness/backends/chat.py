@@ -82,7 +82,8 @@ class HubTokenizer:
 
     def candidates(self, letters: str) -> Sequence[int]:
         short = [(text, i) for text, i in self.hub.get_vocab().items() if len(text) <= _LONGEST]
-        return [i for text, i in short if text.startswith("<0x") or any(x in text for x in letters)]
+        wanted = set(letters)
+        return [i for text, i in short if text.startswith("<0x") or not wanted.isdisjoint(text)]
 
     def _text(self, ids: Sequence[int], skip_special_tokens: bool) -> str:
         options = {
@@ -107,17 +108,13 @@ class Chat:
         image_token: str | None = None,
         system: str | None = None,
     ) -> None:
-        self.name, self.tokenizer, self.image_token, self.system = (
-            name,
-            tokenizer,
-            image_token,
-            system,
-        )
-        self.template, self.bos, self.vocabulary = (
-            tokenizer.template,
-            tokenizer.bos,
-            tokenizer.vocabulary,
-        )
+        self.name = name
+        self.tokenizer = tokenizer
+        self.image_token = image_token
+        self.system = system
+        self.template = tokenizer.template
+        self.bos = tokenizer.bos
+        self.vocabulary = tokenizer.vocabulary
         self.encode, self.decode, self.pieces = tokenizer.encode, tokenizer.decode, tokenizer.pieces
         self._compiled = ChatTemplate(name, self.template)
 

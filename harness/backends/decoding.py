@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -37,11 +38,12 @@ class Choice:
         self.first_at_s: float | None = None
         # calls of `next`: the number of chosen tokens of an answer that is asked alone
         self.rounds = 0
-        self._drawn = {
-            place: (request.temperature, noise.generator("answer", tuple(ids), request.sample))
-            for place, (request, ids) in enumerate(zip(requests, prompts, strict=True))
-            if request.temperature
-        }
+        # temperature and generator of each request whose answer is drawn, by its place
+        self._drawn: dict[int, tuple[float, np.random.Generator]] = {}
+        for place, (request, ids) in enumerate(zip(requests, prompts, strict=True)):
+            if request.temperature:
+                generator = noise.generator("answer", tuple(ids), request.sample)
+                self._drawn[place] = request.temperature, generator
         self.draws = bool(self._drawn)  # whether any token is drawn and not just the likeliest
 
     def next(
@@ -113,6 +115,7 @@ class Decoding:
     def _free(
         self, session: Session, requests: Sequence[Request], choice: Choice
     ) -> list[Completion]:
+        """Return answers that the model writes freely."""
         written: list[list[int]] = [[] for _ in requests]
         # An answer that is asked alone is timed, token by token.
         drafts = self._drafts(requests) if len(requests) > 1 and not choice.draws else None
@@ -152,11 +155,11 @@ class Decoding:
         guesses = []
         for request, tokens in written.values():
             drafts.learn(request.shape, tokens)
-            guesses.append(
-                drafts.after(request.shape, tokens, request.max_tokens - len(tokens) - 1)
-            )
+            most = request.max_tokens - len(tokens) - 1
+            guesses.append(drafts.after(request.shape, tokens, most))
         # no wider than half of the answers fill
-        width = sorted(map(len, guesses))[len(guesses) // 2]
+        widths = sorted(len(guess) for guess in guesses)
+        width = widths[len(widths) // 2]
         guesses = [guess[:width] for guess in guesses]
         counts = session.follow([tokens[-1:] for _, tokens in written.values()], guesses)
         for (_, tokens), guess, count in zip(written.values(), guesses, counts, strict=True):
@@ -168,6 +171,7 @@ class Decoding:
     def _constrained(
         self, session: Session, requests: Sequence[Request], choice: Choice
     ) -> list[Completion]:
+        """Return answers that fill in the skeletons of what is asked for."""
         walks = [self._skeleton(request).walk() for request in requests]
         asks = [next(walk) for walk in walks]
         done: dict[int, Filled] = {}
@@ -184,6 +188,7 @@ class Decoding:
         return [_completion(r, *done[i], len(requests)) for i, r in enumerate(requests)]
 
     def _skeleton(self, request: Request) -> Skeleton:
+        """Return the skeleton of an answer. Raises UserError if it may need too many tokens."""
         shape = request.shape
         if shape not in self._skeletons:
             self._skeletons[shape] = Skeleton(self._chat, shape)
@@ -199,25 +204,30 @@ class Decoding:
     def _read_out(
         self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]
     ) -> list[Completion]:
+        """Return the probabilities of each request's letters, each order read by itself."""
         # Requests may have different numbers of actions: each column stands for one letter's token.
         spellings = {r.actions: self._letter_tokens(r.actions) for r in requests}
-        tokens = sorted({t for per_letter in spellings.values() for own in per_letter for t in own})
-        column = {token: j for j, token in enumerate(tokens)}
+        of_letters = chain.from_iterable(spellings.values())
+        tokens = sorted(set(chain.from_iterable(of_letters)))
+        column_of = {token: column for column, token in enumerate(tokens)}
         if len(orders[0]) == 1:
             with closing(self._engine.begin([prompt for [prompt] in orders], tokens)) as session:
                 readings = session.log_probs(tokens)[:, None]
         else:  # what all orders of a question begin with is read once, and then the rest of each
-            shared = [common_length(each) for each in orders]
-            heads = [each[0][:length] for each, length in zip(orders, shared, strict=True)]
-            rests = [
-                [ids[length:] for ids in each] for each, length in zip(orders, shared, strict=True)
-            ]
+            heads, rests = list[list[int]](), list[list[list[int]]]()
+            for prompts in orders:
+                length = common_length(prompts)
+                heads.append(prompts[0][:length])
+                rests.append([ids[length:] for ids in prompts])
             with closing(self._engine.begin(heads, tokens)) as session:
                 readings = session.ends(rests, tokens)
         completions = []
         for request, rows in zip(requests, readings, strict=True):
-            columns = [[column[token] for token in own] for own in spellings[request.actions]]
-            log_p = [[row[own].tolist() for own in columns] for row in rows]
+            log_p: list[list[list[float]]] = [[] for _ in rows]
+            for spelling in spellings[request.actions]:
+                columns = [column_of[token] for token in spelling]
+                for of_order, row in zip(log_p, rows, strict=True):
+                    of_order.append(row[columns].tolist())
             completions.append(_completion_of_letters(request, len(requests), log_p))
         return completions
 
@@ -225,20 +235,20 @@ class Decoding:
         """Return the tokens of each letter, in all its spellings:
         with a blank before it, and without.
         """
-        if (names := letters(actions)) not in self._letters:
+        names = letters(actions)
+        if names not in self._letters:
             encodings = [tokens_after(self._chat, "\n", letter) for letter in names]
-            if any(len(tokens) != 1 for tokens in encodings) or len(set(encodings)) < len(
-                encodings
-            ):
+            single = all(len(tokens) == 1 for tokens in encodings)
+            if not single or len(set(encodings)) < len(encodings):
                 raise UserError(
                     f"{self._chat.shown}: its tokenizer has no single token for each of "
                     f"the letters {names}; use --answer json"
                 )
-            known = self._chat.spellings(names)
-            self._letters[names] = [
-                sorted({token, *known[letter]})
-                for (token,), letter in zip(encodings, names, strict=True)
-            ]
+            spellings = self._chat.spellings(names)
+            tokens_of_letters = []
+            for (token,), letter in zip(encodings, names, strict=True):
+                tokens_of_letters.append(sorted({token, *spellings[letter]}))
+            self._letters[names] = tokens_of_letters
         return self._letters[names]
 
 
@@ -258,13 +268,22 @@ def _completion_of_letters(
 ) -> Completion:
     """Return a read-out, from the log-probabilities of each letter's tokens in each order."""
     if len(log_p) > 1:
-        p = [[math.fsum(map(math.exp, own)) for own in letters_log_p] for letters_log_p in log_p]
+        p = [_letter_weights(of_letters) for of_letters in log_p]
         average = asdict(average_orders(request.actions, p))
         return _completion(request, tokens=1, batch_size=batch_size, **average)
-    largest = max(map(max, log_p[0]))
-    weights = [math.fsum(math.exp(x - largest) for x in own) for own in log_p[0]]
+    [of_letters] = log_p
+    largest = max(max(of_tokens) for of_tokens in of_letters)
+    weights = _letter_weights(of_letters, largest)
     mass = min(1.0, math.exp(largest) * sum(weights))
     return _completion(request, stated(request.actions, weights), 1, batch_size, label_mass=mass)
+
+
+def _letter_weights(log_p: Sequence[Sequence[float]], scale_log_p: float = 0.0) -> list[float]:
+    """Return the probability of each letter, the sum over its tokens, divided by a scale."""
+    weights = []
+    for of_tokens in log_p:
+        weights.append(math.fsum(math.exp(value - scale_log_p) for value in of_tokens))
+    return weights
 
 
 def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[int]:

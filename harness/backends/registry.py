@@ -139,7 +139,8 @@ def registration(engine: str) -> Registration:
     """Return the registration of an engine.
     Raises UserError if there is none, or a plug-in fails.
     """
-    if (entry := ENGINES.get(engine)) is None:
+    entry = ENGINES.get(engine)
+    if entry is None:
         raise unknown("engine", engine, ENGINES)
     return entry
 
@@ -151,7 +152,8 @@ def capabilities(engine: str) -> Capabilities:
 
 def reads_prompts(engine: str) -> bool:
     """Return whether an engine's models read prompts; one that is unknown here may."""
-    return (known := ENGINES.get(engine)) is None or known.capabilities.language_model
+    entry = ENGINES.get(engine)
+    return entry is None or entry.capabilities.language_model
 
 
 def open_backend(

@@ -124,19 +124,20 @@ def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
+    """Raise UserError unless llama.cpp would read the same tokens by a GGUF file's tokenizer."""
     model, pre = tokenizer["model"], tokenizer["pre_tokenizer"] or {}
-    steps = [
-        {key: step.get(key) for key in wanted}
-        for step, wanted in zip(pre.get("pretokenizers", ()), (_SPLIT, _BYTES), strict=False)
-    ]
+    steps = pre.get("pretokenizers", ())
+    known_parts = []
+    for step, known in zip(steps, (_SPLIT, _BYTES), strict=False):
+        known_parts.append({key: step.get(key) for key in known})
     odd = [
-        t["content"]
-        for t in tokenizer["added_tokens"]
-        if t["lstrip"] or t["rstrip"] or t["single_word"]
+        token["content"]
+        for token in tokenizer["added_tokens"]
+        if token["lstrip"] or token["rstrip"] or token["single_word"]
     ]
     if model["type"] != "BPE" or model.get("ignore_merges") or model.get("byte_fallback"):
         what = "is no plain BPE"
-    elif steps != [_SPLIT, _BYTES] or len(pre["pretokenizers"]) != len(steps):
+    elif known_parts != [_SPLIT, _BYTES] or len(steps) != 2:
         what = "splits text otherwise than Qwen2's"
     elif tokenizer["normalizer"] not in _NORMALIZERS:
         what = "normalises text otherwise than Qwen2's"

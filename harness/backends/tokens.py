@@ -29,6 +29,7 @@ _SPLITS: Mapping[str, tuple[str, ...]] = {
     "llama-bpe": (QWEN2_SPLIT.replace(r"|\p{N}|", r"|\p{N}{1,3}|"),),
 }
 _WHOLE_FIRST = ("llama-bpe",)  # a piece that is a token is not merged out of its bytes
+_CONTROL, _USER_DEFINED = 3, 4  # types of a GGUF file's tokens
 
 
 @lru_cache(maxsize=4)
@@ -83,19 +84,19 @@ def _from_gguf(file: Path) -> Any:
     if values["tokenizer.ggml.model"] != "gpt2" or pre not in _SPLITS:
         return _converted(file, values["tokenizer.ggml.model"], pre)
     vocabulary = values["tokenizer.ggml.tokens"]
-    merges = [
-        (left, right) for left, right in (p.split(" ") for p in values["tokenizer.ggml.merges"])
-    ]
-    model = models.BPE(
-        vocab={t: i for i, t in enumerate(vocabulary)},
-        merges=merges,
-        ignore_merges=pre in _WHOLE_FIRST,
-    )
+    merges = []
+    for pair in values["tokenizer.ggml.merges"]:
+        left, right = pair.split(" ")
+        merges.append((left, right))
+    number_of = {text: number for number, text in enumerate(vocabulary)}
+    model = models.BPE(vocab=number_of, merges=merges, ignore_merges=pre in _WHOLE_FIRST)
     built = byte_level(model, _SPLITS[pre])
-    # Control tokens, and user-defined tokens that are never split, such as `<think>`.
     types = values["tokenizer.ggml.token_type"]
-    added = [(t, k) for t, k in zip(vocabulary, types, strict=True) if k in (3, 4)]
-    built.add_tokens([AddedToken(t, special=k == 3, normalized=False) for t, k in added])
+    added = []
+    for text, kind in zip(vocabulary, types, strict=True):
+        if kind in (_CONTROL, _USER_DEFINED):  # those are never split, such as `<think>`
+            added.append(AddedToken(text, special=kind == _CONTROL, normalized=False))
+    built.add_tokens(added)
     return built
 
 

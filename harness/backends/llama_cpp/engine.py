@@ -182,7 +182,7 @@ class LlamaEngine:
         llama.cpp's build, and the file by hub commit or by content.
         """
         commit = hub_commit(self._file.parent)
-        return {
+        identity: dict[str, Any] = {
             "engine": "llama-cpp",
             "answers": BUILT_IN["llama-cpp"].answers,
             # Its version and the features of the CPU move an answer's last digits.
@@ -197,13 +197,12 @@ class LlamaEngine:
             "kv_cache": self.context.cache_type,
             "device": self._model.device,
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
-            **({"system": self.chat.system} if self.chat.system else {}),
-            **(
-                {"adapter_sha256": sha256_file(self._model.adapter_file)}
-                if self._model.adapter_file
-                else {}
-            ),
         }
+        if self.chat.system:
+            identity["system"] = self.chat.system
+        if self._model.adapter_file:
+            identity["adapter_sha256"] = sha256_file(self._model.adapter_file)
+        return identity
 
     @cached_property
     def _sha256(self) -> str:

@@ -208,7 +208,7 @@ class TransformersEngine:
         a hub checkpoint is named by its commit, others by their files.
         """
         commit = hub_commit(self.where)
-        return {
+        identity: dict[str, Any] = {
             "engine": "transformers",
             "answers": BUILT_IN["transformers"].answers,
             "transformers": version("transformers"),
@@ -219,10 +219,14 @@ class TransformersEngine:
             "dtype": str(self.model.dtype).removeprefix("torch."),
             "device": str(self.model.device),
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
-            **({"gguf_sha256": self._gguf_sha256} if is_gguf(self.card) else {}),
-            **({"adapter_sha256": sha256_file(self.adapter / TENSORS)} if self.adapter else {}),
-            **({"system": self.chat.system} if self.chat.system else {}),
         }
+        if is_gguf(self.card):
+            identity["gguf_sha256"] = self._gguf_sha256
+        if self.adapter:
+            identity["adapter_sha256"] = sha256_file(self.adapter / TENSORS)
+        if self.chat.system:
+            identity["system"] = self.chat.system
+        return identity
 
     @cached_property
     def _files_sha256(self) -> str:

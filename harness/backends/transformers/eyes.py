@@ -132,23 +132,25 @@ class Eyes:
         ids = torch.tensor([list(prompt)])
         images = [self._pictures.image(number) for number in pictures_in(prompt)]
         grids = [self._processor.measured(image.pixels)[1] for image in images]
-        filled, grid = torch.where(ids < 0, self._filled, ids), torch.cat(grids) if grids else None
+        filled = torch.where(ids < 0, self._filled, ids)
+        grid = torch.cat(grids) if grids else None
         types = (ids < 0).int()
-        place, _ = self._model.model.get_rope_index(
+        positions: torch.Tensor
+        positions, _ = self._model.model.get_rope_index(
             filled, mm_token_type_ids=types, image_grid_thw=grid
         )
-        positions: torch.Tensor = place[:, 0]
-        return positions
+        return positions[:, 0]
 
     def _encode(self, images: list[Image]) -> list[list[torch.Tensor]]:
         """Return each layer's inputs for some pictures."""
-        inputs = self._processor([image.pixels for image in images])
-        features = self._model.model.get_image_features(
-            **{name: value.to(self._model.device) for name, value in inputs.items()},
-            return_dict=True,
-        )
+        processed = self._processor([image.pixels for image in images])
+        inputs = {name: value.to(self._model.device) for name, value in processed.items()}
+        features = self._model.model.get_image_features(**inputs, return_dict=True)
         layers = [features.pooler_output, *getattr(features, "deepstack_features", ())]
-        return [[layer[i] for layer in layers] for i in range(len(images))]
+        inputs_of_images = []
+        for number in range(len(images)):
+            inputs_of_images.append([layer[number] for layer in layers])
+        return inputs_of_images
 
 
 def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
@@ -157,9 +159,8 @@ def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
     """
     if not written:
         return [], []
-    around, whole = map(
-        tokenizer.convert_tokens_to_ids, ("<fake_token_around_image>", "<global-img>")
-    )
+    around = tokenizer.convert_tokens_to_ids("<fake_token_around_image>")
+    whole = tokenizer.convert_tokens_to_ids("<global-img>")
     return [around, whole], [around]
 
 
