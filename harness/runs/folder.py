@@ -274,21 +274,24 @@ def read(path: Path) -> Run:
     """
     file = path / "run.json"
     if not file.is_file():
-        raise UserError(
-            f"{printable(path)} is a suite; give the folder of one of its runs"
-            if (path / SUITE).is_file()
-            else f"{printable(path)} is no finished run, since its model could not be asked: "
-            f"{reason}"
-            if (reason := work.unanswered(path))
-            else f"{printable(path)} is a file; a run is a folder, made by `harness eval` or "
-            "`harness drive`"
-            if path.is_file()
-            else f"{printable(path)} is no finished run: it has no run.json; "
-            "give a folder made by `harness eval` or `harness drive`"
-        )
+        raise UserError(f"{printable(path)} is {_other_than_run(path)}")
     stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
     formats.checked(stated.get("format") if isinstance(stated, dict) else None, file)
     return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(stated), Manifest)))
+
+
+def _other_than_run(path: Path) -> str:
+    """Return what a path without a run's record is, and what to give instead."""
+    if (path / SUITE).is_file():
+        return "a suite; give the folder of one of its runs"
+    if reason := work.unanswered(path):
+        return f"no finished run, since its model could not be asked: {reason}"
+    if path.is_file():
+        return "a file; a run is a folder, made by `harness eval` or `harness drive`"
+    return (
+        "no finished run: it has no run.json; "
+        "give a folder made by `harness eval` or `harness drive`"
+    )
 
 
 def most_rows(episodes: Sequence[Episode]) -> int:

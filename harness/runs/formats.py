@@ -143,22 +143,24 @@ ANSWER: Mapping[str, Added] = {
 COLUMNS: Mapping[str, Added] = {
     "trust": Added("2026-11-23", None, "rules that judge helpers"),
     "attacker": Added("2026-11-23", None, "attacks"),
-    **dict.fromkeys(("inference_j", "helpers_j", "radio_mj", "waiting_j"),
-                    Added("2026-11-23", None, "energy; also missing without a device profile")),
-    "busy_ratio": Added("2026-11-23", None, 
-        "load of the channel; also "
-        "missing where it is not known"),
-    **dict.fromkeys(("miss", "false_alarm"),
-                    Added("2026-11-27", None, 
-                        "misses and false alarms; also "
-                        "missing in closed loop")),
-    **dict.fromkeys(("ttc_s", "pet_s", "short_ttc", "short_pet"),
-                    Added("2026-11-27", None, 
-                        "conflicts in time; also missing "
-                        "on trees of older datasets")),
+    **dict.fromkeys(
+        ("inference_j", "helpers_j", "radio_mj", "waiting_j"),
+        Added("2026-11-23", None, "energy; also missing without a device profile"),
+    ),
+    "busy_ratio": Added(
+        "2026-11-23", None, "load of the channel; also missing where it is not known"
+    ),
+    **dict.fromkeys(
+        ("miss", "false_alarm"),
+        Added("2026-11-27", None, "misses and false alarms; also missing in closed loop"),
+    ),
+    **dict.fromkeys(
+        ("ttc_s", "pet_s", "short_ttc", "short_pet"),
+        Added("2026-11-27", None, "conflicts in time; also missing on trees of older datasets"),
+    ),
     "agent": Added("2026-11-27", None, "swarms; also missing where only egos decide"),
     "broke_word": Added("2026-11-27", None, "plans; also missing where none is sent"),
-}  # fmt: skip
+}
 # Columns of episodes.csv; `records.Episode` has the same defaults.
 EPISODE: Mapping[str, Added] = {
     **dict.fromkeys(

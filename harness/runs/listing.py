@@ -70,6 +70,7 @@ def runs(folder: Path) -> list[Listed]:
 
 
 def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
+    """Yield what is in a folder and, down to `DEPTH`, in those below it."""
     try:
         entry = _entry(path, root)
         names = sorted(os.listdir(path)) if os.access(path, os.R_OK | os.X_OK) else []
@@ -79,19 +80,18 @@ def _entries(path: str, root: str, depth: int) -> Iterator[Listed]:
         yield replace(entry, name=os.path.relpath(path, root))
     if depth < DEPTH:
         for name in names:
+            if name.startswith(".") or name == SOURCES:
+                continue
             subfolder = os.path.join(path, name)
-            if (
-                not name.startswith(".")
-                and name != SOURCES
-                and os.path.isdir(subfolder)
-                and _within(subfolder, root)
-            ):
+            if os.path.isdir(subfolder) and _within(subfolder, root):
                 yield from _entries(subfolder, root, depth + 1)
 
 
 def _marks() -> dict[str, str]:
     """Return what lists call a study, by the file that marks its folder."""
-    return {**{f"{kind}.json": word for kind, word in studies().items()}, "fidelity.csv": "study"}
+    marks = {f"{kind}.json": word for kind, word in studies().items()}
+    marks["fidelity.csv"] = "study"
+    return marks
 
 
 def _within(path: str, root: str) -> bool:
@@ -112,9 +112,8 @@ def _entry(path: str, root: str) -> Listed | None:
         try:
             config = _json(path, WORK, CONFIG)
             kind = KINDS[config["settings"]["world"]["kind"]]
-            entry = Listed(
-                "", kind, "unfinished", _date(config["created"]), "the same command continues it"
-            )
+            created, advice = _date(config["created"]), "the same command continues it"
+            entry = Listed("", kind, "unfinished", created, advice)
             return _with_config(entry, {**config["settings"], "tags": config["tags"]})
         except _BROKEN:
             return Listed("", "run", "broken", written, f"{WORK}/{CONFIG}")
@@ -122,33 +121,39 @@ def _entry(path: str, root: str) -> Listed | None:
         return _suite_entry(path, root, has("summary.csv"), written)
     for name, kind in _marks().items():
         if has(name):
-            written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
-            try:
-                sources = _json(path, name).get("sources", ()) if kind != "study" else ()
-                model = ", ".join(str(source["name"]) for source in sources if "name" in source)
-                return Listed("", kind, "finished", written, model=model or None)
-            except _BROKEN:
-                return Listed("", kind, "broken", written, name)
+            return _other_entry(path, name, kind)
     if has("answers.jsonl") or has("summary.csv"):  # the manifest is written last
         return Listed("", "run", "broken", written, "run.json")
     return None
 
 
+def _other_entry(path: str, name: str, kind: str) -> Listed:
+    """Return the entry of a study, a comparison or the like, whose record is the file `name`."""
+    written = datetime.fromtimestamp(os.stat(os.path.join(path, name)).st_mtime, UTC)
+    try:
+        sources = _json(path, name).get("sources", ()) if kind != "study" else ()
+        model = ", ".join(str(source["name"]) for source in sources if "name" in source)
+    except _BROKEN:
+        return Listed("", kind, "broken", written, name)
+    return Listed("", kind, "finished", written, model=model or None)
+
+
 def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
+    """Return the entry of a run that has a record, which may be broken."""
     listed = Listed("", "run", "broken", written, "run.json")
     try:
         config = _json(path, "run.json")
         if config["format"] in formats.READ_BY:
-            return replace(
-                listed, why=f"run.json: format of harness {formats.READ_BY[config['format']]}"
-            )
+            reader = formats.READ_BY[config["format"]]
+            return replace(listed, why=f"run.json: format of harness {reader}")
         if config["format"] != formats.FORMAT:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
         listed = replace(_with_config(listed, config), why="summary.csv")
-        return (
-            _with_success(listed, rows := _rows(path), [(config, rows)]) if has_summary else listed
-        )
+        if not has_summary:
+            return listed
+        rows = _rows(path)
+        return _with_success(listed, rows, [(config, rows)])
     except _BROKEN:
         return listed
 
@@ -191,12 +196,13 @@ def _rows(path: str) -> Rows:
         TextIOWrapper(data, "utf-8-sig") as file,
     ):
         markers = [f",{metric}," for metric in (BALANCED, SUCCESS, FAILED, OFF_LAG)]
-        head, *lines = [
-            line
-            for n, line in enumerate(file)
-            if n == 0 or any(metric in line for metric in markers)
-        ]
-    return list(csv.DictReader([head, *lines]))
+        lines: list[str] = []
+        for line in file:
+            if not lines or any(marker in line for marker in markers):
+                lines.append(line)
+    if not lines:
+        raise ValueError("summary.csv is empty")
+    return list(csv.DictReader(lines))
 
 
 def _means(summaries: Sequence[Rows]) -> Rows:
@@ -210,14 +216,17 @@ def _means(summaries: Sequence[Rows]) -> Rows:
         by_key.append({key_of(row): row for row in summary})
     shared = set(by_key[0]).intersection(*by_key[1:])
     means = list[dict[str, str]]()
-    for key in (key for key in by_key[0] if key in shared):
+    for key in by_key[0]:
+        if key not in shared:
+            continue
         of_families = list[Estimate]()
         for rows in by_key:
             value, low, high = (float(rows[key][end] or "nan") for end in ends)
             of_families.append(Estimate(value, low, high, 0, 0))
         mean = mean_of(of_families)
-        numbers = map(repr, (mean.value, mean.low, mean.high))
-        means.append(dict(zip((*keys, *ends), (*key, *numbers), strict=True)))
+        row = dict(zip(keys, key, strict=True))
+        row |= {"value": repr(mean.value), "ci_low": repr(mean.low), "ci_high": repr(mean.high)}
+        means.append(row)
     return means
 
 
@@ -230,24 +239,22 @@ def _with_success(
     metric = leading({row["metric"] for row in rows})
     kinds = {row["interval"] for row in rows if row["metric"] == metric}
     kind = ANY_TIME if ANY_TIME in kinds else "episodes"
-    leads = [row for row in rows if (row["metric"], row["interval"]) == (metric, kind)]
+    of_metric = [row for row in rows if (row["metric"], row["interval"]) == (metric, kind)]
     radios = {c["name"] for c in runs[0][0]["conditions"] if c.get("profile") is not None}
-    warned = {name for run in runs for name in _doubted(*run)}
-    best = best_of(
-        {row["condition"]: _number(row["value"]) or 0.0 for row in leads}, radios, warned
-    )
-    [lead] = [row for row in leads if row["condition"] == best]
-    value, low, high = (_share(lead[key]) for key in ("value", "ci_low", "ci_high"))
-    unread = next((_number(row["value"]) for row in rows if row["metric"] == FAILED), None)
+    warned = {name for config, summary in runs for name in _doubted(config, summary)}
+    success = {row["condition"]: _number(row["value"]) or 0.0 for row in of_metric}
+    best = best_of(success, radios, warned)
+    [best_row] = [row for row in of_metric if row["condition"] == best]
+    unread = [_number(row["value"]) for row in rows if row["metric"] == FAILED]
     return replace(
         listed,
         state="finished",
         why=None,
         condition=best,
-        success=value,
-        low=low,
-        high=high,
-        unread=unread,
+        success=_share(best_row["value"]),
+        low=_share(best_row["ci_low"]),
+        high=_share(best_row["ci_high"]),
+        unread=unread[0] if unread else None,
         metric=metric,
     )
 
@@ -261,14 +268,14 @@ def _doubted(config: dict[str, Any], rows: Rows) -> set[str]:
 
 
 def _with_config(entry: Listed, config: dict[str, Any]) -> Listed:
+    """Return an entry with the models, the prompt, the answer mode and the tags of a record."""
+    agents = [config, *config.get("helpers", ())]
     return replace(
         entry,
-        model=" + ".join(
-            str(agent["model"]["name"]) for agent in (config, *config.get("helpers", ()))
-        ),
+        model=" + ".join(str(agent["model"]["name"]) for agent in agents),
         prompt=str(config["prompt"]["version"]),
         answer=str(config["answer"]),
-        tags=tuple(map(str, config["tags"])),
+        tags=tuple(str(tag) for tag in config["tags"]),
     )
 
 

@@ -525,16 +525,18 @@ def deciding(settings: Settings) -> Settings:
     """Return settings without those that may differ in one run;
     whoever goes on with it says them.
     """
-    free = {
-        each.name: each.default for each in options(type(settings.world)) if each.same == NOTHING
-    }
+    declared = options(type(settings.world))
+    free = {option.name: option.default for option in declared if option.same == NOTHING}
     return structs.replace(settings, **free)
 
 
 def words(settings: Settings) -> tuple[str, ...]:
     """Return the words of a command with these settings, without `--out`; defaults are left out."""
-    stated = ((each, each.of(settings)) for each in options(type(settings.world)))
-    typed = [word for each, value in stated if value != each.default for word in each.words(value)]
+    typed: list[str] = []
+    for option in options(type(settings.world)):
+        value = option.of(settings)
+        if value != option.default:
+            typed += option.words(value)
     return ("harness", COMMANDS[kind_of(settings)], *typed)
 
 
@@ -545,16 +547,13 @@ def difference(before: Settings, now: Settings) -> tuple[str, str]:
     """
     if type(before.world) is not type(now.world):
         return "", ""
-    differing = [
-        each
-        for each in options(type(now.world))
-        if each.of(before) != each.of(now) and each.same != NOTHING
-    ]
-    typed = (
-        " ".join(" ".join(each.words(each.of(settings))) or f"no {each.flag}" for each in differing)
-        for settings in (before, now)
-    )
-    return next(typed), next(typed)
+    typed_before, typed_now = list[str](), list[str]()
+    for option in options(type(now.world)):
+        old, new = option.of(before), option.of(now)
+        if old != new and option.same != NOTHING:
+            typed_before.append(" ".join(option.words(old)) or f"no {option.flag}")
+            typed_now.append(" ".join(option.words(new)) or f"no {option.flag}")
+    return " ".join(typed_before), " ".join(typed_now)
 
 
 def of_words(typed: Sequence[str]) -> Settings:
@@ -565,13 +564,13 @@ def of_words(typed: Sequence[str]) -> Settings:
         given: dict[str, Any] = {}
         rest = iter(typed[2:])
         for flag in rest:
-            each = flags[flag]
-            if each.kind is bool:
-                given[each.name] = flag == each.flag
-            elif each.kind == list[str]:
-                given[each.name] = [*given.get(each.name, ()), next(rest)]
+            option = flags[flag]
+            if option.kind is bool:
+                given[option.name] = flag == option.flag
+            elif option.kind == list[str]:
+                given[option.name] = [*given.get(option.name, ()), next(rest)]
             else:
-                given[each.name] = each.kind(next(rest))
+                given[option.name] = option.kind(next(rest))
     except (IndexError, KeyError, StopIteration, ValueError):
         raise UserError(f"{printable(' '.join(typed))} is no command of a run") from None
     return changed(Settings(world=WORLDS[kind]()), given)
@@ -590,12 +589,15 @@ def text_of(settings: Settings) -> str:
         "world": [f"kind = {_toml(kind_of(settings))}"],
         EXTENSIONS: [],
     }
-    for each in options(type(settings.world)):
-        if (value := each.of(settings)) not in (None, ()):
-            *table, key = each.path
+    for option in options(type(settings.world)):
+        value = option.of(settings)
+        if value not in (None, ()):
+            *table, key = option.path
             tables["".join(table)].append(f"{key} = {_toml(value)}")
     for name, rows in tables.items():
-        lines += ([f"\n[{name}]"] if name and rows else []) + rows
+        if name and rows:
+            lines.append(f"\n[{name}]")
+        lines += rows
     return "\n".join(lines) + "\n"
 
 
