@@ -186,7 +186,8 @@ class Agent:
         """
 
         def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
-            return [*map(chat, readout.cyclic(listed) if self.letters == "cyclic" else [listed])]
+            orders = readout.cyclic(listed) if self.letters == "cyclic" else [listed]
+            return [chat(order) for order in orders]
 
         messages, *further = each(actions)
         chats: dict[str, Any] = {"messages": messages}
@@ -225,7 +226,10 @@ def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[st
     """Return a prompt's chat in an image mode; `none` removes the picture."""
     if image != "none":
         return tuple(messages)
-    return tuple({key: text for key, text in m.items() if key != "image"} for m in messages)
+    without = []
+    for message in messages:
+        without.append({key: text for key, text in message.items() if key != "image"})
+    return tuple(without)
 
 
 def in_mode(

@@ -260,7 +260,8 @@ class Asker:
         self._kept = KeptAnswers(kept) if kept else None
         self._progress, self._more = progress, more
         self._given, self.served = frozenset(answers or {}), list[Served]()
-        self.answers = {**(self._kept.recall() if self._kept else {}), **(answers or {})}
+        recalled = self._kept.recall() if self._kept else {}
+        self.answers = {**recalled, **(answers or {})}
         self.tally, self._in_a_row = Tally(), 0
         # How many there are while none could be read; None once one could, or it was said.
         self._unread: int | None = None if self.answers else 0
@@ -465,7 +466,7 @@ class Asker:
         NaN without an intent.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
-        width = max(width, *map(len, answers))
+        width = max([width, *[len(row) for row in answers]])
         unknown = (math.nan,) * len(self.spec.actions)
         p, distances_m, ranges_m, bits, texts_b, unasked = [], [], [], [], [], []
         models = [self._models(scene, width) for scene in scenes]
@@ -570,14 +571,15 @@ class Asker:
         graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks)), by_id))
         calls = []
         for (scene, senders), lacking in zip(sets, lacks, strict=True):
-            source, keys = (
-                source_of(scene.id, senders),
-                (key.partition(REWRITTEN)[0] for key in senders),
-            )
-            sent = {key: a for key in keys if (a := self.answers.get(f"{source}/{key}"))}
-            calls.append(
-                fusion_request(self.spec, scene, sent, senders, next(graphs) if lacking else None)
-            )
+            source = source_of(scene.id, senders)
+            sent = {}
+            for sender in senders:
+                key = sender.partition(REWRITTEN)[0]
+                answer = self.answers.get(f"{source}/{key}")
+                if answer:
+                    sent[key] = answer
+            graph = next(graphs) if lacking else None
+            calls.append(fusion_request(self.spec, scene, sent, senders, graph))
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:

@@ -118,13 +118,9 @@ def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajec
     ]
     arrived = []
     while running:
-        frames = [
-            min((d.frame for c in t.courses for d in c.open.values()), default=until_frame + 1)
-            for _, t in running
-        ]
-        lockstep.advance(
-            [t.world for _, t in running], [min(frame, until_frame) for frame in frames]
-        )
+        frames = [_next_frame(trajectory, until_frame + 1) for _, trajectory in running]
+        worlds = [trajectory.world for _, trajectory in running]
+        lockstep.advance(worlds, [min(frame, until_frame) for frame in frames])
         branched = []
         for (order, trajectory), frame in zip(running, frames, strict=True):
             if trajectory.world.ended or frame > until_frame:
@@ -133,3 +129,9 @@ def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajec
                 branched += [((*order, -n), part) for n, part in enumerate(trajectory.act())]
         running = branched
     return [trajectory for _, trajectory in sorted(arrived, key=itemgetter(0))]
+
+
+def _next_frame(trajectory: Trajectory, never: int) -> int:
+    """Return the frame at which an open decision acts next; `never` if none is open."""
+    frames = [decision.frame for course in trajectory.courses for decision in course.open.values()]
+    return min(frames, default=never)

@@ -224,11 +224,14 @@ def _inference(
         ego_j[rows.start : rows.stop] = answer_j(latency.speeds[0], egos[scene])
         ego_s[rows.start : rows.stop] = answer_s(latency.speeds[0], egos[scene])
         for row in rows:
-            if rewrites := fusing.get(int(condition[row])):
-                heard = tuple(
-                    key_of(helper, rewrites, attackers[row, place])
-                    for place, column in enumerate(senders)
-                    if (helper := column[row]) and on_time[row, place]
-                )
-                call_j[row] = answer_j(latency.speeds[0], calls[scene, heard]) if heard else 0.0
+            rewrites = fusing.get(int(condition[row]))
+            if rewrites is None:
+                continue
+            heard = []
+            for place, column in enumerate(senders):
+                helper = column[row]
+                if helper and on_time[row, place]:
+                    heard.append(key_of(helper, rewrites, attackers[row, place]))
+            if heard:
+                call_j[row] = answer_j(latency.speeds[0], calls[scene, tuple(heard)])
     return ego_j, ego_s, call_j

@@ -51,14 +51,14 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     if calls := sum(1 for scene in scenes for _ in _fusion_calls(spec, scene)):
         asked["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
-    return {
+    counts = {
         **spec.record(),
         "requests": asked.total(),
         "requests_by_role": dict(asked),
         "scenes": len(scenes),
         "prompt_tokens": stats or None,
-        **({"cost": costs} if costs else {}),
     }
+    return {**counts, "cost": costs} if costs else counts
 
 
 def lacking(

@@ -113,11 +113,12 @@ class FrozenSource:
 
     def settings(self) -> FrozenSettings:
         given: dict[str, Any] = self.selection.given
+        until = self.until.settings() if self.until else {}
         return FrozenSettings(
             dataset=str(argument(self.dataset.path)),
             limit=self.selection.limit,
             **given,
-            **(self.until.settings() if self.until else {}),
+            **until,
         )
 
 
@@ -283,16 +284,14 @@ class FrozenWorld(SceneWorld):
                 strict=True,
             )
         ]
-        return [
-            self._episode(
-                point.name, seed, layout, [forest.edges[n] for n in taken if n >= 0], success
-            )
-            for point, walks in self._walks.items()
-            for seed, taken_here, successes in zip(
-                self._seeds.tolist(), *self._taken(walks), strict=True
-            )
-            for layout, taken, success in zip(layouts, taken_here, successes, strict=True)
-        ]
+        episodes = []
+        for point, walks in self._walks.items():
+            taken, successes = self._taken(walks)
+            for n, seed in enumerate(self._seeds.tolist()):
+                for layout, edges, success in zip(layouts, taken[n], successes[n], strict=True):
+                    course = [forest.edges[edge] for edge in edges if edge >= 0]
+                    episodes.append(self._episode(point.name, seed, layout, course, success))
+        return episodes
 
     def _taken(self, walks: _Walks) -> tuple[list[list[list[int]]], list[list[bool]]]:
         """Return the edges that each walk took, (S, E, steps) with -1 after its end,

@@ -83,13 +83,14 @@ def declared(text: str) -> Latency:
     Raises UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]
+    seconds: dict[str, list[float]] = {}
     try:
-        seconds = {role: [float(part) for part in value.split(":")] for role, _, value in pairs}
+        for role, _, value in pairs:
+            seconds[role] = [float(part) for part in value.split(":")]
     except ValueError:
         seconds = {}
-    ego, helper, fusion = (
-        seconds.get(r, seconds.get("ego", [np.nan])) for r in ("ego", "helper", "fusion")
-    )
+    ego = seconds.get("ego", [np.nan])
+    helper, fusion = seconds.get("helper", ego), seconds.get("fusion", ego)
     roles_once = len(seconds) == len(pairs) and seconds.keys() <= {"ego", "helper", "fusion"}
     one_each = len(ego) == len(fusion) == 1
     if not (roles_once and one_each and all(0 <= s <= LONGEST_S for s in (*ego, *helper, *fusion))):
@@ -119,18 +120,16 @@ def inference_s(
     counts. A repair turn takes the time of one more answer. An answer's own declared delay
     (`slow_s`) is added.
     """
+    shape = len(answers), len(answers[0]) if answers else 0
+    seconds, turns, slow = np.full((3, *shape), np.nan)
+    for n, row in enumerate(answers):
+        for place, answer in enumerate(row):
+            if answer and latency.speeds:
+                seconds[n, place] = answer_s(latency.speed(places[n][place]), answer)
+            elif answer:
+                turns[n, place], slow[n, place] = answer.turns, answer.slow_s
     if latency.speeds:
-        return np.array(
-            [
-                [
-                    answer_s(latency.speed(place), a) if a else np.nan
-                    for place, a in zip(of, row, strict=True)
-                ]
-                for of, row in zip(places, answers, strict=True)
-            ]
-        )
-    turns = np.array([[a.turns if a else np.nan for a in row] for row in answers])
-    slow = np.array([[a.slow_s if a else np.nan for a in row] for row in answers])
+        return seconds
     by_place = [latency.ego_s, *islice(cycle(latency.helper_times_s()), slow.shape[1] - 1)]
     return np.asarray(slow + turns * np.array(by_place, dtype=float)[np.array(places, dtype=int)])
 
@@ -169,12 +168,11 @@ def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
 
 def _times(answers: Sequence[Answer | AnswerFacts], which: str) -> Times | None:
     """Return percentiles of the answers' time in the field `which`; None if no answer has it."""
-    timed = [
-        (s, a.scene.partition("-")[0]) for a in answers if (s := getattr(a, which)) is not None
-    ]
+    timed = [answer for answer in answers if getattr(answer, which) is not None]
     if not timed:
         return None
-    values, episodes = np.array([s for s, _ in timed]), [episode for _, episode in timed]
+    values = np.array([getattr(answer, which) for answer in timed])
+    episodes = [answer.scene.partition("-")[0] for answer in timed]
     intervals = {
         percent: None if math.isnan(low) else (round(low, 6), round(high, 6))
         for percent, (low, high) in percentiles.intervals(values, episodes).items()

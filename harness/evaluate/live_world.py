@@ -102,13 +102,14 @@ class LiveSource:
         return replace(self, episodes=looks.at[-1], until=self.until and self.until.after(looks))
 
     def settings(self) -> DriveSettings:
+        until = self.until.settings() if self.until else {}
         return DriveSettings(
             scenario=scenarios.argument(self.scenario),
             episodes=self.episodes,
             first_seed=self.first_seed,
             sample=self.sample,
             sample_seed=0 if self.sample is None else self.sample_seed,
-            **(self.until.settings() if self.until else {}),
+            **until,
         )
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
@@ -141,26 +142,26 @@ class LiveWorld(SceneWorld):
         """
         self.scenario, self._p = scenario, scenario.parameters
         self._first_seed, self._ego_alone = first_seed, ego_alone
-        runs = list(product(points, seeds))
-        self._going = [
-            Trajectory(n, World.start(scenario, first_seed + n), [Course(*run) for run in runs])
-            for n in numbers
-        ]
+        self._going: list[Trajectory] = []
+        for number in numbers:
+            courses = [Course(point, seed) for point, seed in product(points, seeds)]
+            world = World.start(scenario, first_seed + number)
+            self._going.append(Trajectory(number, world, courses))
         self._ended: list[Trajectory] = []
         self._decisions: list[Decision] = []
         self._step, self._tick, self._ticks = 0, 0, offsets(scenario)
 
     def observe(self) -> Sequence[Scene]:
         while self._going and self._step < self._p.decisions:
-            due = [
-                (t, agent) for t in self._going for agent in t.under_way if self._is_due(t, agent)
-            ]
-            for trajectory, agent in due:
-                for course in trajectory.courses:
-                    course.skipped += agent in course.open
-            self._deciding = [
-                (t, agent) for t, agent in due if any(agent not in c.open for c in t.courses)
-            ]
+            self._deciding = []
+            for trajectory in self._going:
+                for agent in trajectory.under_way:
+                    if self._is_due(trajectory, agent):
+                        waits = [agent in course.open for course in trajectory.courses]
+                        for course, waiting in zip(trajectory.courses, waits, strict=True):
+                            course.skipped += waiting
+                        if not all(waits):
+                            self._deciding.append((trajectory, agent))
             if self._deciding:
                 points = [(t.world, agent, t.number) for t, agent in self._deciding]
                 self.scenes = looks(points, self._step, self._ego_alone)
@@ -269,9 +270,8 @@ class LiveWorld(SceneWorld):
         """Return when each decision acts, whether it did, and conflicts,
         in the order of decisions.
         """
-        ttc_s, pet_s = (
-            np.array([getattr(d, name) for d in self._decisions]) for name in ("ttc_s", "pet_s")
-        )
+        ttc_s = np.array([decision.ttc_s for decision in self._decisions])
+        pet_s = np.array([decision.pet_s for decision in self._decisions])
         return {
             "acts_at_s": np.array([d.frame for d in self._decisions]) / self._p.simulation_hz,
             "acted": np.array([d.acted for d in self._decisions]),

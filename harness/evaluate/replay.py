@@ -77,10 +77,10 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     scenario = episodes[0].scenario
     worlds = [World.start(scenario, episode.layout_seed) for episode in episodes]
     due_frames = [due_frame(world, d) for world, d in zip(worlds, decisions, strict=True)]
-    acts = [
-        [(frame, acting) for frame, acting in actions_by_frame(episode).items() if frame <= last]
-        for episode, last in zip(episodes, due_frames, strict=True)
-    ]
+    acts = []
+    for episode, last in zip(episodes, due_frames, strict=True):
+        actions = actions_by_frame(episode).items()
+        acts.append([(frame, acting) for frame, acting in actions if frame <= last])
     for turn in zip_longest(*acts):  # each world's next actions, or None
         due = [(world, *act) for world, act in zip(worlds, turn, strict=True) if act]
         lockstep.advance([world for world, _, _ in due], [frame for _, frame, _ in due])

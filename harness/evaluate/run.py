@@ -524,22 +524,25 @@ def _gather(
 
     with uncollected():
         # One part after the other: the decisions of all would not fit into memory.
-        by_part, figures = zip(*map(scored, chunks, parts), strict=True)
+        by_part: list[list[Episode]] = []
+        figures: list[Figures] = []
+        for chunk, part in zip(chunks, parts, strict=True):
+            episodes_here, figures_here = scored(chunk, part)
+            by_part.append(episodes_here)
+            figures.append(figures_here)
         whole = Figures.joined(figures)
         answers = [answer for answer, _ in whole.answers]
         _settle(parts, answers)
         summary = whole.scores()
-        cells = len(names) * len(settings["seeds"])
-        episodes = [
-            episode
-            for cell in range(cells)
-            for chunk, of_part in zip(chunks, by_part, strict=True)
-            for episode in of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
-        ]
+        episodes: list[Episode] = []
+        for cell in range(len(names) * len(settings["seeds"])):
+            for chunk, of_part in zip(chunks, by_part, strict=True):
+                episodes += of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
         if settings["world"].get("looks"):
             summary = [*summary, *any_time_scores(whole.grid, episodes)]
         if layouts:
             summary = [*summary, *adjusted_scores(whole.grid, episodes, layouts)]
+        cost = costs.total(settings, works)
         manifest = msgspec.convert(
             {
                 "format": FORMAT,
@@ -556,14 +559,11 @@ def _gather(
                 "engine_errors": sum(answer.error is not None for answer in answers),
                 "retries": sum(answer.retries for answer in answers),
                 "versions": begun.versions,
-                **(
-                    {"cost": msgspec.to_builtins(cost)}
-                    if (cost := costs.total(settings, works))
-                    else {}
-                ),
             },
             Manifest,
         )
+        if cost:
+            manifest = msgspec.structs.replace(manifest, cost=cost)
         kept_sources.write(out, made_of, place)
         with suppress(UserError):  # a stranger's shard may state any command
             write_whole(out / FILE, text_of(of_words(begun.command)))

@@ -30,9 +30,8 @@ def shared_graphs(
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
     for seat, places in by_seat([scene for scene, _ in sets], scenario).items():
-        for n, graph in zip(
-            places, _shared_graphs(seat, [sets[n] for n in places], scenes), strict=True
-        ):
+        graphs_here = _shared_graphs(seat, [sets[n] for n in places], scenes)
+        for n, graph in zip(places, graphs_here, strict=True):
             graphs[n] = graph
     return graphs
 
@@ -40,7 +39,8 @@ def shared_graphs(
 def _shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
-    changes = {change for _, senders in sets for key in senders for change in changes_of(key)}
+    keys = [key for _, senders in sets for key in senders]
+    changes = {change for key in keys for change in changes_of(key)}
     if TRUTH in changes:
         truths = truth_graphs(scenario, [scene.state for scene, _ in sets])
         own = [scene.graphs[scene.viewers[0]] for scene, _ in sets]

@@ -427,31 +427,27 @@ class Spec:
         a part of a run's `run.json`.
         """
         settings = msgspec.to_builtins(self.settings)
+        profiles = [point.radio.profile for point in self.points]
+        schedules = {
+            point.ask.schedule: SCHEDULES.file_sha256(point.ask.schedule) for point in self.points
+        }
+        kept = {}
+        for folder, by_name in kept_of(self.points).items():
+            kept[folder] = {name: each.record for name, each in by_name.items()}
         return {
             **self.ego.settings(),
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.source.record()),
             "actions": list(self.actions),
             "conditions": [point.record() for point in self.points],
-            "channels": {
-                name: CHANNELS.record(name)
-                for point in self.points
-                if (name := point.radio.profile)
-            },
+            "channels": {name: CHANNELS.record(name) for name in profiles if name},
             "networks": {
                 point.cloud.round_trip: asdict(point.network)
                 for point in self.points
                 if point.network
             },
-            "schedules": {
-                name: sha256
-                for name in (point.ask.schedule for point in self.points)
-                if (sha256 := SCHEDULES.file_sha256(name))
-            },
-            "kept": {
-                folder: {name: kept.record for name, kept in by_name.items()}
-                for folder, by_name in kept_of(self.points).items()
-            },
+            "schedules": {name: sha256 for name, sha256 in schedules.items() if sha256},
+            "kept": kept,
             "seeds": list(self.seeds),
             "device_profile": msgspec.to_builtins(self.device_profile),
             **{key: settings[name] for key, name in formats.BESIDE.items()},

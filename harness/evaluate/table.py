@@ -55,7 +55,8 @@ def table(
     The decisions may be in any order; further columns (n,), `more`, are in that order.
     """
     points_by_id = {id(part.decision_points): part.decision_points for part in decided}
-    starts = np.cumsum([0, *map(len, points_by_id.values())]).tolist()
+    lengths = [len(decision_points) for decision_points in points_by_id.values()]
+    starts = np.cumsum([0, *lengths]).tolist()
     start = dict(zip(points_by_id, starts, strict=False))
     scenes = [scene for decision_points in points_by_id.values() for scene in decision_points]
     vehicles = max(len(scene.viewers) for scene in scenes) - 1
@@ -88,26 +89,27 @@ def table(
     }
     # an attacker may have several voices
     voices = [f"voice-{n + 1}" for n in range(helpers - vehicles)]
-    senders = [
-        [*scene.viewers[1:], *[None] * (vehicles + 1 - len(scene.viewers)), *voices]
-        for scene in scenes
-    ]
-    episode, step = (
-        of_scenes(getattr(s.record, name) for s in scenes) for name in ("episode", "step")
-    )
+    senders: list[list[str | None]] = []
+    for scene in scenes:
+        absent = [None] * (vehicles + 1 - len(scene.viewers))
+        senders.append([*scene.viewers[1:], *absent, *voices])
+    of_messages_by_column: dict[str, Any] = {}
+    for name, messages in sent.items():
+        of_messages_by_column |= by_message(name, np.where(asked, messages, np.nan))
+    episode = of_scenes(scene.record.episode for scene in scenes)
+    step = of_scenes(scene.record.step for scene in scenes)
     ids = [scene.id for scene in scenes]
     rank = np.unique(ids, return_inverse=True)[1]
     order = np.lexsort((point, rank[at], step, episode))
+    joined: dict[str, Any] = {}
+    for name in numbers[0]:
+        joined[name] = np.concatenate([part[name] for part in numbers])
     values = {
-        **{name: np.concatenate([part[name] for part in numbers]) for name in numbers[0]},
+        **joined,
         **by_action("fused", np.concatenate([part.result.fused for part in decided]), actions),
         "broke_word": np.concatenate([broken_words(part) for part in decided]),
         **more,
-        **{
-            column: array
-            for name, messages in sent.items()
-            for column, array in by_message(name, np.where(asked, messages, np.nan)).items()
-        },
+        **of_messages_by_column,
         "seed": np.concatenate([part.due.seed for part in decided]),
         "episode": episode,
         "step": step,
@@ -118,11 +120,9 @@ def table(
         "condition": Labels(point, points),
         "agent": _labels([s.viewers[0] if s.several else None for s in scenes], at),
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
-        **{
-            f"helper_{h + 1}": _labels([row[h] for row in senders], at, asked[:, h])
-            for h in range(helpers)
-        },
     }
+    for h in range(helpers):
+        labels[f"helper_{h + 1}"] = _labels([row[h] for row in senders], at, asked[:, h])
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 

@@ -62,7 +62,8 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     fusion = []
     for scene in scenes if spec.fusion_obstacle is None else ():
         by_viewer = {viewer: answers[f"{scene.id}/{viewer}"] for viewer in scene.viewers}
-        if heard := [viewer for viewer in scene.viewers[1:] if by_viewer[viewer].intent]:
+        heard = [viewer for viewer in scene.viewers[1:] if by_viewer[viewer].intent]
+        if heard:
             fusion.append(replace(fusion_request(spec, scene, by_viewer, heard), timed=True))
     sample = times([*answers.values(), *(answer_of(r, backend.complete([r])[0]) for r in fusion)])
     if "ego" not in sample:
@@ -77,13 +78,10 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
         sample.get(role, sample["ego"]).median_s for role in ("ego", "helper", "merge")
     )
     several_helpers = len(spec.helpers) > 1
-    helper_times = tuple(
-        times(answers[r.id] for r in first if r.agent == agent)
-        .get("helper", sample["ego"])
-        .median_s
-        for agent in range(1, len(spec.agents))
-        if several_helpers
-    )
+    helper_times: list[float] = []
+    for agent in range(1, len(spec.agents) if several_helpers else 1):
+        of_agent = times(answers[request.id] for request in first if request.agent == agent)
+        helper_times.append(of_agent.get("helper", sample["ego"]).median_s)
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
     helper_s = helper_times[0] if helper_times else helper_s
-    return Latency("measured", basis, ego_s, helper_s, fusion_s, sample, helper_times)
+    return Latency("measured", basis, ego_s, helper_s, fusion_s, sample, tuple(helper_times))

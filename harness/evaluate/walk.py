@@ -217,59 +217,68 @@ def _steps(
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
     memories = {point: Memory() for point in points}
     speakers = {point: point.speaker() for point in points}
-    physical = {point for point in points if point.physical}
     while decision_points := world.observe():
         intents = ask(decision_points)
-        due = {point: each for point in points if len((each := world.due(point)).at)}
-        if not physical.isdisjoint(due):
-            intents = replace(intents, site=world.site({point.unit for point in due if point.unit}))
-        if any(point.needs("outlook") for point in due):
-            intents = replace(intents, outlook=world.outlook())
-        if any(point.needs("claims") for point in due):
-            intents = replace(intents, claims=world.claims())
-        if any(point.content.plan for point in due):
-            intents = replace(intents, plans=world.plans())
-        if any(point.content.graph for point in due):
-            counts, bits = world.listed() or (None, None)
-            intents = replace(intents, objects=counts, object_bits=bits)
+        due = _due(world, points)
+        intents = _with_needs(world, due, intents)
         others = _others(ask, decision_points, due)
         answers = _asked(ask, decision_points, due, {PLAIN: intents, **others})
-        broadcasts = {
-            point: speakers[point].said(
-                heard(point, answers, each), each.draws, each.episode, each.seed
-            )
-            for point, each in due.items()
-        }
-        sent = {
-            point: exchange(point, each.intents, each.draws) for point, each in broadcasts.items()
-        }
-        for point in (point for point in due if point.fusion.rounds > 1):
-            fusion = FusionInputs(
-                None, memories[point].recall(due[point]), tie_draws(due[point].draws, ties)
-            )
-            plan_call = partial(ask.plan_call, decision_points, due[point].at)
-            broadcasts[point], sent[point] = further_rounds(
-                point, broadcasts[point], sent[point], partial(_decided, point, fusion, plan_call)
-            )
-        calls = _fusion_calls(due, broadcasts, sent, decision_points, ask)
+        said: dict[OperatingPoint, SentIntents] = {}
+        sent: dict[OperatingPoint, Exchange] = {}
+        fusions: dict[OperatingPoint, FusionInputs] = {}
+        for point, due_here in due.items():
+            own = heard(point, answers, due_here)
+            said[point] = speakers[point].said(own, due_here.draws, due_here.episode, due_here.seed)
+            sent[point] = exchange(point, said[point].intents, said[point].draws)
+            ties_here = tie_draws(due_here.draws, ties)
+            fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
+        for point, due_here in due.items():
+            if point.fusion.rounds > 1:
+                plan_call = partial(ask.plan_call, decision_points, due_here.at)
+                decides = partial(_decided, point, fusions[point], plan_call)
+                said[point], sent[point] = further_rounds(point, said[point], sent[point], decides)
+        calls = _fusion_calls(due, said, sent, decision_points, ask)
         decided = []
         for point, due_here in due.items():
-            broadcast, call = broadcasts[point], None
+            call = None
             if point.has_fusion_call and point.content.plan:
-                call = ask.plan_call(decision_points, due_here.at, broadcast.intents)
+                call = ask.plan_call(decision_points, due_here.at, said[point].intents)
             elif point.has_fusion_call:
-                call = calls[point.rewrites](
-                    places_of(point, due_here, len(decision_points)), shown(point, broadcast)
-                )
-            fusion = FusionInputs(
-                call, memories[point].recall(due_here), tie_draws(due_here.draws, ties)
-            )
-            result = fuse(point, sent[point], broadcast.intents, fusion)
-            decided.append(Decided(point, decision_points, due_here, result, broadcast))
-        for part in decided:
-            memories[part.point].keep(part.due, part.result.state)
+                places = places_of(point, due_here, len(decision_points))
+                call = calls[point.rewrites](places, shown(point, said[point]))
+            fusion = replace(fusions[point], call=call)
+            result = fuse(point, sent[point], said[point].intents, fusion)
+            memories[point].keep(due_here, result.state)
+            decided.append(Decided(point, decision_points, due_here, result, said[point]))
         yield decided
         world.step(decided)
+
+
+def _due(
+    world: World[DecisionPoint], points: Sequence[OperatingPoint]
+) -> dict[OperatingPoint, Due]:
+    """Return the decisions that are due now, by condition; none of one without any."""
+    due = {point: world.due(point) for point in points}
+    return {point: due_here for point, due_here in due.items() if len(due_here.at)}
+
+
+def _with_needs(
+    world: World[DecisionPoint], due: Mapping[OperatingPoint, Due], intents: Intents
+) -> Intents:
+    """Return what vehicles intend with all that some condition needs to know of the world."""
+    if any(point.physical for point in due):
+        units = {point.unit for point in due if point.unit}
+        intents = replace(intents, site=world.site(units))
+    if any(point.needs("outlook") for point in due):
+        intents = replace(intents, outlook=world.outlook())
+    if any(point.needs("claims") for point in due):
+        intents = replace(intents, claims=world.claims())
+    if any(point.content.plan for point in due):
+        intents = replace(intents, plans=world.plans())
+    if any(point.content.graph for point in due):
+        counts, bits = world.listed() or (None, None)
+        intents = replace(intents, objects=counts, object_bits=bits)
+    return intents
 
 
 def _decided(
@@ -356,8 +365,9 @@ def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) 
 
 def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
     names = ("helpers", "payload_bits", "text_bytes", "unasked", "objects", "object_bits")
-    sent = {name: array for name in names if (array := getattr(source, name)) is not None}
-    return replace(own, valid=valid, **sent)
+    sent = {name: getattr(source, name) for name in names}
+    known = {name: array for name, array in sent.items() if array is not None}
+    return replace(own, valid=valid, **known)
 
 
 def _able(point: OperatingPoint, intents: Intents) -> Intents:
