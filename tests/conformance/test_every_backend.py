@@ -5,6 +5,7 @@ the contract of `harness.backends.base.Backend`.
 import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import get_args
@@ -33,6 +34,11 @@ class Case:
 
     backend: Backend
     asked: tuple[Request, ...]
+
+    @cached_property
+    def said(self) -> list[Completion]:
+        """What is answered when all are asked at once."""
+        return self.backend.complete(self.asked)
 
 
 def model_free() -> list[str]:
@@ -147,7 +153,7 @@ def shares(options: Collection[str], said: str) -> dict[str, float]:
 
 def test_a_constrained_answer_keeps_to_the_schema(case: Case) -> None:
     """What any engine promises, as a server is held to it: JSON Schema, without blanks or not."""
-    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+    for r, c in zip(case.asked, case.said, strict=True):
         if r.answer == "constrained":
             assert c.error is None
             assert broken("generic", r, c.text, ended=True) is None
@@ -167,7 +173,7 @@ def same(one: list[Completion], other: list[Completion]) -> None:
 
 
 def test_a_read_out_and_only_a_read_out_says_how_much_was_on_its_letters(case: Case) -> None:
-    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+    for r, c in zip(case.asked, case.said, strict=True):
         letters = "readout" in capabilities(case.backend.identity()["engine"]).answer_modes
         assert (c.label_mass is not None) == (r.bare and letters)
         assert c.label_mass is None or 0 < c.label_mass <= 1
@@ -183,7 +189,7 @@ def test_asking_nothing_gives_nothing(case: Case) -> None:
 
 
 def test_each_completion_keeps_the_contract(case: Case) -> None:
-    for c in case.backend.complete(case.asked):
+    for c in case.said:
         assert c.finish_reason in ("stop", "length", "error")
         assert (c.error is None) == (c.finish_reason != "error")
         assert c.finish_reason == "error" or c.text, "these five are answered with some text"
@@ -205,13 +211,13 @@ def test_each_completion_keeps_the_contract(case: Case) -> None:
 
 
 def test_an_engine_that_has_tokens_keeps_to_the_most_that_is_allowed(case: Case) -> None:
-    for r, c in zip(case.asked, case.backend.complete(case.asked), strict=True):
+    for r, c in zip(case.asked, case.said, strict=True):
         if c.completion_tokens is not None:
             assert c.completion_tokens <= r.max_tokens
 
 
 def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) -> None:
-    first = case.backend.complete(case.asked)
+    first = case.said
     same(case.backend.complete(case.asked), first)
     same([case.backend.complete([r])[0] for r in case.asked], first)
     same(case.backend.complete(case.asked[::-1]), first[::-1])
