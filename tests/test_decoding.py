@@ -119,6 +119,7 @@ def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> Non
     assert len(lengths) > 2, "answers of one length would not show that rows leave their batch"
 
 
+@pytest.mark.exhaustive
 def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) -> None:
     """On the model that ships, whose texts have a shape that can be guessed."""
     opened = open_backend(resolve("swarm-tiny", "transformers"), batch_size=BATCH, device="cpu")

@@ -228,6 +228,7 @@ def test_a_backend_answers_what_its_picture_shows(
     assert capfd.readouterr() == ("", ""), "llama.cpp has much to say of a projector"
 
 
+@pytest.mark.exhaustive
 def test_parity_is_measured_with_pictures_too(tiny: Path, theirs: Any) -> None:
     asked, letters = (
         [question(n, image, how) for n, image in enumerate((A, B))] for how in ("json", "readout")

@@ -47,7 +47,7 @@ def test_a_wrong_file_stands_in_its_list(kind: str, project: Path, harness: Type
     assert f"{kind}/bad.toml" in said
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_needs_another_file_does_not_fail(
     project: Path, harness: Typed, small_path: Path
 ) -> None:

@@ -303,7 +303,7 @@ def without(state, vehicle):
 
 @pytest.mark.slow
 def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
-    hidden, worlds = 0, [World.start(SCENARIO, seed) for seed in range(8)]
+    hidden, worlds = 0, [World.start(SCENARIO, seed) for seed in range(4)]
     for action in ("IDLE", "SLOWER", "IDLE", "FASTER", "IDLE"):
         for state in [world.state() for world in worlds if not world.outcome.ended]:
             for viewer in (state.ego, *state.helpers):
@@ -314,7 +314,7 @@ def test_a_graph_does_not_change_when_what_it_does_not_list_is_taken_away():
                     less = scene_graph(SCENARIO, without(state, unlisted), viewer.id)
                     assert less == graph, (state.episode_seed, state.step, viewer.id, unlisted)
         act_together(worlds, [action] * len(worlds))
-    assert hidden > 100
+    assert hidden > 50
 
 
 @pytest.mark.slow

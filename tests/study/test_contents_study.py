@@ -76,7 +76,7 @@ def test_each_content_is_what_a_run_of_it_comes_to(
             assert cell(played, content, column) == pytest.approx(score.value)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_where_nothing_arrives_every_content_is_worth_nothing(played: pd.DataFrame) -> None:
     contents = played.content.unique()
     alone = cell(played, NOTHING, "success")

@@ -246,6 +246,7 @@ def test_another_kind_of_model_is_no_base(folder: Path, tmp_path: Path):
         take_over(model, folder)
 
 
+@pytest.mark.exhaustive
 def test_it_answers_in_every_mode(folder: Path, asked: list[Question]):
     model: Any = open_backend(
         cards.resolve(str(folder)), device="cpu", dtype="float32", batch_size=4
