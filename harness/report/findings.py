@@ -43,63 +43,54 @@ class Finding:
     sentence: str
 
 
-def each(of: Source[Run]) -> Source[Runs]:
-    """Return what says of several runs what `of` says of each."""
-    return partial(_merged, of)
+def each(source: Source[Run]) -> Source[Runs]:
+    """Return the source that says of several runs what this one says of each."""
+    return partial(_merged, source)
 
 
-def _merged(of: Source[Run], runs: Runs) -> list[str]:
+def _merged(source: Source[Run], runs: Runs) -> list[str]:
     """Return each sentence once, with the names of the runs that it is about if not of all."""
-    about: dict[str, list[str]] = {}
+    names_of: dict[str, list[str]] = {}  # by sentence
     for name, run in runs.items():
-        for sentence in dict.fromkeys(of(run)):
-            about.setdefault(sentence, []).append(name)
-    return [
-        sentence if len(names) == len(runs) else f"{', '.join(names)}: {sentence}"
-        for sentence, names in about.items()
-    ]
+        for sentence in dict.fromkeys(source(run)):
+            names_of.setdefault(sentence, []).append(name)
+    sentences = []
+    for sentence, names in names_of.items():
+        of_all = len(names) == len(runs)
+        sentences.append(sentence if of_all else f"{', '.join(names)}: {sentence}")
+    return sentences
 
 
 OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
-    Kind.VOID: [*map(each, (caveats.unanswered, caveats.unread))],
+    Kind.VOID: [each(caveats.unanswered), each(caveats.unread)],
     Kind.CAVEAT: [
         caveats.no_prompt,
-        *map(
-            each,
-            (
-                caveats.of_extensions,
-                caveats.moved_system,
-                caveats.by_letter,
-                caveats.beyond_sources,
-                caveats.on_device,
-                caveats.looked_at,
-                ignores_input,
-                unchecked,
-                caveats.lost_messages,
-                caveats.retried,
-            ),
-        ),
+        each(caveats.of_extensions),
+        each(caveats.moved_system),
+        each(caveats.by_letter),
+        each(caveats.beyond_sources),
+        each(caveats.on_device),
+        each(caveats.looked_at),
+        each(ignores_input),
+        each(unchecked),
+        each(caveats.lost_messages),
+        each(caveats.retried),
     ],
     Kind.LIMIT: [
-        *map(
-            each,
-            (
-                caveats.causes,
-                caveats.few,
-                caveats.saturated,
-                caveats.earlier_gains,
-                caveats.sampled,
-                caveats.divided,
-                caveats.flipped,
-                caveats.controls,
-                caveats.unheard,
-                caveats.lost_at_once,
-                caveats.lagging,
-                caveats.unmeasured,
-            ),
-        )
+        each(caveats.causes),
+        each(caveats.few),
+        each(caveats.saturated),
+        each(caveats.earlier_gains),
+        each(caveats.sampled),
+        each(caveats.divided),
+        each(caveats.flipped),
+        each(caveats.controls),
+        each(caveats.unheard),
+        each(caveats.lost_at_once),
+        each(caveats.lagging),
+        each(caveats.unmeasured),
     ],
-    Kind.FIGURE: [*map(each, (words.adjusted_lines, in_a_line))],
+    Kind.FIGURE: [each(words.adjusted_lines), each(in_a_line)],
 }
 # Of a run, or of a suite as a whole.
 OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
@@ -120,19 +111,20 @@ def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
     all of it or only of these kinds.
     """
     runs = run.runs if isinstance(run, SuiteRun) else {"": run}
-    return [*of_runs(runs, *kinds), *_said(OF_ONE, run, kinds)]
+    return [*of_runs(runs, *kinds), *_findings(OF_ONE, run, kinds)]
 
 
 def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
     """Return what is said of runs that stand side by side, all of it or only of these kinds."""
-    return _said(OF_RUNS, runs, kinds)
+    return _findings(OF_RUNS, runs, kinds)
 
 
-def _said(table: Mapping[Kind, Sequence[Source[T]]], of: T, kinds: Sequence[Kind]) -> list[Finding]:
-    return [
-        Finding(kind, sentence)
-        for kind, sources in table.items()
-        if kind in (kinds or Kind)
-        for source in sources
-        for sentence in source(of)
-    ]
+def _findings(
+    table: Mapping[Kind, Sequence[Source[T]]], subject: T, kinds: Sequence[Kind]
+) -> list[Finding]:
+    findings = []
+    for kind, sources in table.items():
+        if kind in (kinds or Kind):
+            for source in sources:
+                findings += [Finding(kind, sentence) for sentence in source(subject)]
+    return findings

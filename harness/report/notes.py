@@ -31,18 +31,16 @@ def pace(run: Shown) -> Iterator[str]:
             share = 100 * first.median_s / took.median_s
             text = f"{share:.0f} % of the median answer is prefill"
             yield f"{word}: {text} (batch 1, measured where it ran)"
-        for what, of in (("TTFT", first), ("TPOT", took.token)):
-            if of:
-                half, high = (
-                    _milliseconds(of.median_s, of.median_ci_s),
-                    _milliseconds(of.p95_s, of.p95_ci_s),
-                )
-                tail = f", p95 {high}" if of.n > 1 else ""
-                yield f"  {word} {what} {half} ms{tail}, n = {of.n}"
+        for name, times in (("TTFT", first), ("TPOT", took.token)):
+            if times:
+                median = _milliseconds(times.median_s, times.median_ci_s)
+                p95 = _milliseconds(times.p95_s, times.p95_ci_s)
+                tail = f", p95 {p95}" if times.n > 1 else ""
+                yield f"  {word} {name} {median} ms{tail}, n = {times.n}"
 
 
 def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
-    """With a decimal, or two below ten, and the interval where there is one."""
+    """Return milliseconds with a decimal, two below ten, and their interval where there is one."""
     unit = Unit("ms", 1 if seconds >= 0.01 else 2, 1000.0)
     return unit.interval(seconds, *ends) if ends else unit.number(seconds)
 
@@ -68,18 +66,18 @@ def latency_source(latency: Latency) -> str:
         "helper": latency.helper_times_s(),
         "ego with messages": (latency.fusion_s,),
     }
-    times = ", ".join(
-        f"{r} {' or '.join(f'{s * 1000:.0f}' for s in each)} ms" for r, each in by_role.items()
-    )
-    return f"{times}; {source} ({printable(latency.basis)})"
+    times = []
+    for role, seconds in by_role.items():
+        milliseconds = [f"{second * 1000:.0f}" for second in seconds]
+        times.append(f"{role} {' or '.join(milliseconds)} ms")
+    return f"{', '.join(times)}; {source} ({printable(latency.basis)})"
 
 
 def energy(run: Shown) -> Iterator[str]:
     """Yield what a decision takes in each condition; nothing without a device profile."""
     for name in run.conditions:
-        total, helpers, radio = (
-            run.score(name, metric) for metric in ("energy_j", "helpers_j", "radio_mj")
-        )
+        total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
+        radio = run.score(name, "radio_mj")
         if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
             joules = PLAIN.interval(total.value, total.low, total.high)
             yield (
@@ -91,9 +89,10 @@ def energy(run: Shown) -> Iterator[str]:
 def answer_times(run: Shown) -> Iterator[str]:
     """Yield how long a role's own answers took."""
     for role, took in run.manifest.answer_times.items():
-        low, half, high = (f"{1000 * s:.1f}" for s in (took.p5_s, took.median_s, took.p95_s))
-        took_ms = f"{half} ms (5-95 %: {low} to {high}, n = {took.n})"
-        yield f"{printable(role_word(role))} answers took {took_ms}; not used as latency"
+        median_ms = f"{1000 * took.median_s:.1f} ms"
+        spread_ms = f"5-95 %: {1000 * took.p5_s:.1f} to {1000 * took.p95_s:.1f}"
+        times = f"{median_ms} ({spread_ms}, n = {took.n})"
+        yield f"{printable(role_word(role))} answers took {times}; not used as latency"
 
 
 def cost(run: Shown) -> Iterator[str]:
@@ -116,16 +115,16 @@ def readings(run: Shown) -> Iterator[str]:
     """Yield how the answers of each role were read; shares of a suite are means over families."""
     means = ", as means over families" if isinstance(run, SuiteRun) else ""
     for role in roles():
-        yield from (f"{role_word(role)} {line}{means}" for line in _of_role(run, role))
+        for line in _of_role(run, role):
+            yield f"{role_word(role)} {line}{means}"
 
 
 def _of_role(run: Shown, role: str) -> Iterator[str]:
-    shares = [
-        run.score(ALL, f"{verdict}_rate_{role}") for verdict in ("strict", "recovered", "failed")
-    ]
+    verdicts = ("strict", "recovered", "failed")
+    shares = [run.score(ALL, f"{verdict}_rate_{role}") for verdict in verdicts]
     if shares[0] is not None:
-        values = " / ".join(f"{100 * (s.value or 0):.1f}" for s in shares if s is not None)
-        yield f"answers strict / recovered / failed: {values} % of {shares[0].n}"
+        percents = [f"{100 * (share.value or 0):.1f}" for share in shares if share is not None]
+        yield f"answers {' / '.join(verdicts)}: {' / '.join(percents)} % of {shares[0].n}"
     if divided := run.score(ALL, f"divided_rate_{role}"):
         yield f"answers divided by their sum: {100 * (divided.value or 0):.1f} % of {divided.n}"
     if mass := run.score(ALL, f"label_mass_{role}"):
@@ -137,16 +136,15 @@ def _of_role(run: Shown, role: str) -> Iterator[str]:
 
 def _letters(run: Shown, role: str) -> str:
     """Return what a role's read-outs owe to the letters and to the order of the list of actions."""
-    share, follows = (
-        run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter")
-    )
-    read = "letters read once"
+    share = run.score(ALL, f"letter_share_{role}")
+    follows = run.score(ALL, f"follows_letter_{role}")
+    text = "letters read once"
     if share and follows:
-        owed = f"{100 * (share.value or 0):.0f} % follows the letter"
-        read = f"{owed}, the likeliest action in {_hits(follows)} of {follows.n}"
+        percent = f"{100 * (share.value or 0):.0f} % follows the letter"
+        text = f"{percent}, the likeliest action in {_hits(follows)} of {follows.n}"
     if flip := run.score(ALL, f"flip_rate_{role}"):
-        read += f"; the reversed list changes the likeliest action in {_hits(flip)} of {flip.n}"
-    return read
+        text += f"; the reversed list changes the likeliest action in {_hits(flip)} of {flip.n}"
+    return text
 
 
 def _hits(share: Score) -> int:

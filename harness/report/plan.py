@@ -34,7 +34,9 @@ class Cost:
     minutes: float | None
 
     def times(self, layouts: float) -> "Cost":
-        tokens, minutes = (each and each * layouts for each in (self.tokens, self.minutes))
+        """Return the cost of so many layouts, where this is that of one."""
+        tokens = self.tokens and self.tokens * layouts
+        minutes = self.minutes and self.minutes * layouts
         return Cost(self.requests * layouts, tokens, minutes)
 
 
@@ -116,9 +118,8 @@ def _gains(path: Path) -> _Sides:
             f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no "
             "gain; give a second run, of another model or prompt, or a run with both"
         )
-    by_condition = dict(
-        zip(run.conditions, of_ends(METRICS[SUCCESS], run.grid, run.episodes), strict=True)
-    )
+    successes = of_ends(METRICS[SUCCESS], run.grid, run.episodes)
+    by_condition = dict(zip(run.conditions, successes, strict=True))
     alone = by_condition.pop(BASELINE)
     success = Success.of(run.episodes[: len(run.grid.episodes)], lead_of(run))
     values = {name: (alone, b) for name, b in by_condition.items()}
@@ -127,21 +128,20 @@ def _gains(path: Path) -> _Sides:
 
 def _difference(a: Path, b: Path) -> _Sides:
     both = pair(a, b)
-    first = both.conditions[0], both.seeds[0]
-    success = Success.of(
-        [both.a.ends[*first, e] for e in both.episodes], lead_of(both.a.run, both.b.run)
-    )
-    values = {
-        name: (both.values(both.a, SUCCESS, name).T, both.values(both.b, SUCCESS, name).T)
-        for name in both.conditions
-    }
+    condition, seed = both.conditions[0], both.seeds[0]
+    ends = [both.a.ends[condition, seed, episode] for episode in both.episodes]
+    success = Success.of(ends, lead_of(both.a.run, both.b.run))
+    values = {}
+    for name in both.conditions:
+        of_a, of_b = both.values(both.a, SUCCESS, name), both.values(both.b, SUCCESS, name)
+        values[name] = of_a.T, of_b.T
     cost = _cost([both.a.run, both.b.run])
     return _Sides(f"{printable(a)} and {printable(b)}", "B - A", success, values, cost)
 
 
 def _cost(runs: Sequence[Run]) -> Cost:
     """Return what the answers of one layout take, in all of the runs."""
-    costs = list(map(_cost_of, runs))
+    costs = [_cost_of(run) for run in runs]
     return Cost(
         sum(each.requests for each in costs),
         _sum(each.tokens for each in costs),
@@ -168,21 +168,23 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
     """Return a plan as plain values: differences from 0 to 1, what is not known as None."""
+    conditions = []
+    for row in plan.rows:
+        cost = row.cost
+        condition = {
+            "condition": row.condition or None,
+            "layouts": row.layouts,
+            "finds": known(row.finds),
+            "requests": cost and cost.requests,
+            "tokens": cost and cost.tokens,
+            "minutes": cost and cost.minutes,
+        }
+        conditions.append(condition)
     return {
         "difference": plan.difference,
         "basis": plan.basis,
         "detect": detect,
         "power": power,
         "finds_with": plan.layouts,
-        "conditions": [
-            {
-                "condition": row.condition or None,
-                "layouts": row.layouts,
-                "finds": known(row.finds),
-                **(
-                    vars(row.cost) if row.cost else dict.fromkeys(("requests", "tokens", "minutes"))
-                ),
-            }
-            for row in plan.rows
-        ],
+        "conditions": conditions,
     }

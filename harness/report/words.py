@@ -53,26 +53,28 @@ def headline(run: Run | SuiteRun) -> str:
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    lead = lead_of(run)
+    metric = lead_of(run)
     families = f" (mean over {len(run.runs)} families)" if isinstance(run, SuiteRun) else ""
-    value = _shown(run, best, lead)
+    value = _shown(run, best, metric)
     if not base:
-        several = len(run.conditions) > 1
-        of = " without a warning" if doubted(*_runs(run)) else ""
-        what = "clears {} of the episodes" if lead == SUCCESS else "has {} balanced success"
-        text = f"Under {best}, {model} {what.format(value)}{families}"
-        if halves := entry(lead).halves:
-            text += ": {} with a danger, {} without".format(
-                *(_shown(run, best, half) for half in halves)
-            )
-        return text + (f", and no other condition{of} does better." if several else ".")
-    pairs, p = plays(_runs(run), lead).pairs(best, base), p_values(run, base)
+        outcome = f"has {value} balanced success"
+        if metric == SUCCESS:
+            outcome = f"clears {value} of the episodes"
+        text = f"Under {best}, {model} {outcome}{families}"
+        if halves := entry(metric).halves:
+            dangerous, harmless = (_shown(run, best, half) for half in halves)
+            text += f": {dangerous} with a danger, {harmless} without"
+        if len(run.conditions) == 1:
+            return f"{text}."
+        unwarned = " without a warning" if doubted(*_runs(run)) else ""
+        return f"{text}, and no other condition{unwarned} does better."
+    pairs, p = plays(_runs(run), metric).pairs(best, base), p_values(run, base)
     corrected = dict(zip(p, holm(list(p.values())), strict=True))
     clear = judged(mean_difference(pairs), corrected[best])
-    if lead == SUCCESS:
+    if metric == SUCCESS:
         text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
-        return f"{text}{_shown(run, base, lead)}: {clear}."
-    shares = [_shown(run, best, half) for half in entry(lead).halves]
+        return f"{text}{_shown(run, base, metric)}: {clear}."
+    shares = [_shown(run, best, half) for half in entry(metric).halves]
     changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
     return (
         f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} "
@@ -103,16 +105,18 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 
     Empty where there is none.
     """
-    lead = lead_of(run)
-    scores = {c: s.value or 0.0 for c in run.conditions if (s := run.score(c, lead)) is not None}
-    radios = {c["name"] for c in run.manifest.conditions if c.get("profile") is not None}
-    best = best_of(scores, radios, doubted(*_runs(run)))
-    alone = [
-        c["name"]
-        for c in run.manifest.conditions
-        if c.get("profile") is None and c["name"] in scores
-    ]
-    base = alone[0] if alone else min(scores, key=lambda c: scores[c], default="")
+    metric = lead_of(run)
+    values = {}
+    for condition in run.conditions:
+        score = run.score(condition, metric)
+        if score is not None:
+            values[condition] = score.value or 0.0
+    points = run.manifest.conditions
+    with_radio = {point["name"] for point in points if point.get("profile") is not None}
+    alone = [point["name"] for point in points if point["name"] not in with_radio]
+    alone = [name for name in alone if name in values]
+    best = best_of(values, with_radio, doubted(*_runs(run)))
+    base = alone[0] if alone else min(values, key=lambda name: values[name], default="")
     return best, "" if base == best else base
 
 
@@ -121,23 +125,21 @@ def figures(run: Run) -> list[dict[str, str]]:
     each with what it is and its interval.
     """
     best, base = compared(run)
-    lead = lead_of(run)
-    better, gained = adjusted(run, best, lead) or (None, "")
-    wanted = [
-        (f"{IN_WORDS[lead]} under {best}", run.score(best, lead)),
-        (f"adjusted for difficulty, {gained}", better),
-        *(
-            (what, run.score(best, half))
-            for what, half in zip(
-                ("with a danger", "without a danger"), entry(lead).halves, strict=False
-            )
-        ),
-        (f"gain over {base}", run.score(best, GAINS[lead]) if base == BASELINE else None),
-        (f"unsafe episodes under {best}", run.score(best, "unsafe_rate")),
-        (f"latency of a decision under {best}", run.score(best, LATENCY)),
-        ("ego's answers that could not be read", run.score(metrics.ALL, "failed_rate_ego")),
-    ]
-    return [{"what": what, **shown(score)} for what, score in wanted if score is not None]
+    metric = lead_of(run)
+    scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
+    if better := adjusted(run, best, metric):
+        score, worth_of_it = better
+        scores[f"adjusted for difficulty, {worth_of_it}"] = score
+    if halves := entry(metric).halves:
+        dangerous, harmless = halves
+        scores["with a danger"] = run.score(best, dangerous)
+        scores["without a danger"] = run.score(best, harmless)
+    if base == BASELINE:
+        scores[f"gain over {base}"] = run.score(best, GAINS[metric])
+    scores[f"unsafe episodes under {best}"] = run.score(best, "unsafe_rate")
+    scores[f"latency of a decision under {best}"] = run.score(best, LATENCY)
+    scores["ego's answers that could not be read"] = run.score(metrics.ALL, "failed_rate_ego")
+    return [{"what": what, **shown(score)} for what, score in scores.items() if score is not None]
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
@@ -148,8 +150,8 @@ def as_good_as(plain: Estimate, corrected: Estimate) -> str:
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
     """Return success corrected by the layouts' difficulty, and what that is as good as.
 
-    None of fewer layouts than `SHOWN_FROM`, and where an interval of every look leads,
-    which this one is not.
+    None of fewer layouts than `SHOWN_FROM`, and where the interval holds at every look,
+    which this one does not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -158,24 +160,30 @@ def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
 
 
 def adjusted_lines(run: Run) -> Iterator[str]:
-    """Yield it of all conditions in which there is one, plain and balanced, as lines."""
+    """Yield a line of success corrected by the layouts' difficulty in each condition,
+    and one of balanced success; none where no condition has it.
+    """
     for metric, words in IN_WORDS.items():
-        each = {name: figure for name in run.conditions if (figure := adjusted(run, name, metric))}
-        cells = (
-            f"{printable(name)} {written(score)}, {gained}"
-            for name, (score, gained) in each.items()
-        )
-        if each:
+        cells = []
+        for name in run.conditions:
+            if better := adjusted(run, name, metric):
+                score, worth_of_it = better
+                cells.append(f"{printable(name)} {written(score)}, {worth_of_it}")
+        if cells:
             yield f"{words} % adjusted for difficulty: {'; '.join(cells)}"
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Return p of each other condition's gain over `base`, in what leads;
+    """Return p of each other condition's gain over `base` in the headline metric;
     of a suite the mean gain's.
     """
     played = plays(_runs(run), lead_of(run))
-    found = {c: p_of_mean(played.pairs(c, base)) for c in run.conditions if c != base}
-    return {condition: 1.0 if p is None else p for condition, p in found.items()}
+    p_values = {}
+    for condition in run.conditions:
+        if condition != base:
+            p = p_of_mean(played.pairs(condition, base))
+            p_values[condition] = 1.0 if p is None else p
+    return p_values
 
 
 def p_value(p: float) -> str:
@@ -195,11 +203,10 @@ def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
     """Return a nested mapping as lines of a table: dotted name and value."""
     if isinstance(value, Mapping):
-        return [
-            line
-            for key, inner in value.items()
-            for line in facts(inner, f"{name}.{key}" if name else str(key))
-        ]
+        lines = []
+        for key, inner in value.items():
+            lines += facts(inner, f"{name}.{key}" if name else str(key))
+        return lines
     if isinstance(value, list | tuple) and any(isinstance(inner, Mapping) for inner in value):
         return facts({str(n): inner for n, inner in enumerate(value, 1)}, name)
     if isinstance(value, list):
