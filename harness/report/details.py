@@ -357,8 +357,11 @@ def _shown(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _helpers_asked(runs: Iterable[dict[str, Any] | None]) -> set[tuple[str, ...]]:
     """Return the ids of the helpers whom the ego asked together in some decision of these runs."""
-    decisions = [decision for run in runs if run for decision in run["decisions"]]
-    return {tuple(message["from"] for message in each["messages"]) for each in decisions}
+    sets = set[tuple[str, ...]]()
+    for run in filter(None, runs):
+        for decision in run["decisions"]:
+            sets.add(tuple(message["from"] for message in decision["messages"]))
+    return sets
 
 
 def _fields(answer: Answer) -> dict[str, Any]:

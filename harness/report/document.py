@@ -35,24 +35,28 @@ class Table:
     @property
     def words(self) -> list[bool]:
         """Whether each column has sentences, which begin at the left and wrap on the page."""
-        return [
-            any(len(Markup(row[n]).striptags()) > LONGEST_NUMBER for row in self.rows)
-            for n in range(len(self.heads))
-        ]
+        columns = range(len(self.heads))
+        longest = [0 for _ in columns]
+        for row in self.rows:
+            for n in columns:
+                longest[n] = max(longest[n], len(Markup(row[n]).striptags()))
+        return [length > LONGEST_NUMBER for length in longest]
 
     @property
     def in_terminal(self) -> tuple[list[str], list[list[str]]]:
         """Heads and rows of the columns that a terminal has room for, as plain text."""
-        rows = [[self.heads[n] for n in self.terminal]]
-        rows += [[_plain(row[n]) for n in self.terminal] for row in self.rows[: self.most]]
-        return rows[0], rows[1:]
+        heads = [self.heads[n] for n in self.terminal]
+        rows = []
+        for row in self.rows[: self.most]:
+            rows.append([_plain(row[n]) for n in self.terminal])
+        return heads, rows
 
 
 @dataclass(frozen=True)
 class Section:
-    """What a page says of one thing."""
+    """The part of a page about one study, suite or run."""
 
-    title: str  # what was played
+    title: str  # what was run
     headline: Sequence[str] = ()  # the outcome in sentences
     # how it was made: n, what the intervals are over, and what the outcome is conditional on
     about: Sequence[str] = ()
@@ -86,8 +90,10 @@ def _plain(cell: str) -> str:
 
 def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
     """Return the least and the greatest of values and ends; 0 and 1 of none."""
-    each = [known(x) for b in bounded for x in (b.value, b.low, b.high)]
-    numbers = [x for x in each if x is not None]
+    numbers = list[float]()
+    for each in bounded:
+        ends = (known(each.value), known(each.low), known(each.high))
+        numbers += [number for number in ends if number is not None]
     return min(numbers, default=0.0), max(numbers, default=1.0)
 
 
@@ -106,14 +112,16 @@ def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Ma
     def x(value: float) -> float:
         return round(8 + (value - least) / ((most - least) or 1.0) * (WIDTH - 16), 1)
 
-    value, low, high = (known(number) for number in (bounded.value, bounded.low, bounded.high))
-    zero = f'<path class="zero" d="M{x(0.0)} 0V{HEIGHT}"/>' if least < 0 < most else ""
-    spread = ""
+    low, high = known(bounded.low), known(bounded.high)
+    zero = interval = ""
+    if least < 0 < most:
+        zero = f'<path class="zero" d="M{x(0.0)} 0V{HEIGHT}"/>'
     if low is not None and high is not None:
-        spread = f'<path d="M{x(low)} {y}H{x(high)}M{x(low)} {y - 3}v6M{x(high)} {y - 3}v6"/>'
-    at, name = x(value or 0.0), f"forest {verdict}".strip()
+        interval = f'<path d="M{x(low)} {y}H{x(high)}M{x(low)} {y - 3}v6M{x(high)} {y - 3}v6"/>'
+    left = x(known(bounded.value) or 0.0) - 3.5
+    square = f'<rect x="{left}" y="{y - 3.5}" width="7" height="7"/>'
+    name = f"forest {verdict}".strip()
     return Markup(
         f'<svg class="{name}" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
-        f'aria-hidden="true">{zero}{spread}<rect x="{at - 3.5}" y="{y - 3.5}" width="7" '
-        f'height="7"/></svg>'
+        f'aria-hidden="true">{zero}{interval}{square}</svg>'
     )

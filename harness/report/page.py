@@ -32,11 +32,13 @@ from harness.report.remarks import sentences
 from harness.report.runs import Runs
 from harness.report.sections import sections
 from harness.report.templating import environment
+from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS
 from harness.runs.reliability import LEAST
 
 PARTS_SHARED = 8  # fewest parts for which starting workers takes less time than they save
 HEAD = 1 << 14  # bytes of a page within which it states what it lacks
+SETTINGS = ("window_s", "consensus", "content")  # of a condition, for the script
 
 
 @uncollected()
@@ -121,27 +123,30 @@ def render(
 def _pieces(
     runs: Runs, decisions: Decisions, progress: Callable[[int], None], workers: Workers
 ) -> Iterator[str]:
-    """The page in pieces, since that of a million decisions weighs as much as all that is read for
-    it.
+    """Return the page in pieces: that of a million decisions weighs as much as all that is read
+    for it.
     """
     lines = matrix.lines(runs)
     charts = list(panels(runs))
-    alone = len(runs.names) == 1
     by_name = dict(zip(runs.names, runs.runs, strict=True))
+    if len(runs.runs) == 1:
+        title, headline = runs.names[0], words.headline(runs.runs[0])
+        key_figures = [*words.figures(runs.runs[0]), *tile(runs.runs[0])]
+    else:
+        title, headline = f"{len(runs.names)} runs", matrix.headline(lines)
+        key_figures = matrix.figures(lines)
     return (
         environment()
         .get_template("page.html.j2")
         .generate(
             runs=runs,
-            title=runs.names[0] if alone else f"{len(runs.names)} runs",
+            title=title,
             policy=library.policy(library.vega(), library.script()),
             lacks=" ".join(decisions.lacks()),
             warnings=of_runs(by_name, *FIRST),
             size=contents.size(runs),
-            headline=words.headline(runs.runs[0]) if alone else matrix.headline(lines),
-            key_figures=[*words.figures(runs.runs[0]), *tile(runs.runs[0])]
-            if alone
-            else matrix.figures(lines),
+            headline=headline,
+            key_figures=key_figures,
             actions=_actions(runs),
             lines=lines,
             lead=IN_WORDS[lines[0].lead],
@@ -171,6 +176,7 @@ def _pieces(
 def _packed(
     parts: Sequence[Part], progress: Callable[[int], None], workers: Workers
 ) -> Iterator[Markup]:
+    """Yield the blocks of all parts, compressed; of few parts here, else by workers."""
     if workers == 1 or len(parts) < PARTS_SHARED:
         for part in parts:
             for block in part.details.blocks(part.ids):
@@ -183,14 +189,10 @@ def _packed(
         done[place] = blocks
         progress(len(parts[place].ids))
 
-    each(
-        Part.packed,
-        parts,
-        workers,
-        keep,
-        lambda part: f"scenes {part.ids[0]} to {part.ids[-1]}",
-        False,
-    )
+    def name(part: Part) -> str:
+        return f"scenes {part.ids[0]} to {part.ids[-1]}"
+
+    each(Part.packed, parts, workers, keep, name, False)
     for place in range(len(parts)):
         yield from done.pop(place)
 
@@ -200,25 +202,13 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     surface = ground_of(runs.scenario)
     return {
         "names": runs.names,
-        "runs": [
-            {
-                "inference_s": {"ego": latency.ego_s, "helper": latency.helper_s},
-                "points": {
-                    c["name"]: {
-                        **{key: c.get(key) for key in ("window_s", "consensus", "content")},
-                        "question": question_under(c).name,
-                    }
-                    for c in run.manifest.conditions
-                },
-            }
-            for run, latency in ((run, run.manifest.latency) for run in runs.runs)
-        ],
+        "runs": [_settings(run) for run in runs.runs],
         "meanings": {str(member): member.meaning for member in (*Status, *Repair)},
         "ground": {
             "view_m": VIEW_M,
-            "outlines": [o.round(2).tolist() for o in surface.outlines],
-            "marks": [m.tolist() for m in surface.marks],
-            "stops": [s.tolist() for s in surface.stops],
+            "outlines": [outline.round(2).tolist() for outline in surface.outlines],
+            "marks": [mark.tolist() for mark in surface.marks],
+            "stops": [stop.tolist() for stop in surface.stops],
         },
         "charts": {chart.id: chart.spec for chart in charts},
         "actions": _actions(runs),
@@ -227,10 +217,20 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     }
 
 
+def _settings(run: Run) -> dict[str, Any]:
+    """Return a run's inference times, in s, and the settings of its conditions by their names."""
+    points = {}
+    for condition in run.manifest.conditions:
+        point = {name: condition.get(name) for name in SETTINGS}
+        points[condition["name"]] = {**point, "question": question_under(condition).name}
+    latency = run.manifest.latency
+    return {"inference_s": {"ego": latency.ego_s, "helper": latency.helper_s}, "points": points}
+
+
 def _actions(runs: Runs) -> dict[str, tuple[str, str]]:
     """Return the colour of each action, and of text on it."""
-    every = colours.actions(runs.actions)
-    return {
-        name: (c, colours.INK if 5 * n < 3 * len(every) else colours.WHITE)
-        for n, (name, c) in enumerate(every.items())
-    }
+    fills = colours.actions(runs.actions)
+    pairs = {}
+    for n, (name, fill) in enumerate(fills.items()):
+        pairs[name] = fill, colours.INK if 5 * n < 3 * len(fills) else colours.WHITE
+    return pairs

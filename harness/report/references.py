@@ -23,11 +23,11 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
         values = {SUCCESS: success, **by_danger(success, dataset.dangerous)}
-        rates = {
-            name: halved(name, lambda each: rate_interval(values[each]))
-            for name in known_in(values)
-        }
-        return {name: Score.of(reference, name, rate, "episodes") for name, rate in rates.items()}
+        of_reference = {}
+        for metric in known_in(values):
+            rate = halved(metric, lambda half: rate_interval(values[half]))
+            of_reference[metric] = Score.of(reference, metric, rate, "episodes")
+        return of_reference
 
     return {name: scores(name, success) for name, success in dataset.reference_success().items()}
 
@@ -63,14 +63,14 @@ def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) 
     """Say how well each reference does, the best first, and what those that look at nothing do."""
     if not references:
         return ""
-    best_first = sorted(references.items(), key=lambda of: -(of[1].value or 0.0))
-    rates = [
-        f"{label(name, scenario)} {cell['value']} ({cell['interval']})"
-        for name, cell in ((name, shown(score)) for name, score in best_first)
-    ]
+    rates = []
+    for name in sorted(references, key=lambda name: -(references[name].value or 0.0)):
+        cell = shown(references[name])
+        rates.append(f"{label(name, scenario)} {cell['value']} ({cell['interval']})")
     n = next(iter(references.values())).n
     text = (
         f" Dashed: references that need no model, in the same episodes: {', '.join(rates)}; n = "
         f"{n}."
     )
-    return " ".join([text, *(f"{meaning(name, exact)}." for name in BESIDE if name in references)])
+    meanings = [f"{meaning(name, exact)}." for name in BESIDE if name in references]
+    return " ".join([text, *meanings])

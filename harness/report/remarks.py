@@ -26,7 +26,7 @@ LeftOut = Mapping[str, Sequence[Mapping[str, Any]]]
 
 @runtime_checkable
 class Remarks(Protocol):
-    """What says something of decision points."""
+    """An extension's remarks on decision points."""
 
     def sentences(self, runs: Runs) -> Iterable[Markup]:
         """Return what stands above the list;
@@ -50,13 +50,50 @@ def sentences(runs: Runs) -> list[Markup]:
 
     Raises UserError if a file of a run is broken.
     """
-    said: list[Markup] = []
+
+    def escaped(remarks: Remarks) -> list[Markup]:
+        said = list(remarks.sentences(runs))
+        texts(said)  # raises what stands for a failure if one is no text
+        return [escape(sentence) for sentence in said]
+
+    sentences: list[Markup] = []
     for name in REMARKS:
         try:
-            said += REMARKS.ask(name, lambda remarks: _escaped(remarks.sentences(runs)))
+            sentences += REMARKS.ask(name, escaped)
         except Failed as error:
-            said.append(escape(visible(str(error))))
-    return said
+            sentences.append(escape(visible(str(error))))
+    return sentences
+
+
+def left_out(self, run: Run) -> LeftOut:
+    """Return what is drawn beside the answers of decision points:
+    what they became without one thing.
+    """
+    ...
+
+
+REMARKS: Plugins[Remarks] = Plugins("swarmdrive.remarks", Remarks, {})
+
+
+def sentences(runs: Runs) -> list[Markup]:
+    """Return what extensions say above the list.
+    Of one that fails, a sentence says so in its place.
+
+    Raises UserError if a file of a run is broken.
+    """
+
+    def escaped(remarks: Remarks) -> list[Markup]:
+        said = list(remarks.sentences(runs))
+        texts(said)  # raises what stands for a failure if one is no text
+        return [escape(sentence) for sentence in said]
+
+    sentences: list[Markup] = []
+    for name in REMARKS:
+        try:
+            sentences += REMARKS.ask(name, escaped)
+        except Failed as error:
+            sentences.append(escape(visible(str(error))))
+    return sentences
 
 
 def _escaped(sentences: Iterable[str]) -> list[Markup]:
@@ -74,15 +111,19 @@ def left_out(run: Run) -> LeftOut:
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:
         with suppress(Failed):
-            for scene, some in REMARKS.ask(
-                name, lambda remarks: _plain(remarks.left_out(run))
-            ).items():
-                joined.setdefault(scene, []).extend(some)
+            by_scene = REMARKS.ask(name, lambda remarks: _plain(remarks.left_out(run)))
+            for scene, rows in by_scene.items():
+                joined.setdefault(scene, []).extend(rows)
     return joined
 
 
-def _plain(stated: LeftOut) -> LeftOut:
-    """Return the same. Raises what stands for a failure if a page cannot hold it."""
-    plain = {scene: [dict(each) for each in some] for scene, some in stated.items()}
+def _plain(left_out: LeftOut) -> LeftOut:
+    """Return the same as dictionaries.
+
+    Raises TypeError or ValueError if a page cannot hold a value as JSON.
+    """
+    plain = {}
+    for scene, rows in left_out.items():
+        plain[scene] = [dict(row) for row in rows]
     json.dumps(plain, allow_nan=False)
     return plain

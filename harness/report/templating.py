@@ -45,8 +45,8 @@ def environment(*more: Path) -> Environment:
 
 
 def visible(value: Any) -> Any:
-    """Text with every character that shows nothing, or turns the line around, spelt out.
-    None is a dash.
+    """Return a text with every character that shows nothing, or turns the line around, spelt out;
+    None as a dash, and any other value as it is.
     """
     if value is None or isinstance(value, Undefined):
         return "–"
@@ -65,4 +65,7 @@ def _mapping(record: Any) -> Any:
 def _table(rows: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
     """Return the head and body of a table with a column for every key."""
     head = list(dict.fromkeys(key for row in rows for key in row))
-    return head, [[row.get(key) for key in head] for row in rows]
+    body = []
+    for row in rows:
+        body.append([row.get(key) for key in head])
+    return head, body
