@@ -51,48 +51,37 @@ def command(
     if radio is not None and not isinstance(radio, Transceiver):
         raise UserError(f"--channel {printable(channel)}: give a physical radio, such as its-g5")
     sizes = {each: size(each, content) for each in ([name] if name else names)}
-    airtimes_s = {
-        each: float(radio.message_s(s.packet)) for each, s in sizes.items() if radio and s.packet
-    }
+    airtimes_s = {}
+    for message, bits in sizes.items():
+        if radio and bits.packet:
+            airtimes_s[message] = float(radio.message_s(bits.packet))
     members = []
-    if name and (bits := sizes[name].message):
-        members = [share for share in (*shares(name, content), *wraps(name, bits)) if share.bits]
+    if name and (bits_of_message := sizes[name].message):
+        every_share = (*shares(name, content), *wraps(name, bits_of_message))
+        members = [share for share in every_share if share.bits]
     if as_json:
-        echo_json(
-            {
-                "content": content._asdict(),
-                "messages": [
-                    {
-                        "message": each,
-                        **{f"{part}_bits": float(bits) for part, bits in s._asdict().items()},
-                        "airtime_s": airtimes_s.get(each),
-                    }
-                    for each, s in sizes.items()
-                ],
-                "members": [
-                    {
-                        "member": ".".join(share.path),
-                        "bits": float(share.bits),
-                        "source": share.source,
-                    }
-                    for share in members
-                ],
-            }
-        )
+        rows = []
+        for message, bits in sizes.items():
+            parts = {f"{part}_bits": float(value) for part, value in bits._asdict().items()}
+            rows.append({"message": message, **parts, "airtime_s": airtimes_s.get(message)})
+        shares_of_members = [
+            {"member": ".".join(share.path), "bits": float(share.bits), "source": share.source}
+            for share in members
+        ]
+        content_of_messages = content._asdict()
+        echo_json({"content": content_of_messages, "messages": rows, "members": shares_of_members})
         return
     heads = ["bytes", "message", "envelope", "headers", "packet", "with certificate"]
+    if radio:
+        heads.append("on air, ms")
     ms = Unit(decimals=2, factor=1000)
-    table(
-        [*heads, *(["on air, ms"] if radio else [])],
-        [
-            (
-                each,
-                *(f"{bits / 8:g}" for bits in s),
-                *([ms.number(airtimes_s.get(each))] if radio else []),
-            )
-            for each, s in sizes.items()
-        ],
-    )
+    lines = []
+    for message, bits in sizes.items():
+        cells = [message, *(f"{value / 8:g}" for value in bits)]
+        if radio:
+            cells.append(ms.number(airtimes_s.get(message)))
+        lines.append(cells)
+    table(heads, lines)
     if members:
         typer.echo()
         table(["bits", ""], [(".".join(share.path), f"{share.bits:g}") for share in members])

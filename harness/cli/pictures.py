@@ -117,8 +117,8 @@ def draw(image: "Image") -> bool:
 
 
 def half_blocks(pixels: "Pixels") -> "Text":
-    """A picture in characters: each is an upper half block of one pixel's colour on the colour of
-    another.
+    """Return a picture in characters, of pixels (H, W, 3): each is an upper half block of one
+    pixel's colour on the colour of another.
     """
     from rich.color import Color
     from rich.style import Style
@@ -128,15 +128,14 @@ def half_blocks(pixels: "Pixels") -> "Text":
     columns = min(COLUMNS, width)
     lines = max(1, min(round(columns * height / width / 2), height // 2))
     small = _shrunk(_shrunk(pixels, 2 * lines, 0), columns, 1).round().astype(int).tolist()
-    return Text("\n").join(
-        Text.assemble(
-            *(
-                ("▀", Style(color=Color.from_rgb(*upper), bgcolor=Color.from_rgb(*lower)))
-                for upper, lower in zip(above, below, strict=True)
-            )
-        )
-        for above, below in zip(small[::2], small[1::2], strict=True)
-    )
+    rows = []
+    for above, below in zip(small[::2], small[1::2], strict=True):
+        blocks = []
+        for upper, lower in zip(above, below, strict=True):
+            style = Style(color=Color.from_rgb(*upper), bgcolor=Color.from_rgb(*lower))
+            blocks.append(("▀", style))
+        rows.append(Text.assemble(*blocks))
+    return Text("\n").join(rows)
 
 
 def _shrunk(pixels: Any, n: int, axis: int) -> Any:

@@ -17,6 +17,7 @@ from harness.core.figures import Unit, known, shown
 if TYPE_CHECKING:
     from harness.radio.channel import Channel
     from harness.radio.profiles import Profile
+    from harness.radio.reception import Check
 
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(
@@ -58,19 +59,18 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
         busy = known(channel.busy_ratio())
     if as_json:
-        about = {key: value for key, value in asdict(profile).items() if key != "parameters"}
-        reception = {"distance_m": DISTANCES_M, **curves} if curves else None
-        echo_json(
-            {
-                "name": name,
-                **about,
-                "settings": settings,
-                "outside": beyond,
-                "reception": reception,
-                "busy_ratio": busy,
-                "latency_ms": {"distance_m": DISTANCES_M, **latencies} if latencies else None,
-            }
-        )
+        about = asdict(profile)
+        del about["parameters"]
+        result = {
+            "name": name,
+            **about,
+            "settings": settings,
+            "outside": beyond,
+            "reception": {"distance_m": DISTANCES_M, **curves} if curves else None,
+            "busy_ratio": busy,
+            "latency_ms": {"distance_m": DISTANCES_M, **latencies} if latencies else None,
+        }
+        echo_json(result)
         return
     typer.echo(f"{printable(profile_name)} · {printable(profile.model)} · {profile.status}")
     for text in (profile.description, f"source: {profile.source}"):
@@ -84,19 +84,20 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
         typer.echo("packet loss is the same at every distance and behind every obstacle")
         return
     sights = ["in sight", "behind a car", "behind a building"]
-    shares = zip(DISTANCES_M, *curves.values(), strict=True)
-    table(
-        ["reception, %", *sights],
-        [(f"{d} m", *(f"{100 * share:.1f}" for share in row)) for d, *row in shares],
-    )
+    rows = []
+    for n, distance_m in enumerate(DISTANCES_M):
+        rows.append((f"{distance_m} m", *(f"{100 * curve[n]:.1f}" for curve in curves.values())))
+    table(["reception, %", *sights], rows)
     if latencies:
         typer.echo()
-        pairs = (
-            [f"{p50:.1f} / {p95:.1f}" for p50, p95 in zip(*both.values(), strict=True)]
-            for both in latencies.values()
-        )
-        rows = zip(DISTANCES_M, *pairs, strict=True)
-        table(["latency p50 / p95, ms", *sights], [(f"{d} m", *row) for d, *row in rows])
+        rows = []
+        for n, distance_m in enumerate(DISTANCES_M):
+            cells = [f"{distance_m} m"]
+            for percentiles in latencies.values():
+                p50, p95 = (values[n] for values in percentiles.values())
+                cells.append(f"{p50:.1f} / {p95:.1f}")
+            rows.append(tuple(cells))
+        table(["latency p50 / p95, ms", *sights], rows)
     if busy is not None:
         typer.echo(f"channel busy ratio {busy:.3f} under the background load")
 
@@ -141,78 +142,73 @@ def check(
             "give a physical radio, such as mode4"
         )
     _refuse_format(out)
-    found = checked(channel, n, against or (), f"channel profile {profile}")
+    result = checked(channel, n, against or (), f"channel profile {profile}")
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
         from harness.report.drawing.pictures import save
         from harness.studies.figures.lines import reception
 
-        save(reception(name, channel, found.messages, found.curves), out, out.suffix[1:])  # type: ignore[arg-type]
+        save(reception(name, channel, result.messages, result.curves), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
-        curves = [
-            {
-                "configuration": c.curve.configuration,
-                "source": c.curve.source,
-                "n": len(c.reception),
-                "mean_difference": c.mean_difference,
-                "largest_difference": c.largest_difference,
+        curves = []
+        for compared in result.curves:
+            curve = {
+                "configuration": compared.curve.configuration,
+                "source": compared.curve.source,
+                "n": len(compared.reception),
+                "mean_difference": compared.mean_difference,
+                "largest_difference": compared.largest_difference,
             }
-            for c in found.curves
-        ]
-        echo_json({"name": name, "outside": beyond, **vars(found), "curves": curves})
+            curves.append(curve)
+        echo_json({"name": name, "outside": beyond, **vars(result), "curves": curves})
         return
-    table(
-        ["in sight", "model %", "one message %", "round trip %", "delay ms"],
-        [
-            (
-                f"{m.distance_m:g} m",
-                f"{100 * m.model:.1f}",
-                shown(m.crossing),
-                shown(m.round_trip),
-                f"{1000 * m.delay_s:.1f}",
-            )
-            for m in found.messages
-        ],
-    )
+    _messages_table(result)
     typer.echo(f"n = {n} messages per distance, each with its own shadowing; 95 % intervals")
-    if found.waits:
+    if result.waits:
         typer.echo()
-        table(
-            ["next packet after, s", "mean", "95th percentile", "if independent"],
-            [
-                (
-                    f"{w.distance_m:g} m",
-                    shown(w.mean_s, Unit("s", 3)),
-                    shown(w.p95_s, Unit("s", 2)),
-                    f"{w.independent_s:.3f}",
-                )
-                for w in found.waits
-            ],
-        )
-        busy = f"busy ratio {found.busy_ratio:.3f}"
+        _waits_table(result)
+        busy = f"busy ratio {result.busy_ratio:.3f}"
         typer.echo(f"n = {n // 10} trips a distance, {PACKETS} packets each; {busy}")
     for line in beyond:
         typer.echo(line)
-    if found.curves:
+    if result.curves:
         typer.echo()
-        table(
-            ["curve", "points", "mean apart", "largest"],
-            [
-                (
-                    c.curve.configuration or c.curve.source,
-                    str(len(c.reception)),
-                    f"{100 * c.mean_difference:.1f}",
-                    f"{100 * c.largest_difference:+z.1f}",
-                )
-                for c in found.curves
-            ],
-        )
-        mean = f"{100 * found.mean_difference:.1f} points apart on average"
-        typer.echo(f"{len(found.curves)} curves, {mean}; model less theirs")
-        sources = dict.fromkeys(c.curve.source for c in found.curves)
+        _curves_table(result)
+        mean = f"{100 * result.mean_difference:.1f} points apart on average"
+        typer.echo(f"{len(result.curves)} curves, {mean}; model less theirs")
+        sources = dict.fromkeys(compared.curve.source for compared in result.curves)
         typer.echo(printable("; ".join(sources), 1000))
     if out:
         typer.echo(f"wrote {printable(out)}")
+
+
+def _messages_table(result: "Check") -> None:
+    """Print the reception of single messages, a row a distance."""
+    rows = []
+    for at in result.messages:
+        rates = (f"{100 * at.model:.1f}", shown(at.crossing), shown(at.round_trip))
+        rows.append((f"{at.distance_m:g} m", *rates, f"{1000 * at.delay_s:.1f}"))
+    table(["in sight", "model %", "one message %", "round trip %", "delay ms"], rows)
+
+
+def _waits_table(result: "Check") -> None:
+    """Print how long after one packet the next arrives, a row a distance."""
+    rows = []
+    for wait in result.waits:
+        mean, p95 = shown(wait.mean_s, Unit("s", 3)), shown(wait.p95_s, Unit("s", 2))
+        rows.append((f"{wait.distance_m:g} m", mean, p95, f"{wait.independent_s:.3f}"))
+    table(["next packet after, s", "mean", "95th percentile", "if independent"], rows)
+
+
+def _curves_table(result: "Check") -> None:
+    """Print how far the model is from published curves, a row a curve."""
+    rows = []
+    for compared in result.curves:
+        name = compared.curve.configuration or compared.curve.source
+        mean = f"{100 * compared.mean_difference:.1f}"
+        largest = f"{100 * compared.largest_difference:+z.1f}"
+        rows.append((name, str(len(compared.reception)), mean, largest))
+    table(["curve", "points", "mean apart", "largest"], rows)
 
 
 def crowd(
@@ -250,11 +246,10 @@ def crowd(
         raise unknown("--sight", sight, SIGHTS)
     _refuse_format(out)
     every = {name: channel_of(name)[1] for name in names} if names else CHANNELS.usable()
-    loaded = {
-        name: channel
-        for name, channel in every.items()
-        if isinstance(channel, Physical) and "density_per_km" in settable(channel)
-    }
+    loaded = {}
+    for name, channel in every.items():
+        if isinstance(channel, Physical) and "density_per_km" in settable(channel):
+            loaded[name] = channel
     if lacks := [name for name in names or () if name not in loaded]:
         raise UserError(
             f"{printable(lacks[0])} has no density_per_km that a swarm could change; leave it out"
@@ -264,29 +259,28 @@ def crowd(
         from harness.report.drawing.pictures import save
         from harness.studies.figures.lines import crowds as draw
 
-        between = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}[
-            sight
-        ]
-        title = f"one transmission over {distance_m:g} m {between}, vehicles within {radius_m:g} m"
+        words = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}
+        distance = f"{distance_m:g} m {words[sight]}"
+        title = f"one transmission over {distance}, vehicles within {radius_m:g} m"
         save(draw(VEHICLES, losses, title), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
         paper = losses.pop("paper")
-        echo_json(
-            {
-                "vehicles": VEHICLES,
-                "distance_m": distance_m,
-                "radius_m": radius_m,
-                "sight": sight,
-                "paper": paper,
-                "loss": losses,
-            }
-        )
+        result = {
+            "vehicles": VEHICLES,
+            "distance_m": distance_m,
+            "radius_m": radius_m,
+            "sight": sight,
+            "paper": paper,
+            "loss": losses,
+        }
+        echo_json(result)
         return
-    shares = zip(VEHICLES, *losses.values(), strict=True)
-    table(
-        ["lost, %", *map(printable, losses)],
-        [(f"{n} vehicles", *(f"{100 * share:.1f}" for share in row)) for n, *row in shares],
-    )
+    heads = ["lost, %", *(printable(name) for name in losses)]
+    rows = []
+    for n, vehicles in enumerate(VEHICLES):
+        cells = [f"{100 * curve[n]:.1f}" for curve in losses.values()]
+        rows.append((f"{vehicles} vehicles", *cells))
+    table(heads, rows)
     if out:
         typer.echo(f"wrote {printable(out)}")
 

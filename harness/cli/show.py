@@ -51,9 +51,12 @@ def show(study: "Study") -> None:
         typer.echo(fill(printable(text, LONGEST), WIDTH))
     for each in study.tables:
         if each.terminal:
-            heads, rows = each.in_terminal
             typer.echo(f"\n{fill(printable(each.title, LONGEST), WIDTH)}")
-            table(heads, [[printable(cell, CELL) for cell in row] for row in rows])
+            heads, rows = each.in_terminal
+            lines = []
+            for row in rows:
+                lines.append([printable(cell, CELL) for cell in row])
+            table(heads, lines)
     typer.echo()
     for text in study.about:
         typer.echo(fill(printable(text, LONGEST), WIDTH))

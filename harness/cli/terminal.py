@@ -66,13 +66,11 @@ def echo_each(
     as JSON, `plain` values of each.
     """
     if as_json:
-        echo_json(
-            [
-                {"name": name}
-                | ({"error": str(each)} if isinstance(each, UserError) else plain(each))
-                for name, each in things.items()
-            ]
-        )
+        rows = []
+        for name, thing in things.items():
+            values = {"error": str(thing)} if isinstance(thing, UserError) else plain(thing)
+            rows.append({"name": name, **values})
+        echo_json(rows)
         return
     for name, each in things.items():
         if isinstance(each, UserError):
@@ -106,7 +104,7 @@ def echo_text(text: str) -> None:
 
 
 def console() -> "Console":
-    """Plain text in 80 columns."""
+    """Return a console that prints plain text in 80 columns."""
     from rich.console import Console
 
     class Plain(Console):
@@ -124,28 +122,42 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """
     from rich.cells import cell_len, chop_cells
 
-    stacks = [wrap(head, HEAD) or [""] for head in heads[1:]]
-    height = max(map(len, stacks))
-    folded = zip(*([""] * (height - len(stack)) + stack for stack in stacks), strict=True)
-    names_of_heads = [""] * (height - 1) + [heads[0]]
-    lines = [*((name, *cells) for name, cells in zip(names_of_heads, folded, strict=True)), *rows]
-    names, *values = ([cell_len(cell) for cell in column] for column in zip(*lines, strict=True))
-    widths = [max(column) for column in values]
-    rooms = {gap: WIDTH - sum(widths) - gap * len(widths) for gap in (2, 1)}
-    gap, room = max(
-        rooms.items(), key=lambda of: (sum(length <= of[1] for length in names), of[1] >= 0)
-    )
+    lines = [*_folded(heads), *rows]
+    names = [cell_len(name) for name, *_ in lines]
+    widths = [0] * (len(heads) - 1)
+    for _, *cells in lines:
+        for n, cell in enumerate(cells):
+            widths[n] = max(widths[n], cell_len(cell))
+
+    def room_beside(gap: int) -> int:
+        return WIDTH - sum(widths) - gap * len(widths)
+
+    def fit(gap: int) -> tuple[int, bool]:
+        room = room_beside(gap)
+        return sum(length <= room for length in names), room >= 0
+
+    gap = max((2, 1), key=fit)
+    room = room_beside(gap)
     first = max((length for length in names if length <= room), default=0)
     for (name, *cells), length in zip(lines, names, strict=True):
         if length > room:
             for piece in chop_cells(name, WIDTH):
                 typer.echo(piece)
             name, length = "", 0
-        figures = (
-            f"{' ' * (gap + w - cell_len(cell))}{cell}"
-            for w, cell in zip(widths, cells, strict=True)
-        )
-        typer.echo(f"{name}{' ' * (first - length)}{''.join(figures)}".rstrip())
+        line = name + " " * (first - length)
+        for width, cell in zip(widths, cells, strict=True):
+            line += " " * (gap + width - cell_len(cell)) + cell
+        typer.echo(line.rstrip())
+
+
+def _folded(heads: Sequence[str]) -> list[Sequence[str]]:
+    """Return a table's heads as lines, with heads longer than `HEAD` folded at the bottom."""
+    name, *others = heads
+    stacks = [wrap(head, HEAD) or [""] for head in others]
+    height = max(len(stack) for stack in stacks)
+    padded = [[""] * (height - len(stack)) + stack for stack in stacks]
+    names = [""] * (height - 1) + [name]
+    return list(zip(names, *padded, strict=True))
 
 
 def attributes(kind: type) -> dict[str, str]:
