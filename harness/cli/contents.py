@@ -64,25 +64,33 @@ def command(
     from harness.studies.replayed_run import ReplayedRun
 
     with bar("points", quiet=as_json or quiet or dry_run, grows=True) as progress:
-        own = options.cards(model)
-        given = [
-            [ReplayedRun(run, latency, progress, not no_model, None, own) for run in folders(path)]
-            for path in runs
-        ]
-        replayed = [run for each in given for run in each]
+        cards = options.cards(model)
+        by_path, replayed = list[list[ReplayedRun]](), list[ReplayedRun]()
+        for path in runs:
+            of_path = [
+                ReplayedRun(run, latency, progress, not no_model, None, cards)
+                for run in folders(path)
+            ]
+            by_path.append(of_path)
+            replayed += of_path
         panels = panels_of(replayed, condition, over, grid)
-        swarms = models(given, panels)
+        swarms = models(by_path, panels)
         if dry_run:
-            counts = {each.name: asked_at_most(each, panels) for each in swarms}
+            counts = {swarm.name: asked_at_most(swarm, panels) for swarm in swarms}
             if as_json:
                 echo_json(counts)
             elif not quiet:
-                for name, by_family in counts.items():
-                    for family, by_role in by_family.items():
-                        lacks = ", ".join(f"{count} of {role}" for role, count in by_role.items())
-                        typer.echo(f"{printable(name)}, {printable(family)}: at most {lacks}")
+                _show_counts(counts)
             return
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "contents"
         results = run_contents(swarms, panels, draws, where, progress)
     finish(contents_study(results, draws), where, as_json, quiet)
+
+
+def _show_counts(counts: dict[str, dict[str, dict[str, int]]]) -> None:
+    """Print how many questions may be asked, by model, family and role."""
+    for name, by_family in counts.items():
+        for family, by_role in by_family.items():
+            questions = ", ".join(f"{count} of {role}" for role, count in by_role.items())
+            typer.echo(f"{printable(name)}, {printable(family)}: at most {questions}")

@@ -104,16 +104,16 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
     lost = 0 if problems else load.load(path).lost
     built_again = find_spec("highway_env") is not None
     if as_json:
-        counts = {k: getattr(manifest, k) for k in ("name", "episodes", "nodes")}
-        echo_json(
-            {
-                **counts,
-                "sha256": digest,
-                "problems": problems,
-                "lost_before_first_action": lost,
-                "built_again": built_again,
-            }
-        )
+        result = {
+            "name": manifest.name,
+            "episodes": manifest.episodes,
+            "nodes": manifest.nodes,
+            "sha256": digest,
+            "problems": problems,
+            "lost_before_first_action": lost,
+            "built_again": built_again,
+        }
+        echo_json(result)
     elif problems:
         typer.echo("\n".join(problems))
     else:
@@ -250,17 +250,12 @@ def _as_mapping(standing: dict[str, "Estimate"]) -> dict[str, "Estimate"]:
 
 def _table(episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> None:
     heads = ("driver", "frozen % [95 % CI]", "closed loop % [95 % CI]", "difference, pts", "same %")
-    table(
-        heads,
-        [
-            (
-                driver,
-                *(shown(s[name]) for name in ("frozen", "closed", "difference")),
-                f"{100 * s['agreement'].value:.0f}",
-            )
-            for driver, s in standings.items()
-        ],
-    )
+    rows = []
+    for driver, standing in standings.items():
+        estimates = (standing["frozen"], standing["closed"], standing["difference"])
+        same = f"{100 * standing['agreement'].value:.0f}"
+        rows.append((driver, *(shown(estimate) for estimate in estimates), same))
+    table(heads, rows)
     text = console()
     text.print(
         f"n = {episodes} episodes; same: share of them that end alike, frozen and in closed loop"

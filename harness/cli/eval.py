@@ -19,10 +19,12 @@ from harness.runs.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
+    from harness.dataset.load import Dataset
+    from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
 
 SUCCESS = Column("success % [95 % CI]", leading.SUCCESS, interval=True)
-GAINS = {  # of what leads
+GAINS = {  # by headline metric
     leading.SUCCESS: Column("gain, points", "success_gain_over_single-local", interval=True),
     leading.BALANCED: Column(
         "balanced gain, in points", "balanced_success_gain_over_single-local", interval=True
@@ -74,32 +76,27 @@ def command(
     from harness.runs.folder import read
 
     world: Any = settings.world
-    named = suites.named(world.dataset)
+    named_suite = suites.named(world.dataset)
     sources = [resolve.frozen(world, name) for name in suites.datasets(world.dataset)]
-    frozen = [source.dataset for source in sources]
-    options.say_all(world.limit, frozen)
+    datasets = [source.dataset for source in sources]
+    options.say_all(world.limit, datasets)
     specs = [resolve.spec(settings, source) for source in sources]
-    if named:
-        suite.check(named, specs)
-    several = (
-        f"--repeats {repeat}" if repeat is not None else f"suite {named.name}" if named else ""
-    )
+    if named_suite:
+        suite.check(named_suite, specs)
+    several = f"suite {named_suite.name}" if named_suite else ""
+    if repeat is not None:
+        several = f"--repeats {repeat}"
     if several and sources[0].until:
         raise UserError(
             f"{several}: runs that stop early have other layouts each; leave --until-... out"
         )
     if repeat is not None:
-        if named:
+        if named_suite:
             raise UserError(
                 f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of "
                 "its datasets"
             )
-        if full:
-            raise UserError("--full: repeats have a page without decisions; leave it out")
-        if tracker:
-            raise UserError(
-                f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out"
-            )
+        _refuse_with_repeats(full, tracker)
         repeats.check(specs[0], repeat)
         if workers is not None:
             raise UserError(
@@ -109,16 +106,15 @@ def command(
     if dry_run:
         from harness.evaluate.dry_run import count
 
-        counted = [
-            count(spec, dataset, tokenizer) for spec, dataset in zip(specs, frozen, strict=True)
-        ]
+        pairs = zip(specs, datasets, strict=True)
+        counts = [count(spec, dataset, tokenizer) for spec, dataset in pairs]
         if repeat is not None:
-            counted[0] |= {"repeats": repeat}
+            counts[0] |= {"repeats": repeat}
         if as_json:
-            echo_json(counted if named else counted[0])
+            echo_json(counts if named_suite else counts[0])
         elif not quiet:
-            for each in zip(specs, counted, strict=True):
-                show_counted(*each)
+            for spec, counted in zip(specs, counts, strict=True):
+                show_counted(spec, counted)
         return
     trackers = hooks.chosen(tracker or ())
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
@@ -134,42 +130,58 @@ def command(
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
             return
-        if named:
-            suite.evaluate(named, specs, frozen, out, evaluated, quiet, as_json)
+        if named_suite:
+            suite.evaluate(named_suite, specs, datasets, out, evaluated, quiet, as_json)
             return
         done, page = evaluated(specs[0], out or default_out(specs[0]))
-    dataset = walked(frozen[0], done)
     if as_json:
         echo_json(as_mapping(read(done.out)))
-    if silent:
-        return
+    if not silent:
+        selected = bool(sources[0].selection.given)
+        _show(done, walked(datasets[0], done), len(specs[0].seeds), selected)
+        typer.echo(f"wrote {printable(page)}")
+
+
+def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool) -> None:
+    """Print a run's table beside the references that need no model.
+
+    `selected` is whether its episodes are some of the dataset's.
+    """
     from harness.report.references import BESIDE, in_trees, label, meaning
 
-    selected = bool(sources[0].selection.given)
-    seeds_of = dataset.manifest.episodes if selected else len(dataset.episodes)
-    references = in_trees(dataset)
-    gain = [
-        of
-        for of in [GAINS[leading.lead_of(done)]]
-        if any(s.metric == of.metric for s in done.scores)
-    ]
-    beside = {name: references[name] for name in BESIDE if name in references}
-    notes = (
-        f"n = {crossed(len(dataset.episodes), len(specs[0].seeds))}; "
-        f"{'of ' if selected else ''}{stated(dataset.manifest.seed, seeds_of)};",
+    every_reference = in_trees(dataset)
+    references = {name: every_reference[name] for name in BESIDE if name in every_reference}
+    gain = GAINS[leading.lead_of(done)]
+    has_gain = any(score.metric == gain.metric for score in done.scores)
+    columns = (SUCCESS, gain, *COLUMNS) if has_gain else (SUCCESS, *COLUMNS)
+    episodes = dataset.manifest.episodes if selected else len(dataset.episodes)
+    layout_seeds = stated(dataset.manifest.seed, episodes)
+    notes = [
+        f"n = {crossed(len(dataset.episodes), seeds)}; {'of ' * selected}{layout_seeds};",
         "95 % intervals over episodes; msgs: per episode"
-        + "; gain: over single-local, paired" * bool(gain),
-        *map(meaning, beside),
-    )
-    rows = {label(name, dataset.scenario): scores for name, scores in beside.items()}
-    show(done, dataset.name, (SUCCESS, *gain, *COLUMNS), notes, rows)
-    typer.echo(f"wrote {printable(page)}")
+        + "; gain: over single-local, paired" * has_gain,
+        *(meaning(name) for name in references),
+    ]
+    rows = {label(name, dataset.scenario): scores for name, scores in references.items()}
+    show(done, dataset.name, columns, notes, rows)
+
+
+def _refuse_with_repeats(full: bool, tracker: Sequence[str] | None) -> None:
+    if full:
+        raise UserError("--full: repeats have a page without decisions; leave it out")
+    if tracker:
+        raise UserError(
+            f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out"
+        )
 
 
 def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: str) -> None:
     from harness.core.parallel import Ray
 
-    for agent in (agent for spec in specs for agent in spec.agents if agent.can.language_model):
+    agents = [agent for spec in specs for agent in spec.agents]
+    for agent in agents:
+        if not agent.can.language_model:
+            continue
         if not agent.card.server:
             raise UserError(
                 f"--workers {printable(workers)}: rules and servers answer to several processes, "

@@ -12,6 +12,9 @@ from harness.core import resources
 from harness.core.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from harness.core.image import Image
     from harness.prompts.difference import TextChange
 
 NOT_COUNTED = "tokens not counted: give --tokenizer (tokenizer.json, its folder, or a GGUF)"
@@ -42,12 +45,12 @@ def list_prompts(as_json: options.Json = False) -> None:
     from harness.prompts import versions as prompts
 
     fields = ("version", "released", "sha256", "description", "changed", "known_failures")
-    rows: list[dict[str, Any]] = [
-        {"version": name, "error": str(each)}
-        if isinstance(each, UserError)
-        else {field: getattr(each, field) for field in fields}
-        for name, each in resources.each(prompts.names(), prompts.load).items()
-    ]
+    rows: list[dict[str, Any]] = []
+    for name, prompt in resources.each(prompts.names(), prompts.load).items():
+        if isinstance(prompt, UserError):
+            rows.append({"version": name, "error": str(prompt)})
+        else:
+            rows.append({field: getattr(prompt, field) for field in fields})
     if as_json:
         echo_json(rows)
     else:
@@ -98,38 +101,47 @@ def show(
     if reader is None and out:
         raise UserError(f"--out: prompt {version} shows no picture; leave it out")
     system = resolve(model).system if model else None
-    sent = {
-        v: with_system(prompt.render(at.graphs[v], data.actions, words=words), system)
-        for v in viewers
-    }
-    seen = {v: Sight(data.scenario, at.state, v, reader.vision.size_px) for v in viewers if reader}
-    wrote = {v: pictures.write(image, out / f"{at.id}-{v}.png") for v, image in seen.items() if out}
+    chats: dict[str, Sequence[Mapping[str, Any]]] = {}  # by viewer
+    images: dict[str, Image] = {}
+    notes: dict[str, str] = {}
+    for name in viewers:
+        rendered = prompt.render(at.graphs[name], data.actions, words=words)
+        chats[name] = with_system(rendered, system)
+        if reader:
+            images[name] = Sight(data.scenario, at.state, name, reader.vision.size_px)
+            if out:
+                notes[name] = pictures.write(images[name], out / f"{at.id}-{name}.png")
     if as_json:
-        images = {
-            v: {**reader.as_mapping(), "sha256": image.sha256}
-            for v, image in seen.items()
-            if reader
-        }
-        echo_json(
-            {
-                v: [{**m, "image": images[v]} if "image" in m else m for m in messages]
-                for v, messages in sent.items()
-            }
-        )
+        echo_json({name: _as_json(chat, reader, images.get(name)) for name, chat in chats.items()})
         return
-    for v, messages in sent.items():
-        for message in messages:
-            typer.echo(f"--- {v} {message['role']}")
+    for name, chat in chats.items():
+        for message in chat:
+            typer.echo(f"--- {name} {message['role']}")
             if reader and "image" in message:
-                typer.echo(f"picture: {reader.picture}, sha256 {seen[v].sha256[:8]}")
-                if not pictures.draw(seen[v]) and not out:
+                typer.echo(f"picture: {reader.picture}, sha256 {images[name].sha256[:8]}")
+                if not pictures.draw(images[name]) and not out:
                     typer.echo(
                         "not drawn: no terminal with colours here; --out FOLDER writes PNG files"
                     )
                 if out:
-                    typer.echo(wrote[v])
+                    typer.echo(notes[name])
             for line in message["content"].split("\n"):
                 typer.echo(printable(line, len(line) * 10))
+
+
+def _as_json(
+    chat: "Sequence[Mapping[str, Any]]",
+    reader: "pictures.PictureModel | None",
+    image: "Image | None",
+) -> list[dict[str, Any]]:
+    """Return chat messages, with what a picture is in place of the picture."""
+    messages = []
+    for message in chat:
+        plain = dict(message)
+        if reader and image and "image" in message:
+            plain["image"] = {**reader.as_mapping(), "sha256": image.sha256}
+        messages.append(plain)
+    return messages
 
 
 def compare(
@@ -157,19 +169,15 @@ def compare(
     change = difference.change(before, after)
     sent = difference.sent(before, after, at, data.scenario, counter(tokenizer))
     if as_json:
-        about = ("version", "sha256", "released")
-        sides = {
-            key: {name: getattr(p, name) for name in about}
-            for key, p in (("a", before), ("b", after))
+        fields = ("version", "sha256", "released")
+        result = {
+            "a": {name: getattr(before, name) for name in fields},
+            "b": {name: getattr(after, name) for name in fields},
+            **asdict(change),
+            "scene": at.id,
+            "sent": [asdict(message) for message in sent],
         }
-        echo_json(
-            {
-                **sides,
-                **asdict(change),
-                "scene": at.id,
-                "sent": [asdict(message) for message in sent],
-            }
-        )
+        echo_json(result)
         return
     typer.echo(f"{a} → {b}: {'differ' if change else 'the same settings and texts'}")
     for name, *values in change.settings:
@@ -180,13 +188,12 @@ def compare(
     if sent[0].tokens is None:
         typer.echo(NOT_COUNTED)
     for message in sent:
-        counts = {"words": message.words, "tokens": message.tokens}
-        sizes = ", ".join(
-            f"{n[0]} → {n[1]} {unit} ({n[1] - n[0]:+d})"
-            for unit, n in counts.items()
-            if n is not None
-        )
-        typer.echo(f"\n{message.viewer} {message.role}: {sizes}")
+        sizes = []
+        for unit, counts in (("words", message.words), ("tokens", message.tokens)):
+            if counts is not None:
+                n_before, n_after = counts
+                sizes.append(f"{n_before} → {n_after} {unit} ({n_after - n_before:+d})")
+        typer.echo(f"\n{message.viewer} {message.role}: {', '.join(sizes)}")
         for part, text in message.parts.items():
             _changed(part, text)
 
@@ -203,7 +210,8 @@ def _changed(what: str, text: "TextChange") -> None:
     typer.echo(f"{what}: {text.removed} words removed, {text.added} added")
     for hunk in text.hunks:
         typer.echo(f"@@ line {hunk.line_a} → {hunk.line_b}")
-        console().print(Text.assemble(*((piece, COLOURS[kind]) for kind, piece in marked(hunk))))
+        pieces = [(piece, COLOURS[kind]) for kind, piece in marked(hunk)]
+        console().print(Text.assemble(*pieces))
 
 
 def release(version: Version) -> None:

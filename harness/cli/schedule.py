@@ -46,15 +46,13 @@ def learn(
         raise UserError(
             f"--out {printable(out)} is there already; give a new name, since runs name schedules"
         )
-    point, own = named_point(condition), options.cards(model)
+    point, cards = named_point(condition), options.cards(model)
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
-        train, tune_runs = (
-            [ReplayedRun(run, progress=progress, models=own) for run in of] for of in (runs, tune)
-        )
-        progress.more(
-            sum(each.dataset.scenario.parameters.decisions for each in (*train, *tune_runs))
-        )
+        train = [ReplayedRun(run, progress=progress, models=cards) for run in runs]
+        tune_runs = [ReplayedRun(run, progress=progress, models=cards) for run in tune]
+        for run in (*train, *tune_runs):
+            progress.more(run.dataset.scenario.parameters.decisions)
         schedule = run_learn(train, tune_runs, point, out, command, progress)
     if not quiet:
         typer.echo(
@@ -111,11 +109,9 @@ def compare(
             f"--tune: {len(tune)} given for {len(runs)} runs; give one for each, in order, or none"
         )
     with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
-        own = options.cards(model)
-        replayed, tuned = (
-            [ReplayedRun(run, latency, progress, models=own) for run in folders]
-            for folders in (runs, tune)
-        )
+        cards = options.cards(model)
+        replayed = [ReplayedRun(run, latency, progress, models=cards) for run in runs]
+        tuned = [ReplayedRun(run, latency, progress, models=cards) for run in tune]
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or runs[0] / "schedules"
         compared = run_schedules(replayed, tuned, condition, names, draws, budget, where, progress)
