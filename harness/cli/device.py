@@ -4,7 +4,7 @@ and what fits the window.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import typer
@@ -17,6 +17,7 @@ from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
     from harness.runs.devices import Constant, Device, DeviceRow
+    from harness.studies.device_fit import Fit
 
 
 MOST_TOKENS = 1_000_000
@@ -75,54 +76,21 @@ def show(
     answers = answers_of(read(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
-        echo_json(
-            {
-                "device": msgspec.to_builtins(device),
-                "window_ms": window_ms,
-                "run": run and str(run),
-                "fits": [
-                    {
-                        "model": fit.row.model,
-                        "answer": fit.answer,
-                        "prompt_tokens": fit.prompt_tokens,
-                        "output_tokens": fit.output_tokens,
-                        "ms": known(1000 * fit.seconds),
-                        "in_time": fit.in_time,
-                        "joules": fit.joules,
-                        "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value,
-                    }
-                    for fit in results
-                ],
-            }
-        )
+        result = {
+            "device": msgspec.to_builtins(device),
+            "window_ms": window_ms,
+            "run": run and str(run),
+            "fits": [_as_mapping(fit) for fit in results],
+        }
+        echo_json(result)
         return
     typer.echo(f"{printable(device.name)} · {printable(device.description)}")
     if device.memory_gb:
         typer.echo(f"{device.memory_gb.value:g} GB of memory")
     typer.echo()
-    fitting = "in time %" if run else f"in {window_ms:g} ms"
-    yes_or_no, joules = ("no", "yes"), Unit("J", 2)
-    table(
-        ["model", "answer", "in + out", "ms", fitting, "J", "GB"],
-        [
-            (
-                printable(fit.row.model),
-                fit.answer,
-                f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
-                _known(fit.seconds, f"{1000 * fit.seconds:.{0 if fit.seconds >= 0.1 else 1}f}"),
-                _known(
-                    fit.in_time.value,
-                    shown(fit.in_time) if run else yes_or_no[bool(fit.in_time.value)],
-                ),
-                _known(
-                    fit.joules.value,
-                    shown(fit.joules, joules) if run else joules.number(fit.joules.value),
-                ),
-                f"{fit.row.memory_gb.value:.2g}" if fit.row.memory_gb else "unknown",
-            )
-            for fit in results
-        ],
-    )
+    in_time = "in time %" if run else f"in {window_ms:g} ms"
+    lines = [_fit_cells(fit, of_run=run is not None) for fit in results]
+    table(["model", "answer", "in + out", "ms", in_time, "J", "GB"], lines)
     typer.echo()
     if run:
         echo_text(
@@ -132,6 +100,38 @@ def show(
             "prompts. Tokens are counted by the model's own tokenizer"
         )
     _origins(device, rows)
+
+
+def _as_mapping(fit: "Fit") -> dict[str, Any]:
+    return {
+        "model": fit.row.model,
+        "answer": fit.answer,
+        "prompt_tokens": fit.prompt_tokens,
+        "output_tokens": fit.output_tokens,
+        "ms": known(1000 * fit.seconds),
+        "in_time": fit.in_time,
+        "joules": fit.joules,
+        "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value,
+    }
+
+
+def _fit_cells(fit: "Fit", of_run: bool) -> Sequence[str]:
+    """Return a line of the table of fits; of a run's answers shares and joules have intervals."""
+    unit = Unit("J", 2)
+    if of_run:
+        in_time, joules = shown(fit.in_time), shown(fit.joules, unit)
+    else:
+        in_time, joules = "yes" if fit.in_time.value else "no", unit.number(fit.joules.value)
+    decimals = 0 if fit.seconds >= 0.1 else 1
+    return (
+        printable(fit.row.model),
+        fit.answer,
+        f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
+        _known(fit.seconds, f"{1000 * fit.seconds:.{decimals}f}"),
+        _known(fit.in_time.value, in_time),
+        _known(fit.joules.value, joules),
+        f"{fit.row.memory_gb.value:.2g}" if fit.row.memory_gb else "unknown",
+    )
 
 
 def check(
@@ -166,19 +166,14 @@ def check(
         "prefill_tokens_per_s": ("prefill, tokens/s", 1.0),
         "decode_tokens_per_s": ("decoding, tokens/s", 1.0),
     }
-    table(
-        ["role", "what", "measured", f"{printable(device.name)} says", "n"],
-        [
-            (
-                role_word(each.role),
-                scales[each.what][0],
-                shown(each.measured, Unit(factor=scales[each.what][1])),
-                _known(each.stated, f"{each.stated * scales[each.what][1]:.1f}"),
-                str(each.measured.n),
-            )
-            for each in results
-        ],
-    )
+    lines = []
+    for result in results:
+        what, factor = scales[result.what]
+        measured = shown(result.measured, Unit(factor=factor))
+        stated = _known(result.stated, f"{result.stated * factor:.1f}")
+        role, n = role_word(result.role), str(result.measured.n)
+        lines.append((role, what, measured, stated, n))
+    table(["role", "what", "measured", f"{printable(device.name)} says", "n"], lines)
     echo_text(
         "medians of answers asked alone, with 95 % intervals over episodes; "
         f"{printable(row.model)}'s row"
@@ -217,36 +212,28 @@ def measure(
             "harness model device measure: no meter can be read here: NVML needs an NVIDIA GPU and "
             "the nvidia-ml-py, RAPL needs root; state joules in devices/NAME.toml with their source"
         )
-    agent = Agent(
-        cards.load(f"{model}:{engine}" if engine else model), versions.load(prompt), answer
-    )
+    card = cards.load(f"{model}:{engine}" if engine else model)
+    agent = Agent(card, versions.load(prompt), answer)
     with bar("windows", WINDOWS, quiet=as_json) as progress:
         powers, n = measure_agent(agent, meters, window_s, device, progress)
     if as_json:
-        echo_json(
-            {
-                "model": agent.name,
-                "answers": n,
-                "windows": WINDOWS,
-                "window_s": window_s,
-                "meters": powers,
-            }
-        )
+        result = {
+            "model": agent.name,
+            "answers": n,
+            "windows": WINDOWS,
+            "window_s": window_s,
+            "meters": powers,
+        }
+        echo_json(result)
         return
     typer.echo(f"{printable(agent.name)} · {n} answers, one by one")
-    table(
-        ["meter", "idle W", "asking W", "J an answer", "J above idling"],
-        [
-            (
-                printable(each.meter),
-                f"{each.idle_watts:.2f}",
-                shown(each.watts, Unit("W", 2)),
-                shown(each.answer_j, Unit("J", 3)),
-                shown(each.more_j, Unit("J", 3)),
-            )
-            for each in powers
-        ],
-    )
+    watts, joules = Unit("W", 2), Unit("J", 3)
+    lines = []
+    for power in powers:
+        name, idle = printable(power.meter), f"{power.idle_watts:.2f}"
+        of_answer, above_idling = shown(power.answer_j, joules), shown(power.more_j, joules)
+        lines.append((name, idle, shown(power.watts, watts), of_answer, above_idling))
+    table(["meter", "idle W", "asking W", "J an answer", "J above idling"], lines)
     echo_text(
         f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a "
         "meter counts all that draws from it, other programs and idling included"
@@ -257,21 +244,17 @@ def _origins(device: "Device", rows: "Sequence[DeviceRow]") -> None:
     """Print what the numbers rest on, each source once."""
     from harness.runs.devices import APART, JOULES, RATES, constants
 
-    for names, head in (
-        ((*RATES, "answer_ms"), "times"),
-        (tuple(JOULES), "J"),
-        (("memory_gb",), "GB"),
-    ):
-        sources = {
-            f"{c.status} ({_source(device, c)})": None
-            for row in rows
-            for name, c in (
-                *constants(device, row),
-                *((name, getattr(row, name)) for name in APART),
-            )
-            if name in names and c
-        }
-        echo_text(f"{head}: {'; '.join(sources) or 'unknown, since nobody states them'}")
+    kinds = {"times": (*RATES, "answer_ms"), "J": tuple(JOULES), "GB": ("memory_gb",)}
+    sources: dict[str, dict[str, None]] = {head: {} for head in kinds}
+    for row in rows:
+        apart = [(name, getattr(row, name)) for name in APART]
+        for name, constant in (*constants(device, row), *apart):
+            source = constant and f"{constant.status} ({_source(device, constant)})"
+            for head, names in kinds.items():
+                if source and name in names:
+                    sources[head][source] = None
+    for head, of_head in sources.items():
+        echo_text(f"{head}: {'; '.join(of_head) or 'unknown, since nobody states them'}")
     echo_text(f"power mode: {device.power_mode}")
 
 

@@ -1,5 +1,6 @@
 """`harness dataset scenario`: the scenarios, and how hard each is for the reference drivers."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from harness.core.seeds import purpose, stated
 
 if TYPE_CHECKING:
     from harness.world.scenario import Scenario
+
+Row = Sequence[str]  # of a table
 
 
 def list_scenarios(as_json: options.Json = False) -> None:
@@ -39,18 +42,17 @@ def show(name: options.Scenario, as_json: options.Json = False) -> None:
         from harness.prompts.answer_schema import ROLES, answer_schema
 
         meanings = attributes(type(scenario.parameters))
-        echo_json(
-            {
-                "name": name,
-                "description": description,
-                "actions": actions,
-                "parameters": {
-                    key: {"value": value, "meaning": meanings[key]}
-                    for key, value in asdict(scenario.parameters).items()
-                },
-                "answer_schema": {role: answer_schema(role, actions, name) for role in ROLES},
-            }
-        )
+        parameters = {}
+        for key, value in asdict(scenario.parameters).items():
+            parameters[key] = {"value": value, "meaning": meanings[key]}
+        result = {
+            "name": name,
+            "description": description,
+            "actions": actions,
+            "parameters": parameters,
+            "answer_schema": {role: answer_schema(role, actions, name) for role in ROLES},
+        }
+        echo_json(result)
         return
     typer.echo(f"{description}\nactions: {', '.join(actions)}\n")
     echo_fields(scenario.parameters)
@@ -111,15 +113,13 @@ def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episod
 def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     halves = ("balanced", "dangerous", "harmless")
     if all("balanced" in rates for rates in outcomes.values()):
-        table(
-            ("driver", "balanced success % [95 % CI]", "with a danger", "without"),
-            [
-                (driver, *(shown(rates[half]) for half in halves))
-                for driver, rates in outcomes.items()
-            ],
-        )
-        n_dangerous, n_harmless = (next(iter(outcomes.values()))[half].n for half in halves[1:])
-        console().print(f"balanced: mean of both, of {n_dangerous} and {n_harmless} episodes\n")
+        rows = []
+        for driver, rates in outcomes.items():
+            rows.append((driver, *(shown(rates[half]) for half in halves)))
+        table(("driver", "balanced success % [95 % CI]", "with a danger", "without"), rows)
+        first = next(iter(outcomes.values()))
+        episodes_of_each = f"{first['dangerous'].n} and {first['harmless'].n} episodes"
+        console().print(f"balanced: mean of both, of {episodes_of_each}\n")
     heads = (
         "driver",
         "success % [95 % CI]",
@@ -141,49 +141,21 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
 
 
 def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
-    policies, seconds = outcomes["policies"], Unit("s", 2)
-    table(
-        (
-            "driver of all agents",
-            "success % [95 % CI]",
-            "less than joint",
-            "arrived %",
-            "met %",
-            "stuck %",
-        ),
-        [
-            (
-                policy,
-                shown(of["success"]),
-                shown(of["less_than_joint"], sign="+"),
-                *(f"{100 * of[k].value:.1f}" for k in ("arrived", "met", "stuck")),
-            )
-            for policy, of in policies.items()
-        ],
-    )
-    table(
-        ("driver of all agents", "lost s, in sum", "lost s, the most", "price of anarchy", "n"),
-        [
-            (
-                policy,
-                *(shown(of[k], seconds) for k in ("lost_s", "most_lost_s")),
-                shown(of["anarchy"], Unit(decimals=3)),
-                str(of["anarchy"].n),
-            )
-            for policy, of in policies.items()
-        ],
-    )
-    table(
-        ("driver of all agents", "best decisions %", "arrival given away %", "regret s"),
-        [
-            (
-                policy,
-                *(shown(of[k]) for k in ("best_decisions", "gave_away")),
-                shown(of["regret_s"], seconds),
-            )
-            for policy, of in policies.items()
-        ],
-    )
+    seconds, ratio, driver = Unit("s", 2), Unit(decimals=3), "driver of all agents"
+    outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()
+    for policy, of in outcomes["policies"].items():
+        shares = [f"{100 * of[name].value:.1f}" for name in ("arrived", "met", "stuck")]
+        less = shown(of["less_than_joint"], sign="+")
+        outcome_rows.append((policy, shown(of["success"]), less, *shares))
+        lost_s = [shown(of[name], seconds) for name in ("lost_s", "most_lost_s")]
+        anarchy = of["anarchy"]
+        time_rows.append((policy, *lost_s, shown(anarchy, ratio), str(anarchy.n)))
+        decisions = [shown(of[name]) for name in ("best_decisions", "gave_away")]
+        decision_rows.append((policy, *decisions, shown(of["regret_s"], seconds)))
+    success = "success % [95 % CI]"
+    table((driver, success, "less than joint", "arrived %", "met %", "stuck %"), outcome_rows)
+    table((driver, "lost s, in sum", "lost s, the most", "price of anarchy", "n"), time_rows)
+    table((driver, "best decisions %", "arrival given away %", "regret s"), decision_rows)
     text = console()
     text.print(
         f"n = {episodes} episodes, {stated(seed, episodes)}; times where all arrive;\n"
