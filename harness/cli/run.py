@@ -121,11 +121,9 @@ def evaluate(
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
     """Return the episodes that a run came to, which may have stopped early."""
     numbers = dataset.episodes[: run.manifest.world.episodes]
-    return (
-        dataset
-        if len(numbers) == len(dataset.episodes)
-        else dataset.of_episodes(frozenset(numbers))
-    )
+    if len(numbers) == len(dataset.episodes):
+        return dataset
+    return dataset.of_episodes(frozenset(numbers))
 
 
 def default_out(spec: "Spec") -> Path:
@@ -186,10 +184,9 @@ class RunGroup:
             )
         if out.exists() and not out.is_dir():
             raise UserError(f"--out {printable(out)} is no folder; choose an empty or a new one")
-        ours = {*self.others, *self.specs}
-        if out.is_dir() and any(
-            path.name not in ours and path.name[0] != "." for path in out.iterdir()
-        ):
+        names = [path.name for path in out.iterdir()] if out.is_dir() else []
+        others = [name for name in names if name not in (*self.others, *self.specs)]
+        if any(name[0] != "." for name in others):
             raise UserError(
                 f"--out {printable(out)} is a folder with other files in it; choose an empty or a "
                 "new one"
@@ -203,9 +200,8 @@ class RunGroup:
             self.check(out)
         except UserError:
             return False
-        return not any(
-            work.held(run) for run in map(out.joinpath, self.specs) if (run / WORK).is_dir()
-        )
+        runs = [out / name for name in self.specs]
+        return not any(work.held(run) for run in runs if (run / WORK).is_dir())
 
 
 def _mode(agent: "Agent") -> str:
@@ -214,7 +210,7 @@ def _mode(agent: "Agent") -> str:
 
 
 def as_mapping(run: "Run") -> dict[str, Any]:
-    """A finished run for machines: its folder and manifest, what is said of it,
+    """Return a finished run as plain values: its folder and manifest, its caveats and notes,
     the rows of its summary.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
@@ -244,64 +240,60 @@ def show(
     from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
 
-    m = done.manifest
+    manifest = done.manifest
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
-    names = [point["name"] for point in m.conditions]
+    names = [point["name"] for point in manifest.conditions]
     text = console()
-    text.print(
-        f"{printable(m.model['name'], 40)} · prompt {m.prompt['version']} · {m.answer} · {scenes}"
-    )
-    if m.helpers:
-        text.print(f"helpers: {printable(m.variant.helpers)}")
+    model, prompt = printable(manifest.model["name"], 40), manifest.prompt["version"]
+    text.print(f"{model} · prompt {prompt} · {manifest.answer} · {scenes}")
+    if manifest.helpers:
+        text.print(f"helpers: {printable(manifest.variant.helpers)}")
     run = read(done.out)
     for finding in findings(run, *FIRST):
         text.print(finding.sentence)
-    every = (*BALANCED, *columns)
-    rows: dict[str, Mapping[str, Score | None]] = {
-        name: {c.metric: figures.get((name, c.metric)) for c in every} for name in names
-    }
+    rows: dict[str, Mapping[str, Score | None]] = {}
+    for name in names:
+        every_column = (*BALANCED, *columns)
+        rows[name] = {each.metric: figures.get((name, each.metric)) for each in every_column}
     rows |= beside or {}
-    halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
-    tables = (BALANCED, columns) if leading.lead_of(done) == leading.BALANCED else (columns,)
-    for shown in tables:
-        table(
-            ("condition", *(column.head for column in shown)),
-            [
-                (name, *(c.cell(scores.get(c.metric)) for c in shown))
-                for name, scores in rows.items()
-            ],
-        )
-        if shown is not columns:
-            of_each = " and ".join(str(half.n) for half in halves if half)
-            text.print(f"balanced: mean of both, of {of_each} episodes\n")
+    if leading.lead_of(done) == leading.BALANCED:
+        _scores_table(BALANCED, rows)
+        halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
+        episodes = " and ".join(str(half.n) for half in halves if half)
+        text.print(f"balanced: mean of both, of {episodes} episodes\n")
+    _scores_table(columns, rows)
     by_witnesses(figures, names)
-    below = findings(run, Kind.FIGURE, *LAST)
-    for note in (*notes, *(finding.sentence for finding in below)):
+    below = [finding.sentence for finding in findings(run, Kind.FIGURE, *LAST)]
+    for note in (*notes, *below):
         text.print(note)
+
+
+def _scores_table(
+    columns: Sequence[Column], rows: "Mapping[str, Mapping[str, Score | None]]"
+) -> None:
+    """Print scores by metric, a row a condition or reference."""
+    lines = []
+    for name, scores in rows.items():
+        cells = [column.cell(scores.get(column.metric)) for column in columns]
+        lines.append((name, *cells))
+    table(("condition", *(column.head for column in columns)), lines)
 
 
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
     """Print success by who can tell of the danger, where layouts have declared witnesses."""
-    known = {
-        name: metric for name, metric in BY_WITNESSES.items() if (conditions[0], metric) in figures
-    }
-    if known.keys() <= {"no danger"}:
+    metrics = {}
+    for name, metric in BY_WITNESSES.items():
+        if (conditions[0], metric) in figures:
+            metrics[name] = metric
+    if metrics.keys() <= {"no danger"}:
         return
     for start in range(0, len(conditions), MOST_BESIDE):
-        some = conditions[start : start + MOST_BESIDE]
+        beside = conditions[start : start + MOST_BESIDE]
+        rows = []
+        for name, metric in metrics.items():
+            column = Column("", metric, interval=True)
+            cells = [column.cell(figures.get((condition, metric))) for condition in beside]
+            rows.append((name, str(figures[beside[0], metric].n), *cells))
         typer.echo()
-        table(
-            ("success %", "n", *some),
-            [
-                (
-                    name,
-                    str(figures[some[0], metric].n),
-                    *(
-                        Column("", metric, interval=True).cell(figures.get((c, metric)))
-                        for c in some
-                    ),
-                )
-                for name, metric in known.items()
-            ],
-        )
+        table(("success %", "n", *beside), rows)
     typer.echo("seen by: helpers, at the first decision; with a radio: it tells of itself\n")

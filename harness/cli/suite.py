@@ -91,15 +91,15 @@ def evaluate(
 
 
 def _mapping(done: "SuiteRun", lines: "Sequence[Line]") -> dict[str, Any]:
-    """Return a suite's run for machines: each family's run, and the means over families."""
+    """Return a suite's run as plain values: each family's run, and the means over families."""
     drivers = {line.name: msgspec.to_builtins(line.drivers) for line in lines}
+    families = {}
+    for family, run in done.runs.items():
+        families[family] = {**as_mapping(run), "drivers": drivers[family]}
     return {
         "suite": done.name,
         "folder": str(done.path),
-        "families": {
-            family: {**as_mapping(run), "drivers": drivers[family]}
-            for family, run in done.runs.items()
-        },
+        "families": families,
         "mean": {"summary": msgspec.to_builtins(done.scores), "drivers": drivers[lines[-1].name]},
     }
 
@@ -123,17 +123,14 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)
     # `constant` stands for the two that always take one action: a line has no room for all.
     drivers = [name for name in lines[-1].drivers if name not in ALWAYS]
-    table(
-        ("references, %", *drivers, "n", "seeds"),
-        [
-            (
-                line.name,
-                *(f"{100 * (line.drivers[d].value or 0.0):.1f}" for d in drivers),
-                *((str(len(line.run.grid.episodes)), seeds_of(line.run)) if line.run else ("", "")),
-            )
-            for line in lines
-        ],
-    )
+    rows = []
+    for line in lines:
+        rates = [f"{100 * (line.drivers[driver].value or 0.0):.1f}" for driver in drivers]
+        n, seeds = "", ""
+        if line.run:
+            n, seeds = str(len(line.run.grid.episodes)), seeds_of(line.run)
+        rows.append((line.name, *rates, n, seeds))
+    table(("references, %", *drivers, "n", "seeds"), rows)
     text.print("references are computed from the trees; a run of uniform draws, and may differ")
     text.print(
         f"n: episodes, each × {amount(len(done.manifest.seeds), 'channel seed')}; seeds: what the "
@@ -148,9 +145,12 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:
     """Print one score of every family and condition, with its interval."""
     for start in range(0, len(conditions), MOST_INTERVALS):
-        some = conditions[start : start + MOST_INTERVALS]
-        rows = [(line.name, *(_cell(getattr(line.cells[c], what)) for c in some)) for line in lines]
-        table((head, *some), rows)
+        beside = conditions[start : start + MOST_INTERVALS]
+        rows = []
+        for line in lines:
+            scores = [getattr(line.cells[condition], what) for condition in beside]
+            rows.append((line.name, *(_cell(score) for score in scores)))
+        table((head, *beside), rows)
         typer.echo()
 
 
