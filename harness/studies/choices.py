@@ -67,11 +67,9 @@ class Choices:
                 success, (S, N, K), and the costs, (S, N, K, C), that each set comes to with the
                 rest of the course.
         """
-        following, success, costs = (
-            np.empty(0, dtype=int),
-            np.empty((0, 0)),
-            np.empty((0, 0, len(COSTS))),
-        )
+        # What the decision points of the next step come to, by what was chosen there.
+        following = np.empty(0, dtype=int)
+        success, costs = np.empty((0, 0)), np.empty((0, 0, len(COSTS)))
         for level in reversed(self.levels):
             at = level.at[:, None]
             child, tree = self.forest.child[at, level.action], self.forest.tree[at]
@@ -99,20 +97,22 @@ class Choices:
         """Return what the best choice of helpers comes to,
         with the fewest messages that it takes.
         """
-        return self.played(
-            lambda level, ends, spent: np.argmax(ends - PRICE * spent[..., 0], axis=-1)
-        )
+
+        def best(level: Level, ends: Floats, spent: Floats) -> Ints:
+            messages = spent[..., COSTS.index("messages")]
+            return np.asarray(np.argmax(ends - PRICE * messages, axis=-1))
+
+        return self.played(best)
 
     def index(self, asked: Bools) -> Ints:
         """Return the sets of these helpers `(..., H)`, by number."""
-        codes = self.sets @ (1 << np.arange(self.sets.shape[1]))
+        helpers = self.sets.shape[1]
+        bits = 1 << np.arange(helpers)
+        codes = self.sets @ bits
         order = np.argsort(codes)
-        wide = np.pad(
-            asked, [(0, 0)] * (asked.ndim - 1) + [(0, self.sets.shape[1] - asked.shape[-1])]
-        )
-        places: Ints = order[
-            np.searchsorted(codes[order], wide @ (1 << np.arange(self.sets.shape[1])))
-        ]
+        padding = [(0, 0)] * (asked.ndim - 1) + [(0, helpers - asked.shape[-1])]
+        wanted = np.pad(asked, padding) @ bits
+        places: Ints = order[np.searchsorted(codes[order], wanted)]
         return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
@@ -182,15 +182,15 @@ def choices(
     helpers = stored.vehicles - 1
     refuse(point, helpers, len(dataset.actions))
     sizes = range(min(point.ask.max_helpers, helpers) + 1)
-    members = [of for size in sizes for of in combinations(range(helpers), size)]
+    members = [some for size in sizes for some in combinations(range(helpers), size)]
     if len(members) > MOST_SETS:
         raise UserError(
             f"--condition {printable(point.name)}: {len(members)} sets of helpers, {MOST_SETS} at "
             "most; give a smaller max_helpers"
         )
-    sets = np.array([[h in of for h in range(helpers)] for of in members]).reshape(
-        len(members), helpers
-    )
+    sets = np.zeros((len(members), helpers), dtype=bool)
+    for row, some in zip(sets, members, strict=True):
+        row[list(some)] = True
     at, levels = forest.root, list[Level]()
     while len(at):
         level = _level(stored, point, seed, at, sets)
@@ -215,26 +215,23 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     draws = channel_draws(
         seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
     )
-    intents, ties = (
-        as_sent(point, point.prepared(intents.take(node))),
-        tie_draws(draws, stored.spec.ties),
-    )
-    own_j, actions, costs = stored.joules(scenes, point)[node], [], []
-    for who in sets[:, :width]:
-        heard = fuse(
-            point,
-            exchange(point, intents, draws, np.broadcast_to(who, intents.valid.shape)),
-            intents,
-            FusionInputs(ties=ties),
-        )
-        actions.append(heard.action.reshape(shape))
-        energy_j = own_j[:, 0] + helpers_j(heard.infers, own_j) + stored.radio_j(point, heard)
-        each = (
-            heard.messages,
-            1e3 * heard.airtime_s,
-            1e3 * heard.latency_s,
-            np.ones(len(node)),
-            energy_j,
-        )
-        costs.append(np.stack(each, -1).reshape(*shape, len(COSTS)))
+    intents = as_sent(point, point.prepared(intents.take(node)))
+    ties = tie_draws(draws, stored.spec.ties)
+    joules = stored.joules(scenes, point)[node]
+    actions, costs = [], []
+    for helpers in sets[:, :width]:
+        schedule = np.broadcast_to(helpers, intents.valid.shape)
+        messages = exchange(point, intents, draws, schedule)
+        result = fuse(point, messages, intents, FusionInputs(ties=ties))
+        actions.append(result.action.reshape(shape))
+        energy_j = joules[:, 0] + helpers_j(result.infers, joules) + stored.radio_j(point, result)
+        of_set = {
+            "messages": result.messages,
+            "airtime_ms": 1e3 * result.airtime_s,
+            "latency_ms": 1e3 * result.latency_s,
+            "decisions": np.ones(len(node)),
+            "energy_j": energy_j,
+        }
+        stacked = np.stack([of_set[name] for name in COSTS], -1)
+        costs.append(stacked.reshape(*shape, len(COSTS)))
     return Level(at, np.stack(actions, -1), np.stack(costs, 2), intents, draws)

@@ -40,8 +40,8 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
     """Return a run with its layout seeds in words.
 
-    Raises UserError unless all are for this purpose,
-    and its layouts are those of the seeds and none of those that are reported.
+    Raises UserError unless all seeds are for this purpose, the layouts are those of the seeds,
+    and none of them is one of the runs that are reported.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -59,9 +59,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
     """Return inputs (n, F) and gains (n,) of asking each helper alone, wherever it may be asked."""
-    alone = [
-        tree.index(np.eye(tree.sets.shape[1], dtype=bool)[h]) for h in range(tree.sets.shape[1])
-    ]
+    alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
     for level, ends, _, _ in tree.backwards(choose):
         known = known_of(point, level.intents, level.draws)
@@ -86,7 +84,8 @@ def fit(x: Floats, y: Floats) -> Network:
         draws.normal(0, 0.1, UNITS),
         np.array(y.mean()),
     ]
-    means, squares = ([np.zeros_like(w) for w in weights] for _ in range(2))
+    means = [np.zeros_like(weight) for weight in weights]
+    squares = [np.zeros_like(weight) for weight in weights]
     for step in range(1, STEPS + 1):
         into, bias, out, base = weights
         units = np.tanh(z @ into + bias)
@@ -113,13 +112,17 @@ def learn(
     Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
-    network, rest = None, [each.scheduled(point) for each in trees]
+    network, rules = None, [tree.scheduled(point) for tree in trees]
     # it needs the outlook, as the network does
-    looks = point.changed(schedule="coverage", threshold=None)
+    with_outlook = point.changed(schedule="coverage", threshold=None)
     for _ in range(ROUNDS):
-        pairs = [gains(each, looks, choose) for each, choose in zip(trees, rest, strict=True)]
-        network = fit(*(np.concatenate(part) for part in zip(*pairs, strict=True)))
-        rest = [by_network(each, looks, network, WHILE_LEARNING) for each in trees]
+        rows, targets = list[Floats](), list[Floats]()
+        for tree, rule in zip(trees, rules, strict=True):
+            of_tree, gains_of_tree = gains(tree, with_outlook, rule)
+            rows.append(of_tree)
+            targets.append(gains_of_tree)
+        network = fit(np.concatenate(rows), np.concatenate(targets))
+        rules = [by_network(tree, with_outlook, network, WHILE_LEARNING) for tree in trees]
         progress(1)
     assert network is not None
     return network
@@ -138,16 +141,18 @@ def tuned(
     point: OperatingPoint,
     progress: Callable[[int], None],
 ) -> float:
-    """Return the threshold with the most success on tune layouts, as it counts, averaged over runs.
+    """Return the threshold with the most success on tune layouts, by each run's success rule,
+    averaged over runs.
 
     Of equals it is the highest.
     """
     success = np.zeros(len(THRESHOLDS))
-    looks = point.changed(schedule="coverage", threshold=None)
-    for stored, counting in counted(tune).items():
+    with_outlook = point.changed(schedule="coverage", threshold=None)
+    for stored, success_rule in counted(tune).items():
         tree = choices(stored, point, stored.seeds, progress)
-        rules = [by_network(tree, looks, network, each) for each in THRESHOLDS]
-        success += [counting.mean(tree.played(rule)[0]) for rule in rules]
+        for n, threshold in enumerate(THRESHOLDS):
+            of_episodes, _ = tree.played(by_network(tree, with_outlook, network, threshold))
+            success[n] += success_rule.mean(of_episodes)
     return THRESHOLDS[int(np.flatnonzero(np.isclose(success, success.max()))[-1])]
 
 
@@ -155,10 +160,10 @@ def text(stated: Stated) -> str:
     """Return the file of a schedule: TOML, whose strings and lists are JSON's."""
     fields = asdict(stated)
     network = fields.pop("network")
-    lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
-    return "\n".join(
-        [*lines, "", "[network]", *(f"{k} = {json.dumps(v)}" for k, v in network.items()), ""]
-    )
+    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
+    lines += ["", "[network]"]
+    lines += [f"{name} = {json.dumps(value)}" for name, value in network.items()]
+    return "\n".join([*lines, ""])
 
 
 def run_learn(

@@ -1,4 +1,4 @@
-"""Plays a source of intents at every point of a panel, and sums up with intervals."""
+"""Play a source of intents at every point of a panel, and sum up with intervals."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -130,18 +130,24 @@ def walk_through(
             place = row * len(episodes) + np.searchsorted(episodes, part.due.episode)
             places[part.point].append(place)
     for point, steps in parts.items():
-        joint = {column: _below([step[column] for step in steps]) for column in steps[0]}
-        for column in joint.keys() & DECIMALS.keys():
-            joint[column] = joint[column].round(DECIMALS[column])
-        yield joint, np.concatenate(places[point])
+        whole = {}
+        for column in steps[0]:
+            values = _below([step[column] for step in steps])
+            decimals = DECIMALS.get(column)
+            whole[column] = values if decimals is None else values.round(decimals)
+        yield whole, np.concatenate(places[point])
 
 
 def _below(arrays: Sequence[Floats]) -> Floats:
+    """Return arrays (n,) or (n, H) one below the other, NaN where one has fewer columns."""
     if arrays[0].ndim == 1:
         return np.concatenate(arrays)
     wide = max(array.shape[1] for array in arrays)
-    rows = [np.pad(a, ((0, 0), (0, wide - a.shape[1])), constant_values=np.nan) for a in arrays]
-    return np.concatenate(rows)
+    padded = []
+    for array in arrays:
+        missing = ((0, 0), (0, wide - array.shape[1]))
+        padded.append(np.pad(array, missing, constant_values=np.nan))
+    return np.concatenate(padded)
 
 
 @dataclass(frozen=True)
@@ -172,27 +178,29 @@ def play(
     rows, episodes = list[dict[str, Any]](), list[pd.DataFrame]()
     for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
         parts = [_part(walk, len(seeds)) for walk in walks]
-        metrics = {
-            name: np.hstack([part.metrics[name] for part in parts]) for name in parts[0].metrics
-        }
-        of_seeds = zip(*(part.latency_ms for part in parts), strict=True)
-        latency_ms = np.array([percentiles(np.concatenate(of_seed)) for of_seed in of_seeds])
+        metrics = {}
+        for name in parts[0].metrics:
+            metrics[name] = np.hstack([part.metrics[name] for part in parts])
+        by_seed = []
+        for n in range(len(seeds)):
+            of_seed = np.concatenate([part.latency_ms[n] for part in parts])
+            by_seed.append(percentiles(of_seed))
+        latency_ms = np.array(by_seed)
         # Where axes are crossed, the columns of each come last.
         place = {"source": source.name, "panel": panel, **setting.place}
         first = {name: place.pop(name) for name in (*NAMES, "value")}
-        rows += [
-            {
+        for metric, estimate, interval in _estimates(source, metrics, latency_ms):
+            row = {
                 **first,
                 "metric": metric,
-                "mean": e.value,
-                "ci_low": e.low,
-                "ci_high": e.high,
-                "n": e.n,
+                "mean": estimate.value,
+                "ci_low": estimate.low,
+                "ci_high": estimate.high,
+                "n": estimate.n,
                 "interval": interval,
                 **place,
             }
-            for metric, e, interval in _estimates(source, metrics, latency_ms)
-        ]
+            rows.append(row)
         numbers = np.concatenate([part.episodes for part in parts])
         table = pd.DataFrame(
             {
@@ -240,7 +248,9 @@ def _estimates(
 ) -> Iterator[tuple[str, Estimate, str]]:
     over = over_seeds if source.same_episodes else over_own_episodes
     known = known_in(metrics)
-    for name in (name for name in (*metrics, BALANCED) if name in known):
+    for name in (*metrics, BALANCED):
+        if name not in known:
+            continue
         yield name, halved(name, lambda each: over(each, metrics[each]), shared=True), "seed means"
         if source.same_episodes:
             yield name, halved(name, lambda each: over_episodes(each, metrics[each])), "episodes"
@@ -270,5 +280,6 @@ def joined(parts: Sequence[PanelResult]) -> PanelResult:
     """Return the results of several panels or sources, one below the other."""
     import pandas as pd
 
-    tables = [[part.summary for part in parts], [part.episodes for part in parts]]
-    return PanelResult(*(pd.concat(each, ignore_index=True) for each in tables))
+    summary = pd.concat([part.summary for part in parts], ignore_index=True)
+    episodes = pd.concat([part.episodes for part in parts], ignore_index=True)
+    return PanelResult(summary, episodes)
