@@ -118,9 +118,11 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
             "schedule": SCHEDULES,
             **{setting: (NONE, *there()) for setting, there in _named().items()},
         }.get(axis.name)
-        for name in (part for text in parts for part in text.split("+")):
-            if known and (first := name.partition(":")[0]) not in known:
-                raise unknown("--grid", first, known)
+        for text_of_value in parts:
+            for part in text_of_value.split("+"):
+                name = part.partition(":")[0]
+                if known and name not in known:
+                    raise unknown("--grid", name, known)
         return tuple(dict.fromkeys(parts))
     values = [value for part in parts for value in _values(axis, part)]
     if len(values) > MOST_POINTS:
@@ -221,7 +223,10 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
     """Return the grid points, complete, for a manifest."""
-    return {
-        name: [{"value": s.value, "vehicles": s.vehicles, **s.point.record()} for s in settings]
-        for name, settings in panels.items()
-    }
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for name, settings in panels.items():
+        rows[name] = []
+        for setting in settings:
+            row = {"value": setting.value, "vehicles": setting.vehicles, **setting.point.record()}
+            rows[name].append(row)
+    return rows

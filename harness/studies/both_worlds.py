@@ -17,13 +17,15 @@ COMPARED = ("frozen", "closed", "difference", "agreement")
 
 
 def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
-    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds, (S,
-    E).
+    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds,
+    (S, E) each.
     """
-    both = difference(SUCCESS, [(frozen.T, closed.T)])
-    same = over_episodes("agreement_rate", (frozen == closed).astype(float))
-    worlds = [over_episodes(SUCCESS, success) for success in (frozen, closed)]
-    return dict(zip(COMPARED, (*worlds, both, same), strict=True))
+    return {
+        "frozen": over_episodes(SUCCESS, frozen),
+        "closed": over_episodes(SUCCESS, closed),
+        "difference": difference(SUCCESS, [(frozen.T, closed.T)]),
+        "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
+    }
 
 
 def rank(
@@ -36,5 +38,8 @@ def rank(
 
     ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
     frozen = dataset.reference_success()
-    closed = {driver: np.array([[float(of[driver].success) for of in ends]]) for driver in DRIVERS}
-    return {driver: compared(frozen[driver][None], closed[driver]) for driver in DRIVERS}
+    standings = {}
+    for driver in DRIVERS:
+        closed = np.array([float(of_episode[driver].success) for of_episode in ends])
+        standings[driver] = compared(frozen[driver][None], closed[None])
+    return standings

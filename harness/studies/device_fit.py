@@ -39,16 +39,16 @@ def fits(
     """Return each row with each kind of answer,
     of which `window_s` is the time from seeing to the answer.
     """
-    return [
-        _fit(device, row, kind, answers, window_s)
-        for row in rows
-        for kind in ([DECISION] if row.answer_ms else answers.output)
-    ]
+    results = []
+    for row in rows:
+        kinds = [DECISION] if row.answer_ms else answers.output
+        results += [_fit(device, row, kind, answers, window_s) for kind in kinds]
+    return results
 
 
 @dataclass(frozen=True)
 class Answers:
-    """Answers of which a fit is asked."""
+    """Token counts of the answers that are to fit a device."""
 
     prompt: Floats  # tokens read, (n,)
     output: dict[str, Floats]  # tokens written by kind of answer, each (n,)
@@ -73,29 +73,34 @@ def answers_of(run: Run) -> Answers:
     counts = np.array([tokens(answer) for answer in egos], dtype=float).reshape(-1, 2)
     if not len(counts):
         raise UserError(f"{printable(run.path)} has no answer of its ego; give another run")
-    mode, ones = run.manifest.answer, np.ones(len(counts))
-    _, place = np.unique([answer.scene.partition("-")[0] for answer in egos], return_inverse=True)
-    return Answers(
-        counts[:, 0], {READOUT: ones, mode: counts[:, 1]}, place, run.manifest.model["name"]
-    )
+    episodes = [answer.scene.partition("-")[0] for answer in egos]
+    _, place = np.unique(episodes, return_inverse=True)
+    output = {READOUT: np.ones(len(counts)), run.manifest.answer: counts[:, 1]}
+    return Answers(counts[:, 0], output, place, run.manifest.model["name"])
 
 
 def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: float) -> Fit:
-    speed, output = (
-        devices.speed(device, row),
-        answers.output.get(kind, np.zeros(len(answers.prompt))),
-    )
+    speed = devices.speed(device, row)
+    output = answers.output.get(kind, np.zeros(len(answers.prompt)))
     pairs = list(zip(answers.prompt.tolist(), output.tolist(), strict=True))
-    seconds, joules = (
-        np.array([of(speed, *pair) for pair in pairs]) for of in (devices.seconds, devices.joules)
-    )
+    seconds = np.array([devices.seconds(speed, *pair) for pair in pairs])
+    joules = np.array([devices.joules(speed, *pair) for pair in pairs])
     hits = np.where(np.isnan(seconds), np.nan, (seconds <= window_s).astype(float))
     if answers.episodes is None:
-        once = [Estimate(float(each[0]), np.nan, np.nan, 1, 0) for each in (hits, joules)]
+        in_time = Estimate(float(hits[0]), np.nan, np.nan, 1, 0)
+        energy = Estimate(float(joules[0]), np.nan, np.nan, 1, 0)
     else:
-        once = [rate_interval(hits, answers.episodes), episode_interval(joules, answers.episodes)]
-    read, written, took = (float(np.median(each)) for each in (answers.prompt, output, seconds))
-    return Fit(row, kind, read, written, took, *once)
+        in_time = rate_interval(hits, answers.episodes)
+        energy = episode_interval(joules, answers.episodes)
+    return Fit(
+        row=row,
+        answer=kind,
+        prompt_tokens=float(np.median(answers.prompt)),
+        output_tokens=float(np.median(output)),
+        seconds=float(np.median(seconds)),
+        in_time=in_time,
+        joules=energy,
+    )
 
 
 @dataclass(frozen=True)
@@ -114,15 +119,13 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     """Compare a profile with a run's own times.
     Raises UserError if no answer of the run was asked alone.
     """
-    alone = [a for a in run.answers if a.seconds is not None and a.error is None and not a.retries]
-    alone = [
-        a for a in alone if not a.first and a.prompt_tokens is not None and a.completion_tokens
-    ]
-    figures = [
-        figure
-        for role in dict.fromkeys(a.role for a in alone)
-        for figure in _held(device, row, [a for a in alone if a.role == role])
-    ]
+    alone: dict[str, list[Answer]] = {}  # by role
+    for answer in run.answers:
+        timed = answer.seconds is not None and answer.error is None and not answer.retries
+        counted = answer.prompt_tokens is not None and answer.completion_tokens
+        if timed and counted and not answer.first:
+            alone.setdefault(answer.role, []).append(answer)
+    figures = [figure for answers in alone.values() for figure in _held(device, row, answers)]
     if not figures:
         raise UserError(
             f"{printable(run.path)} has no answer that was asked alone and timed; run it with "
@@ -134,13 +137,14 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
 def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
     speed, role = devices.speed(device, row), alone[0].role
     stated = [devices.seconds(speed, *tokens(answer)) for answer in alone]
-    yield Comparison(
-        "seconds", role, _median([(a.seconds, a) for a in alone]), float(np.median(stated))
-    )
-    read = [
-        (a.prompt_tokens / a.first_token_s, a) for a in alone if a.first_token_s and a.prompt_tokens
-    ]
-    written = [(1 / a.token_s, a) for a in alone if a.token_s]
+    measured = _median([(answer.seconds, answer) for answer in alone])
+    yield Comparison("seconds", role, measured, float(np.median(stated)))
+    read, written = list[tuple[float, Answer]](), list[tuple[float, Answer]]()
+    for answer in alone:
+        if answer.first_token_s and answer.prompt_tokens:
+            read.append((answer.prompt_tokens / answer.first_token_s, answer))
+        if answer.token_s:
+            written.append((1 / answer.token_s, answer))
     for name, pairs in zip(devices.RATES, (read, written), strict=True):
         if pairs:
             value = getattr(speed, name)
@@ -148,6 +152,8 @@ def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[C
 
 
 def _median(pairs: Sequence[tuple[float | None, Answer]]) -> Estimate:
+    """Return the median of answers' values, with its interval over their episodes."""
     values = np.array([value for value, _ in pairs], dtype=float)
-    low, high = percentiles.intervals(values, [a.scene.partition("-")[0] for _, a in pairs])[50]
+    episodes = [answer.scene.partition("-")[0] for _, answer in pairs]
+    low, high = percentiles.intervals(values, episodes)[50]
     return Estimate(float(np.median(values)), low, high, len(values), 0)
