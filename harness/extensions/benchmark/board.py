@@ -48,58 +48,64 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
     """Return the entries of one edition, the best first.
     Raises UserError if they are of several, or none.
     """
-    named = {entry.edition.name: entry.edition for entry in entries}
-    if len(named) != 1:
+    names = dict.fromkeys(entry.edition.name for entry in entries)
+    if len(names) != 1:
+        listed = ", ".join(printable(name) for name in names)
         raise UserError(
-            f"a board is of one edition, and these files are of {len(named)}"
-            f"{': ' * bool(named)}{', '.join(map(printable, named))}; give files of one"
+            f"a board is of one edition, and these files are of {len(names)}"
+            f"{': ' * bool(names)}{listed}; give files of one"
         )
     edition = entries[0].edition
-    lead, by = lead_of(*(entry.suite for entry in entries)), edition.ranked_by
-    ranked = [entry.suite for entry in entries if not _privileged(entry.suite)]
-    of_each = [
-        Line(
-            entry,
-            None if _privileged(entry.suite) else _rank(entry.suite, ranked, edition, lead),
-            {
-                name: entry.suite.score(name, lead)
-                for name in dict.fromkeys((by, *edition.condition))
-            },
-            _gain(entry.suite, edition, lead),
-        )
-        for entry in entries
-    ]
-    return sorted(of_each, key=lambda line: -_value(line.success[by]))
+    metric = lead_of(*[entry.suite for entry in entries])
+    conditions = dict.fromkeys((edition.ranked_by, *edition.condition))
+    contestants = [entry.suite for entry in entries if not _privileged(entry.suite)]
+    board = []
+    for entry in entries:
+        suite, rank = entry.suite, None
+        if not _privileged(suite):
+            rank = _rank(suite, contestants, edition, metric)
+        success = {condition: suite.score(condition, metric) for condition in conditions}
+        board.append(Line(entry, rank, success, _gain(suite, edition, metric)))
+    return sorted(board, key=lambda line: -_value(line.success[edition.ranked_by]))
 
 
 def _privileged(suite: SuiteRun) -> bool:
+    """Return whether an entry sees what no vehicle can see."""
     return bool(suite.manifest.model.get("privileged"))
 
 
 def _value(score: Score | None) -> float:
+    """Return a score's value, and -1 where there is none."""
     return -1.0 if score is None or score.value is None else score.value
 
 
-def _rank(suite: SuiteRun, ranked: Sequence[SuiteRun], edition: Edition, lead: str) -> int:
-    others = [other for other in ranked if other is not suite]
-    differences = [
-        edition.difference(_pairs(other, suite, edition.ranked_by, lead)) for other in others
-    ]
-    return 1 + sum(difference.low > 0 for difference in differences)
+def _rank(suite: SuiteRun, contestants: Sequence[SuiteRun], edition: Edition, metric: str) -> int:
+    """Return one more than the number of contestants that are clearly better."""
+    rank = 1
+    for other in contestants:
+        if other is not suite:
+            pairs = _pairs(other, suite, edition.ranked_by, metric)
+            rank += edition.difference(pairs).low > 0
+    return rank
 
 
-def _pairs(a: SuiteRun, b: SuiteRun, condition: str, lead: str) -> Pairs:
+def _pairs(a: SuiteRun, b: SuiteRun, condition: str, metric: str) -> Pairs:
     """Return success of both under a condition, by family."""
-    both = [plays([of.runs[family] for family in a.runs], lead).families for of in (a, b)]
-    return [(rule, x[condition], y[condition]) for (rule, x), (_, y) in zip(*both, strict=True)]
+    families_a = plays([a.runs[family] for family in a.runs], metric).families
+    families_b = plays([b.runs[family] for family in a.runs], metric).families
+    pairs = []
+    for (rule, success_a), (_, success_b) in zip(families_a, families_b, strict=True):
+        pairs.append((rule, success_a[condition], success_b[condition]))
+    return pairs
 
 
-def _gain(suite: SuiteRun, edition: Edition, lead: str) -> Score | None:
-    by = edition.ranked_by
-    if by == BASELINE or BASELINE not in edition.condition:
+def _gain(suite: SuiteRun, edition: Edition, metric: str) -> Score | None:
+    """Return what an entry gains over the baseline; None where the edition has none."""
+    condition = edition.ranked_by
+    if condition == BASELINE or BASELINE not in edition.condition:
         return None
-    gain = edition.difference(plays(suite.runs.values(), lead).pairs(by, BASELINE))
-    return Score.of(by, GAINS[lead], gain, edition.gains)
+    gain = edition.difference(plays(suite.runs.values(), metric).pairs(condition, BASELINE))
+    return Score.of(condition, GAINS[metric], gain, edition.gains)
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
@@ -112,21 +118,24 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     """Return the page of a board's lines."""
     first = ordered[0].entry
     edition, suite = first.edition, first.suite
-    by, lead = edition.ranked_by, IN_WORDS[lead_of(*(line.entry.suite for line in ordered))]
+    by = edition.ranked_by
+    metric = IN_WORDS[lead_of(*[line.entry.suite for line in ordered])]
     others = [name for name in ordered[0].success if name != by]
-    most = reach(score for line in ordered if (score := line.success[by]))[1]
-    rows = [
-        (
-            Markup("{}<small>{}</small>").format(visible(line.name), visible(_by(line))),
+    scores = [line.success[by] for line in ordered]
+    _, most = reach([score for score in scores if score])
+    rows = []
+    for line, score in zip(ordered, scores, strict=True):
+        name = Markup("{}<small>{}</small>").format(visible(line.name), visible(_by(line)))
+        row = (
+            name,
             "–" if line.rank is None else str(line.rank),
-            cell(line.success[by]),
-            forest(score, 0.0, most) if (score := line.success[by]) else "",
+            cell(score),
+            forest(score, 0.0, most) if score else "",
             cell(line.gain),
-            *(cell(line.success[name]) for name in others),
+            *[cell(line.success[condition]) for condition in others],
             _checked(line.entry),
         )
-        for line in ordered
-    ]
+        rows.append(row)
     heads = (
         "entry",
         "rank",
@@ -138,7 +147,8 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     )
     layouts = sum(len(run.grid.episodes) for run in suite.runs.values())
     about = (
-        f"{edition.description}. {lead.capitalize()} in %, means over {len(suite.runs)} families, "
+        f"{edition.description}. {metric.capitalize()} in %, means over "
+        f"{len(suite.runs)} families, "
         f"{amount(layouts, 'layout')} × {amount(len(suite.manifest.seeds), 'channel seed')} in "
         f"all, with 95 % intervals over layouts. The edition's digest is {edition.digest}."
     )
@@ -157,7 +167,7 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
             "each family has one of its own: those of all layouts together, as in v2v-safety-1.1, "
             "are narrower."
         )
-    table = Table(f"Entries by {lead} under {by}", heads, rows, note, left=True)
+    table = Table(f"Entries by {metric} under {by}", heads, rows, note, left=True)
     caveats = [f"Left out: {visible(reason)}" for reason in left_out]
     return document([Section(edition.name, about=[about], caveats=caveats, tables=[table])])
 
@@ -168,7 +178,8 @@ def _by(line: Line) -> str:
 
 
 def _checked(entry: Rescored) -> Markup:
-    differing = sum(map(len, entry.differences.values()))
+    """Return how many of an entry's figures differ when they are computed again."""
+    differing = sum(len(differences) for differences in entry.differences.values())
     if differing:
         return Markup('<span class="worse">✗ {} figures differ</span>').format(differing)
     return Markup('<span class="better">✓ {} figures, all equal</span>').format(entry.compared)

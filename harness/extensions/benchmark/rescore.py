@@ -9,8 +9,6 @@ from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from msgspec import structs
-
 from harness.core.errors import Unanswered, UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.files import sha256_file
@@ -137,16 +135,15 @@ def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
     Numbers are compared as they are written, to the last digit;
     but not a column of episodes that the stated run, which may be older, lacks.
     """
-    theirs, ours = (
-        {score.key: score for score in edition.figures(run)} for run in (stated, computed)
-    )
-    for key in {**theirs, **ours}:
-        if theirs.get(key) != ours.get(key):
+    stated_scores = {score.key: score for score in edition.figures(stated)}
+    computed_scores = {score.key: score for score in edition.figures(computed)}
+    for key in stated_scores | computed_scores:
+        if stated_scores.get(key) != computed_scores.get(key):
             yield " ".join(key)
-    rows = [[structs.astuple(episode) for episode in run.episodes] for run in (stated, computed)]
-    columns = (zip(*each, strict=True) for each in rows)
-    for name, *values in zip(Episode.__struct_fields__, *columns, strict=True):
-        if any(value is not None for value in values[0]):
-            wrong = sum(a != b for a, b in zip_longest(*values))
+    for name in Episode.__struct_fields__:
+        stated_values = [getattr(episode, name) for episode in stated.episodes]
+        computed_values = [getattr(episode, name) for episode in computed.episodes]
+        if any(value is not None for value in stated_values):
+            wrong = sum(a != b for a, b in zip_longest(stated_values, computed_values))
             if wrong:
                 yield f"{name} of {wrong} episodes"
