@@ -92,11 +92,14 @@ def check(
     [prompt] = backend.rendered(asked[:1])
     chat: Chat | None = getattr(backend, "chat", None)
     ids = chat.encode(prompt) if chat else []
+    turn_end = None
+    if chat and chat.turn_end is not None:
+        [turn_end] = chat.pieces([chat.turn_end])
     return Checkup(
         prompt=prompt,
         tokens=list(zip(ids, chat.pieces(ids), strict=True)) if chat else None,
         bos_tokens=_leading(ids, chat.bos) if chat else None,
-        turn_end=chat.pieces([end])[0] if chat and (end := chat.turn_end) is not None else None,
+        turn_end=turn_end,
         thinking=chat.thinking if chat else None,
         answers={request.answer: answer(request) for request in asked},
         identity=backend.identity(),
@@ -105,6 +108,7 @@ def check(
 
 
 def _leading(ids: Sequence[int], token: int | None) -> int:
+    """Return how many of the first ids are a token."""
     return next((n for n, each in enumerate(ids) if each != token), len(ids))
 
 

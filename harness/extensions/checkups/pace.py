@@ -57,15 +57,16 @@ def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, 
 def advice(measured: Sequence[Pace]) -> str:
     """Say in one line which of several engines is faster here, and how to choose it."""
     engines = " and ".join(pace.engine for pace in measured)
-    of_letters, of_text = [pace.readout_s for pace in measured], [pace.text_s for pace in measured]
-    by_letters, by_text = _fastest(measured, of_letters), _fastest(measured, of_text)
+    by_letters = _fastest(measured, [pace.readout_s for pace in measured])
+    by_text = _fastest(measured, [pace.text_s for pace in measured])
     if by_letters == by_text:
         verdict = f"{by_text or 'neither'} is faster here"
     else:
         verdict = (
             f"faster here: {by_letters or 'neither'} for read-outs, {by_text or 'neither'} for text"
         )
-    letters_s, text_s = (" and ".join(f"{s:.2g} s" for s in of) for of in (of_letters, of_text))
+    letters_s = " and ".join(f"{pace.readout_s:.2g} s" for pace in measured)
+    text_s = " and ".join(f"{pace.text_s:.2g} s" for pace in measured)
     return (
         f"{verdict}; --engine chooses. On {engines}: a read-out {letters_s}, {TOKENS} tokens of "
         f"text {text_s}"
@@ -79,12 +80,14 @@ def _fastest(measured: Sequence[Pace], seconds: Sequence[float]) -> str | None:
 
 
 def _small(card: Card) -> bool:
+    """Return whether a model's files are small enough to be timed by the way."""
     where = locate(card)
     files = [file for file in where.rglob("*") if file.is_file()] if where.is_dir() else [where]
     return sum(file.stat().st_size for file in files) <= MOST_BYTES
 
 
 def _pace(card: Card) -> Pace:
+    """Return how long a read-out and a text take on a card's engine. Raises Unanswered."""
     backend = open_backend(card, batch_size=1)
     took: list[float] = []
     try:

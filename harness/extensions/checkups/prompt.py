@@ -122,10 +122,10 @@ def try_out(
     pairs = questions.scene_pairs(agent)
     by_role = {role: questions.requests(agent, role) for role in ROLES}
     halves = [half for pair in pairs for half in (pair.present, pair.absent)]
-    everything = [*by_role["ego"], *by_role["helper"], *halves]
+    requests = [*by_role["ego"], *by_role["helper"], *halves]
     completions: list[Completion] = []
-    for start in range(0, len(everything), CHUNK):
-        chunk = everything[start : start + CHUNK]
+    for start in range(0, len(requests), CHUNK):
+        chunk = requests[start : start + CHUNK]
         completions += backend.complete(chunk)
         for completion in completions[start:]:
             if completion.error is not None:
@@ -134,25 +134,20 @@ def try_out(
                 )
         progress(len(chunk))
     rest = iter(completions)
-    roles = tuple(
-        described(
-            agent.prompt,
-            role,
-            asked[0].actions,
-            [answer_of(request, next(rest)) for request in asked],
-        )
-        for role, asked in by_role.items()
-    )
-    return Trial(agent.card.name, agent.prompt.version, roles, moved(pairs, rest))
+    roles = []
+    for role, of_role in by_role.items():
+        answers = [answer_of(request, next(rest)) for request in of_role]
+        roles.append(described(agent.prompt, role, of_role[0].actions, answers))
+    return Trial(agent.card.name, agent.prompt.version, tuple(roles), moved(pairs, rest))
 
 
 def described(
     prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]
 ) -> Answers:
     """Return what a role's answers are like, for a prompt whose examples they may copy."""
-    examples = (
-        [_value(example.answer) for example in prompt.examples.of(role)] if prompt.examples else []
-    )
+    examples = []
+    if prompt.examples:
+        examples = [_value(example.answer) for example in prompt.examples.of(role)]
     intents = [answer.intent for answer in answers if answer.intent]
     likeliest = Counter(actions[intent.index(max(intent))] for intent in intents)
     faults = Counter(fault for answer in answers for fault in _faults(answer))

@@ -171,24 +171,19 @@ def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Mov
 
     A pair has two completions: with the fact, and without.
     """
-    changes: dict[Fact, list[float]] = {}
+    changes_by_fact: dict[Fact, list[float]] = {}
     for pair in pairs:
-        likely = [
-            _likelihood(pair, half, next(completions)) for half in (pair.present, pair.absent)
-        ]
-        readable = [p for p in likely if p is not None]
-        of_fact = changes.setdefault(pair.fact, [])
-        if len(readable) == len(likely):
-            of_fact.append(readable[0] - readable[1])
-    return tuple(
-        Moved(
-            fact,
-            len(all_),
-            sum(c >= LEAST_MOVED for c in all_),
-            round(fmean(all_), 4) if all_ else 0.0,
-        )
-        for fact, all_ in changes.items()
-    )
+        present = _likelihood(pair, pair.present, next(completions))
+        absent = _likelihood(pair, pair.absent, next(completions))
+        changes = changes_by_fact.setdefault(pair.fact, [])
+        if present is not None and absent is not None:
+            changes.append(present - absent)
+    summaries = []
+    for fact, changes in changes_by_fact.items():
+        enough = sum(change >= LEAST_MOVED for change in changes)
+        mean = round(fmean(changes), 4) if changes else 0.0
+        summaries.append(Moved(fact, len(changes), enough, mean))
+    return tuple(summaries)
 
 
 def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | None:
@@ -201,9 +196,8 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
     """Keep what was found of the model with an identity."""
-    kept.keep(
-        _name(identity, findings.prompt_sha256, findings.answer), msgspec.json.encode(findings)
-    )
+    name = _name(identity, findings.prompt_sha256, findings.answer)
+    kept.keep(name, msgspec.json.encode(findings))
 
 
 def recall_findings(

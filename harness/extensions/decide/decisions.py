@@ -96,16 +96,20 @@ class Body(Struct):
 
 def read(body: Body) -> Enquiry:
     """Return what is asked. Raises Refusal where it cannot be."""
-    contents = (
-        [body.input] if isinstance(body.input, str) else [_user(message) for message in body.input]
-    )
-    texts, images = zip(*map(_read, contents), strict=True) if contents else ((), ())
+    messages = body.input
+    contents = [messages] if isinstance(messages, str) else [_user(each) for each in messages]
+    texts, images = list[str](), list[str]()
+    for content in contents:
+        text, urls = _read(content)
+        texts.append(text)
+        images += urls
     state = "\n".join(texts)
     questions = tuple(_asked(question, state) for question in body.questions)
-    return Enquiry(body.model, questions, tuple(image for some in images for image in some))
+    return Enquiry(body.model, questions, tuple(images))
 
 
 def _user(message: Message) -> str | list[Part]:
+    """Return the content of a user's message. Raises Refusal for that of another role."""
     if message.role != "user":
         raise Refusal(
             "input has a message of another role than user; put what it says into the user's"
@@ -117,12 +121,13 @@ def _read(content: str | list[Part]) -> tuple[str, list[str]]:
     """Return the text of some content, its parts on lines of their own, and its pictures' URLs."""
     if isinstance(content, str):
         return content, []
-    texts = [
-        part.text if isinstance(part, Text) else text_of(part.data)
-        for part in content
-        if not isinstance(part, Picture)
-    ]
-    return "\n".join(texts), [part.image_url for part in content if isinstance(part, Picture)]
+    texts, urls = list[str](), list[str]()
+    for part in content:
+        if isinstance(part, Picture):
+            urls.append(part.image_url)
+        else:
+            texts.append(part.text if isinstance(part, Text) else text_of(part.data))
+    return "\n".join(texts), urls
 
 
 def _asked(question: Choice | Score | Predicate, state: str) -> Asked:

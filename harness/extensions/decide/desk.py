@@ -36,13 +36,15 @@ class Desk:
             raise Refusal("too many questions wait; ask again later", 429, "busy")
         for pair in zip(requests, futures, strict=True):
             self._waiting.put_nowait(pair)
+        waiting = [asyncio.wrap_future(future) for future in futures]
         try:
-            return await asyncio.gather(*map(asyncio.wrap_future, futures))
+            return await asyncio.gather(*waiting)
         finally:
             for future in futures:
                 future.cancel()  # where another failed, or the client waits no more
 
     def _work(self) -> None:
+        """Answer what waits, for ever."""
         while True:
             batch = [self._waiting.get()]
             while len(batch) < self._batch_size and not self._waiting.empty():

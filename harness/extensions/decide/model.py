@@ -95,7 +95,7 @@ class ServedModel:
                 "at most",
                 code="context_length_exceeded",
             )
-        turn = {"role": "user", **({"image": "camera"} if image else {})}
+        turn = {"role": "user", "image": "camera"} if image else {"role": "user"}
         chats = self._agent.in_orders(
             asked.options, lambda order: decision.asked(asked.question, (turn,), order)
         )

@@ -104,23 +104,22 @@ def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.Dat
     for score in done.scores:
         if score.metric in SHOWN or score.metric.startswith(("latency_p", "collision")):
             by_point.setdefault(score.condition, []).append(score)
-    return pd.DataFrame(
-        [
-            {
-                "source": source,
-                "panel": panel,
-                "condition": s.condition,
-                "variable": s.variable,
-                "value": s.value,
-                "metric": r.metric,
-                "mean": r.value,
-                "ci_low": r.low,
-                "ci_high": r.high,
-                "n": r.n,
-                "interval": r.interval,
-            }
-            for panel, settings in grids.items()
-            for s in settings
-            for r in by_point[s.point.name]
-        ]
-    )
+    rows = []
+    for panel, settings in grids.items():
+        for setting in settings:
+            for score in by_point[setting.point.name]:
+                row = {
+                    "source": source,
+                    "panel": panel,
+                    "condition": setting.condition,
+                    "variable": setting.variable,
+                    "value": setting.value,
+                    "metric": score.metric,
+                    "mean": score.value,
+                    "ci_low": score.low,
+                    "ci_high": score.high,
+                    "n": score.n,
+                    "interval": score.interval,
+                }
+                rows.append(row)
+    return pd.DataFrame(rows)

@@ -92,7 +92,9 @@ def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: floa
 
 
 def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
-    """Our rows for one of the paper's: one, or those of the grid points that it speaks of."""
+    """Return our rows for one of the paper's: one,
+    or those of the grid points that it speaks of.
+    """
     s = summary[
         (summary.panel == row["panel"])
         & (summary.condition == CONDITIONS[row["condition"]])
@@ -106,7 +108,10 @@ def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[
         s = s[s.value.astype(float) >= float(value.removeprefix(FROM)) - 1e-9]
     elif value:
         s = s[abs(s.value.astype(float) - float(value)) < 1e-9]
-    return [{str(k): v for k, v in record.items()} for record in s.to_dict("records")]
+    rows = []
+    for record in s.to_dict("records"):
+        rows.append({str(column): value for column, value in record.items()})
+    return rows
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
@@ -116,12 +121,10 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
     `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
     """
     ran = ledger[ledger.kind != "cited"]
-    return ran.assign(
-        condition=ran.condition.map(CONDITIONS),
-        metric=ran.metric.map({theirs: ours for theirs, (ours, *_) in METRICS.items()}),
-    ).rename(columns={"paper_low": "low", "paper_high": "high"})[
-        ["panel", "condition", "value", "metric", "low", "high"]
-    ]
+    our_metrics = {theirs: ours for theirs, (ours, *_) in METRICS.items()}
+    ran = ran.assign(condition=ran.condition.map(CONDITIONS), metric=ran.metric.map(our_metrics))
+    ran = ran.rename(columns={"paper_low": "low", "paper_high": "high"})
+    return ran[["panel", "condition", "value", "metric", "low", "high"]]
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:

@@ -11,7 +11,7 @@ from harness.core.versions import versions
 from harness.extensions.paper.calibrated import Calibrated
 from harness.extensions.paper.ledger import headline, ledger, marks, tables
 from harness.report.document import Table
-from harness.studies.axes import AXES, CORE, Setting, axis_of, described, grid
+from harness.studies.axes import AXES, CORE, Axis, Setting, Value, axis_of, described, grid
 from harness.studies.play import joined, play
 from harness.studies.study import Study, percent
 
@@ -42,20 +42,20 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
     points = {name: point.changed(helper_rounds=True) for name, point in POINTS.items()}
     six = points["6g"]
     crowded = six.changed(helper_rounds=False, density_coupled=True)
+    conditions = [Setting(name, point, VEHICLES) for name, point in points.items()]
     sizes = [Setting("6g", crowded, int(n), "size", n) for n in grid(AXES["size"], "1:8")]
-    along = {
-        name: [Setting("6g", AXES[name].at(six, v), VEHICLES, name, v) for v in grid(AXES[name])]
-        for name in ("loss", "tau")
-    }
-    nearest = axis_of(WEIGHTS)
-    weights = tuple(Setting("6g", nearest.at(six, v), VEHICLES, WEIGHTS, v) for v in (1.0, EQUAL_M))
+
+    def along(axis: Axis, values: Sequence[Value]) -> tuple[Setting, ...]:
+        """Return `6g` with other values of one setting."""
+        return tuple(Setting("6g", axis.at(six, v), VEHICLES, axis.name, v) for v in values)
+
+    loss, tau, weights = AXES["loss"], AXES["tau"], axis_of(WEIGHTS)
     return [
-        Panel(CORE, tuple(Setting(name, point, VEHICLES) for name, point in points.items()), core),
-        *(
-            Panel(name, tuple(settings), sweep)
-            for name, settings in {"size": sizes, **along}.items()
-        ),
-        Panel(WEIGHTS, weights, core),
+        Panel(CORE, tuple(conditions), core),
+        Panel("size", tuple(sizes), sweep),
+        Panel("loss", along(loss, grid(loss)), sweep),
+        Panel("tau", along(tau, grid(tau)), sweep),
+        Panel(WEIGHTS, along(weights, (1.0, EQUAL_M)), core),
     ]
 
 
