@@ -104,9 +104,8 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         if limit is None:
             here.check(edition)
         runs, differences, compared = dict[str, Run](), dict[str, list[str]](), 0
-        for name, run in edition.entry(
-            [read(stated / name) for name in contents.runs], limit
-        ).items():
+        stated_runs = [read(stated / name) for name in contents.runs]
+        for name, run in edition.entry(stated_runs, limit).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
             ours, otherwise = computed(run, edition.spec(run, source), place, progress)

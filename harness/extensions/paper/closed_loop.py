@@ -19,7 +19,7 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import ClosedLoop, Score
-from harness.studies.axes import AXES, CORE, Setting, described, grid
+from harness.studies.axes import AXES, CORE, Setting, Value, described, grid
 from harness.studies.play import ENDS, PER_DECISION
 from harness.studies.study import Study
 from harness.studies.sweep import in_a_sentence, tables
@@ -37,17 +37,21 @@ def panels() -> dict[str, list[Setting]]:
     """Return the paper's panels as conditions named by what they change;
     size has density-coupled loss.
     """
-    losses = density_coupled_loss(np.arange(1, VEHICLES + 1))
-    changes = (
-        *(("size", n, n, f"max_helpers={n - 1},loss={loss:g}") for n, loss in enumerate(losses, 1)),
-        *(("loss", VEHICLES, v, f"loss={v:g}") for v in grid(AXES["loss"])),
-        *(("tau", VEHICLES, v, f"tau_nats={v:g}") for v in grid(AXES["tau"])),
-    )
-    settings = {CORE: [Setting(name, point, VEHICLES) for name, point in POINTS.items()]}
-    for panel, vehicles, value, change in changes:
-        setting = Setting("6g", named_point(f"6g:{change}"), vehicles, panel, value)
-        settings.setdefault(panel, []).append(setting)
-    return settings
+
+    def setting(panel: str, value: Value, vehicles: int, changes: str) -> Setting:
+        return Setting("6g", named_point(f"6g:{changes}"), vehicles, panel, value)
+
+    sizes = []
+    for vehicles, loss in enumerate(density_coupled_loss(np.arange(1, VEHICLES + 1)), 1):
+        changes = f"max_helpers={vehicles - 1},loss={loss:g}"
+        sizes.append(setting("size", vehicles, vehicles, changes))
+    losses, taus = grid(AXES["loss"]), grid(AXES["tau"])
+    return {
+        CORE: [Setting(name, point, VEHICLES) for name, point in POINTS.items()],
+        "size": sizes,
+        "loss": [setting("loss", v, VEHICLES, f"loss={v:g}") for v in losses],
+        "tau": [setting("tau", v, VEHICLES, f"tau_nats={v:g}") for v in taus],
+    }
 
 
 def run_closed_loop(

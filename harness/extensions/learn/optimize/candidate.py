@@ -54,20 +54,25 @@ def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
     """
     sizes = space(base)
     changes = ", ".join(f"{name} {n + 1} of {sizes[name]}" for name, n in choice.items() if n)
-    files = {**base.files, **{f"{role}.j2": resolved(base.texts[role], choice) for role in ROLES}}
+    files = dict(base.files)
+    for role in ROLES:
+        files[f"{role}.j2"] = resolved(base.texts[role], choice)
     if base.example_sets:
-        examples = read_examples(files.pop(EXAMPLES), EXAMPLES).only(
-            base.example_sets[choice.get(SETS, 0)]
-        )
-        files |= {EXAMPLES: text_of(examples)} if examples else {}
+        example_set = base.example_sets[choice.get(SETS, 0)]
+        examples = read_examples(files.pop(EXAMPLES), EXAMPLES).only(example_set)
+        if examples:
+            files[EXAMPLES] = text_of(examples)
     return _candidate(base, files, changes or "first alternatives")
 
 
 def systems(base: Prompt) -> dict[str, str]:
     """Return the text of each role's block `system`, with its first alternatives."""
-    return {
-        role: match[2] for role in ROLES if (match := SYSTEM.search(resolved(base.texts[role])))
-    }
+    texts = {}
+    for role in ROLES:
+        match = SYSTEM.search(resolved(base.texts[role]))
+        if match:
+            texts[role] = match[2]
+    return texts
 
 
 def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:

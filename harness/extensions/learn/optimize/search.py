@@ -126,10 +126,11 @@ def search(
         new, report = replace(winner.prompt, version=plan.version), plan.report()
         for name, prompt in ((OLD, plan.base), (NEW, new)):
             places = [f"{name}-{spec.source.name}" if len(report) > 1 else name for spec in report]
-            runs[name] = [
-                read_or_evaluate(changed(spec, prompt), out / place, progress, cache_file, opens)
-                for spec, place in zip(report, places, strict=True)
-            ]
+            runs[name] = []
+            for spec, folder in zip(report, places, strict=True):
+                evaluation = changed(spec, prompt)
+                run = read_or_evaluate(evaluation, out / folder, progress, cache_file, opens)
+                runs[name].append(run)
     study = _study(plan, tuning, winner, report, runs, getattr(engine, "replies", 0))
     if runs:
         history = json.dumps(study.manifest, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
@@ -160,15 +161,20 @@ def _certificate(
     """Return how success counts, and by family (and for all) both prompts' estimates and their
     difference.
     """
-    rules = alike([Success.of(run.episodes[: len(run.grid.episodes)], BALANCED) for run in old])
-    rows = [
-        {OLD: rule.estimate(a), NEW: rule.estimate(b), "difference": rule.difference(b, a)}
-        for rule, a, b in zip(rules, map(_success, old), map(_success, new), strict=True)
-    ]
+    first_seeds = [run.episodes[: len(run.grid.episodes)] for run in old]
+    rules = alike([Success.of(episodes, BALANCED) for episodes in first_seeds])
+    old_success = [_success(run) for run in old]
+    new_success = [_success(run) for run in new]
+    pairs = list(zip(rules, new_success, old_success, strict=True))
+    rows: list[dict[str, Estimate]] = []
+    for rule, after, before in pairs:
+        difference = rule.difference(after, before)
+        row = {OLD: rule.estimate(before), NEW: rule.estimate(after), "difference": difference}
+        rows.append(row)
     if len(rows) > 1:
-        both = {name: mean_of([row[name] for row in rows]) for name in (OLD, NEW)}
-        pairs = zip(rules, map(_success, new), map(_success, old), strict=True)
-        rows.append({**both, "difference": mean_difference([*pairs])})
+        old_mean = mean_of([row[OLD] for row in rows])
+        new_mean = mean_of([row[NEW] for row in rows])
+        rows.append({OLD: old_mean, NEW: new_mean, "difference": mean_difference(pairs)})
     return rules[0], rows
 
 
@@ -180,22 +186,25 @@ def _study(
     runs: Mapping[str, Sequence[Run]],
     replies: int,
 ) -> Study:
+    """Return the study of a search: what was tried, and what the winner gained.
+
+    `runs` are those on report layouts, by `OLD` and `NEW`; none where no prompt was better than
+    the base. `replies` counts the texts of the model that reflects.
+    """
     import pandas as pd
 
     base, agent = plan.base, plan.tune[0].ego
     tried = [_row(tuning, record) for record in tuning.records.values()]
-    tune = [
-        {
-            "scenario": s.scenario.name,
-            "layouts": len(list(s.source.layout_seeds)),
-            "seeds": _seeds(s),
-        }
-        for s in tuning.specs
-    ]
-    where = (
-        f"{len(tuning.layouts)} tune layouts "
-        f"({', '.join(sorted({_seeds(s) for s in tuning.specs}))})"
-    )
+    tune = []
+    for spec in tuning.specs:
+        layouts = len(list(spec.source.layout_seeds))
+        tune.append({"scenario": spec.scenario.name, "layouts": layouts, "seeds": _seeds(spec)})
+    wordings = []
+    for wording, record in zip(tried, tuning.records.values(), strict=True):
+        texts = record.candidate.rewritten
+        wordings.append({**wording, "system": dict(texts)} if texts else wording)
+    seeds = ", ".join(sorted({_seeds(spec) for spec in tuning.specs}))
+    where = f"{len(tuning.layouts)} tune layouts ({seeds})"
     manifest: dict[str, Any] = {
         "version": plan.version,
         "sha256": winner.key,
@@ -209,15 +218,12 @@ def _study(
         "questions": tuning.spent,
         "tokens": tuning.tokens,
         "reflections": replies,
-        "tried": [
-            {**row, **({"system": dict(r.candidate.rewritten)} if r.candidate.rewritten else {})}
-            for row, r in zip(tried, tuning.records.values(), strict=True)
-        ],
+        "tried": wordings,
         "chosen": winner.what,
         "command": plan.command,
         "versions": versions(),
     }
-    best, first = (tuning.records[key] for key in (winner.key, chosen(base).key))
+    best, first = tuning.records[winner.key], tuning.records[chosen(base).key]
     cost = f"{tuning.spent} questions of {plan.budget}, {tuning.tokens} tokens"
     cost += f", {replies} texts of the reflecting model" if replies else ""
     searched = f"{len(tried)} wordings of {base.version} were tried on {where} with {cost}"
@@ -239,29 +245,36 @@ def _study(
             manifest,
         )
     success, rows = _certificate(runs[OLD], runs[NEW])
-    names = [spec.source.name for spec in report] + (["mean"] if len(rows) > len(report) else [])
-    answers = [answer for side in runs.values() for run in side for answer in run.answers]
-    again = looks(base, plan.prompts) + 1
+    names = [spec.source.name for spec in report]
+    if len(rows) > len(report):
+        names.append("mean")
+    report_runs = [run for of_prompt in runs.values() for run in of_prompt]
+    answers = [answer for run in report_runs for answer in run.answers]
+    look = looks(base, plan.prompts) + 1
+    families, cells, estimates = [], [], []
+    for name, row in zip(names, rows, strict=True):
+        family: dict[str, Any] = {"dataset": name}
+        for side, estimate in row.items():
+            family[side] = as_mapping(estimate)
+            estimates.append({"dataset": name, "side": side, **ends(estimate)})
+        families.append(family)
+        gained = row["difference"]
+        points = shown(gained, POINTS, "+")
+        cells.append((name, shown(row[OLD]), shown(row[NEW]), points, str(gained.n)))
+    report_seeds = [_seeds(spec) for spec in report]
     certificate = {
         "metric": success.metric,
-        "seeds": [_seeds(spec) for spec in report],
+        "seeds": report_seeds,
         "questions": len(answers),
         "tokens": tokens(answers),
-        "families": [
-            {"dataset": name, **{side: as_mapping(e) for side, e in row.items()}}
-            for name, row in zip(names, rows, strict=True)
-        ],
+        "families": families,
     }
-    manifest |= {"certificate": certificate, "looks": again}
-    last = rows[-1]
-    gain, what = last["difference"], success.words
-    unclear = f"not clear of zero, but within {within(gain.low, gain.high)}"
-    verdict = "clear of zero" if gain.low > 0 else "clearly worse" if gain.high < 0 else unclear
-    verdict = verdict if gain.low == gain.low else "too few layouts for an interval"
+    manifest |= {"certificate": certificate, "looks": look}
+    gain, what = rows[-1]["difference"], success.words
     headline = [
         f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on "
-        f"report layouts, {verdict} (n = {gain.n} layouts, paired, 95 % interval over layouts; "
-        f"{', '.join(map(_seeds, report))}, read once, after the search).",
+        f"report layouts, {_verdict(gain)} (n = {gain.n} layouts, paired, 95 % interval over "
+        f"layouts; {', '.join(report_seeds)}, read once, after the search).",
         f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
         f"{100 * _mean(tuning, first):.1f} %. {searched}; the best is: "
         f"{winner.what}.",
@@ -270,46 +283,44 @@ def _study(
     caveats = (
         [
             "Report layouts were read for versions that this one comes from, too: look number "
-            f"{again}."
+            f"{look}."
         ]
-        if again > 1
+        if look > 1
         else []
     )
     table = Table(
         "Certificate, on report layouts",
         ("dataset", f"{base.version}, %", f"{plan.version}, %", "difference, points", "n"),
-        [
-            (
-                name,
-                shown(row[OLD]),
-                shown(row[NEW]),
-                shown(row["difference"], POINTS, "+"),
-                str(row["difference"].n),
-            )
-            for name, row in zip(names, rows, strict=True)
-        ],
+        cells,
         f"{what.capitalize()}, paired by layout, 95 % intervals over layouts.",
         terminal=range(5),
     )
-    flat = [
-        {"dataset": name, "side": side, **ends(e)}
-        for name, row in zip(names, rows, strict=True)
-        for side, e in row.items()
-    ]
     return Study(
         "optimize",
         f"{plan.version}, from {base.version}, for {agent.name}",
         headline,
         [_about(plan)],
         [table, *tables],
-        {**data, "certificate": pd.DataFrame(flat)},
+        {**data, "certificate": pd.DataFrame(estimates)},
         manifest,
         manifest,
         caveats=caveats,
     )
 
 
+def _verdict(gain: Estimate) -> str:
+    """Return in words what an interval says of a gain."""
+    if gain.low != gain.low:
+        return "too few layouts for an interval"
+    if gain.low > 0:
+        return "clear of zero"
+    if gain.high < 0:
+        return "clearly worse"
+    return f"not clear of zero, but within {within(gain.low, gain.high)}"
+
+
 def _about(plan: Search) -> str:
+    """Return the line of a page that says what the scores of its tables are."""
     return (
         f"Engine: {plan.engine}. Condition: {plan.tune[0].points[0].name}. Score on tune layouts: "
         "success, balanced over layouts with and without a danger where there are both, then the "
@@ -319,16 +330,19 @@ def _about(plan: Search) -> str:
 
 
 def _seeds(spec: Spec) -> str:
+    """Return the layout seeds of an evaluation in words."""
     seeds = list(spec.source.layout_seeds)
     return stated(min(seeds), max(seeds) - min(seeds) + 1)
 
 
 def _mean(tuning: Tuning, record: Record) -> float:
+    """Return a candidate's success on the layouts on which it was played."""
     layouts = np.array(sorted(record.played))
     return float(tuning.weights(layouts) @ [record.played[n].success for n in layouts.tolist()])
 
 
 def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
+    """Return what is known of a candidate, a row of the table of wordings."""
     layouts = np.array(sorted(record.played), dtype=int)
     known = len(layouts) > 0
     worth = [record.played[n].worth for n in layouts.tolist()]
@@ -344,23 +358,20 @@ def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
 
 
 def _tried_table(tried: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of wordings, a row each."""
+
     def cell(value: float | None, factor: float, form: str) -> str:
         return "–" if value is None else format(factor * value, form)
 
+    rows = []
+    for row in tried:
+        success, worth = cell(row["success"], 100, ".1f"), cell(row["worth"], 1, ".3f")
+        counts = str(row["questions"]), str(row["characters"])
+        rows.append((row["wording"], str(row["layouts"]), success, worth, *counts))
     return Table(
         "Wordings tried, on tune layouts",
         ("wording", "layouts", "success, %", "worth", "questions", "characters"),
-        [
-            (
-                row["wording"],
-                str(row["layouts"]),
-                cell(row["success"], 100, ".1f"),
-                cell(row["worth"], 1, ".3f"),
-                str(row["questions"]),
-                str(row["characters"]),
-            )
-            for row in tried
-        ],
+        rows,
         "Success is balanced where there are layouts with and without a danger. A wording that "
         "was worse on half of the layouts was not played on the rest. These layouts chose, so "
         "that the best one's figure flatters it. Characters are those of the ego's prompt in the "

@@ -95,12 +95,8 @@ class Tuning:
         self.specs, self.base, self.budget = specs, specs[0].ego.prompt, budget
         self.records: dict[str, Record] = {}
         self.spent = 0
-        self._backend, self._latency, self._place, self._progress = (
-            backend,
-            latency,
-            place,
-            progress,
-        )
+        self._backend, self._latency = backend, latency
+        self._place, self._progress = place, progress
 
     @cached_property
     def layouts(self) -> list[tuple[int, int]]:
@@ -119,7 +115,7 @@ class Tuning:
         kinds: dict[tuple[int, bool], list[int]] = {}
         for n, (family, _) in enumerate(self.layouts):
             kinds.setdefault((family, bool(self._dangerous[n])), []).append(n)
-        return np.array(sorted(n for those in kinds.values() for n in those[::2]))
+        return np.array(sorted(n for of_kind in kinds.values() for n in of_kind[::2]))
 
     def weights(self, layouts: Ints) -> Floats:
         """Return what each of some layouts counts, 1 in all:
@@ -127,9 +123,10 @@ class Tuning:
         """
         family = np.array([self.layouts[n][0] for n in layouts])
         weights = np.zeros(len(layouts))
-        for inside in (family == n for n in np.unique(family)):
-            there = self._dangerous[layouts][inside]
-            weights[inside] = Success(there).weights(np.ones(len(there), dtype=int))
+        for number in np.unique(family):
+            of_family = family == number
+            dangerous = self._dangerous[layouts][of_family]
+            weights[of_family] = Success(dangerous).weights(np.ones(len(dangerous), dtype=int))
         return np.asarray(weights / weights.sum())
 
     def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
@@ -141,20 +138,22 @@ class Tuning:
         if record is None:
             record = self.records[candidate.key] = Record(candidate, self._length(candidate.prompt))
         for family in range(len(self.specs)):
-            missing = {self.layouts[n][1]: n for n in wanted if self.layouts[n][0] == family}
-            missing = {episode: n for episode, n in missing.items() if n not in record.played}
+            missing: dict[int, int] = {}  # place of each layout by its episode
+            for n in wanted:
+                its_family, episode = self.layouts[n]
+                if its_family == family and n not in record.played:
+                    missing[episode] = n
             if missing:
-                played = self._walked(record, family, missing)
-                record.played.update({missing[episode]: each for episode, each in played.items()})
+                for episode, played in self._walked(record, family, missing).items():
+                    record.played[missing[episode]] = played
         return [record.played[n] for n in wanted]
 
     def score(self, candidate: Candidate, layouts: Ints) -> float:
         """Return a candidate's score over some layouts.
         Raises Spent before the budget is exceeded.
         """
-        return float(
-            self.weights(layouts) @ [each.score for each in self.play(candidate, layouts.tolist())]
-        )
+        scores = [played.score for played in self.play(candidate, layouts.tolist())]
+        return float(self.weights(layouts) @ scores)
 
     def rank(self, candidate: Candidate) -> tuple[float, int]:
         """Return what grows with how good a candidate is on all layouts."""
@@ -174,15 +173,14 @@ class Tuning:
         return max(whole, key=self.rank)
 
     def _length(self, prompt: Prompt) -> int:
-        chats = [
-            changed(spec, prompt).ego.rendered(
-                scene.graphs[scene.viewers[0]], spec.actions, (), words
-            )
-            for spec in self.specs
-            for scene in spec.source.trial(1, ego_alone=True)
-            for words in [spec.scenario.prompt_words]
-        ]
-        return sum(len(message["content"]) for chat in chats for message in chat)
+        """Return the characters of the ego's prompt, in the first decision point of each family."""
+        length = 0
+        for spec in self.specs:
+            ego, words = changed(spec, prompt).ego, spec.scenario.prompt_words
+            for scene in spec.source.trial(1, ego_alone=True):
+                chat = ego.rendered(scene.graphs[scene.viewers[0]], spec.actions, (), words)
+                length += sum(len(message["content"]) for message in chat)
+        return length
 
     def _walked(
         self, record: Record, family: int, episodes: Mapping[int, int]

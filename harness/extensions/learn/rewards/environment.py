@@ -28,7 +28,7 @@ Reward = Literal["regret", "success"]
 MOST_CHARS = 100_000  # of a chat message
 MOST = 1e6  # as great as a number of a scene graph may be
 # What messages are written in: line breaks, and letters and signs up to those of East Asia.
-CHARACTERS = frozenset({"\n", "\t", *map(chr, range(0x20, 0x3000))})
+CHARACTERS = frozenset(["\n", "\t"] + [chr(code) for code in range(0x20, 0x3000)])
 
 
 class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
@@ -72,19 +72,17 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         scene = source.begin(source.seeds[0]).scene
         graph = scene.graphs[asking.viewer_of(scene, viewer, 0.0)]
         self.numbers = tuple(name for name, _ in numbers(graph, source.scenario.road()))
-        of_actions = (len(self.actions),)
+        count = len(self.actions)
         self.action_space = (
-            spaces.Box(0.0, 1.0, of_actions)
-            if distributions
-            else spaces.Discrete(len(self.actions))
+            spaces.Box(0.0, 1.0, (count,)) if distributions else spaces.Discrete(count)
         )
         text = spaces.Text(MOST_CHARS, charset=CHARACTERS)
-        each = (len(self.numbers),)
-        self.observation_space = (
-            spaces.Sequence(spaces.Dict({"role": text, "content": text}))
-            if self._text
-            else spaces.Dict(numbers=spaces.Box(-MOST, MOST, each), known=spaces.MultiBinary(each))
+        chat = spaces.Sequence(spaces.Dict({"role": text, "content": text}))
+        shape = (len(self.numbers),)
+        arrays = spaces.Dict(
+            numbers=spaces.Box(-MOST, MOST, shape), known=spaces.MultiBinary(shape)
         )
+        self.observation_space = chat if self._text else arrays
         self.trip: Trip | None = None
 
     @property

@@ -107,16 +107,18 @@ def distill(
             f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train "
             f"seeds alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
-    learnt = {each: tuple(v for v in versions if not prompts.unfit(v, each)) for each in driven}
-    for each, some in learnt.items():
-        if not some:
+    learnt = {}
+    for each in driven:
+        learnt[each] = tuple(v for v in versions if not prompts.unfit(v, each))
+        if not learnt[each]:
             raise UserError(
                 f"--prompt {printable(' '.join(prompt))}: none is for {each.name}; give "
                 f"{each.prompt}, or one of your own"
             )
     # A stage has a batch at least, and that of messages takes a scene for four sequences of each
     # prompt.
-    counts = _counts(samples, max(batch, 4 * sum(map(len, learnt.values()))))
+    pairs = sum(len(of_scenario) for of_scenario in learnt.values())
+    counts = _counts(samples, max(batch, 4 * pairs))
 
     from harness.backends.card import Card
     from harness.backends.transformers.engine import choose_device

@@ -55,19 +55,21 @@ class Curriculum:
 
     def settings(self) -> dict[str, Any]:
         """Return, as plain values, what a resumed training must have in common with its start."""
-        return {
-            "scenarios": {
-                scenario.name: sha256_bytes(canonical_json(scenario.parameters.stated()).encode())
-                for scenario in self.prompts
-            },
+        scenarios = {}
+        for scenario in self.prompts:
+            parameters = canonical_json(scenario.parameters.stated())
+            scenarios[scenario.name] = sha256_bytes(parameters.encode())
+        weights = sha256_file(self.base / WEIGHTS) if isinstance(self.base, Path) else None
+        settings = {
+            "scenarios": scenarios,
             "prompts": {p.version: p.sha256 for prompts in self.prompts.values() for p in prompts},
             "layouts": self.layouts,
             "first_seed": self.seed,
-            "base_sha256": sha256_file(self.base / WEIGHTS)
-            if isinstance(self.base, Path)
-            else None,
-            **({"base": published.base_name(self.base)} if isinstance(self.base, Card) else {}),
+            "base_sha256": weights,
         }
+        if isinstance(self.base, Card):
+            settings["base"] = published.base_name(self.base)
+        return settings
 
 
 def distill(

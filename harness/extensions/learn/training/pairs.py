@@ -143,11 +143,12 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
     refuse_others(run)
     forest, names = dataset.forest, list(run.decisions.scenes)
     ends_s = np.where(forest.safe, forest.delay_s, np.inf)
-    labels = {
-        name: label(dict(zip(dataset.actions, ends_s[n].tolist(), strict=True)))
-        for name in names
-        if forest.value[n := forest.place[name]]
-    }
+    labels = {}
+    for name in names:
+        place = forest.place[name]
+        if forest.value[place]:
+            ends_by_action = dict(zip(dataset.actions, ends_s[place].tolist(), strict=True))
+            labels[name] = label(ends_by_action)
     scenes = tuple(dataset.scenes(list(labels)))
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:

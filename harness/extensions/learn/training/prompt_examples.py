@@ -45,19 +45,20 @@ def examples(
                 f"{FIRST['train']} to {FIRST['report'] - 1}"
             )
         if points := decision_points(scenario, seed, 0):
-            picked = {
-                role: point for role in ROLES if (point := _pick(points, role, times[role], seed))
-            }
+            candidates: dict[str, Candidate] = {}
+            for role in ROLES:
+                candidate = _pick(points, role, times[role], seed)
+                if candidate:
+                    candidates[role] = candidate
             rare = all(
-                times[role][best] == min(times[role]) for role, (_, _, best) in picked.items()
+                times[role][best] == min(times[role]) for role, (_, _, best) in candidates.items()
             )
             passed = 0 if rare or passed == PATIENCE else passed + 1
             if not passed:
-                for role, (graph, label, best) in picked.items():
+                for role, (graph, label, best) in candidates.items():
                     times[role][best] += 1
-                    chosen[role].append(
-                        Example(seed, graph, answer(prompt, graph, label, scenario.actions))
-                    )
+                    text = answer(prompt, graph, label, scenario.actions)
+                    chosen[role].append(Example(seed, graph, text))
                 progress(1)
         seed += 1
     return Examples(scenario.name, ego=tuple(chosen["ego"]), helper=tuple(chosen["helper"]))
@@ -65,12 +66,12 @@ def examples(
 
 def _pick(points: list[Point], role: str, times: list[int], seed: int) -> Candidate | None:
     """Return the decision point of a role that is shown; None where nobody has the role."""
-    candidates: list[Candidate] = [
-        (graph, label := np.array(point.label), int(label.argmax()))
-        for point in points
-        for graph in point.record.graphs.values()
-        if graph.role == role
-    ]
+    candidates: list[Candidate] = []
+    for point in points:
+        label = np.array(point.label)
+        best = int(label.argmax())
+        graphs = [graph for graph in point.record.graphs.values() if graph.role == role]
+        candidates += [(graph, label, best) for graph in graphs]
     order = noise.generator("examples", role, seed).permutation(len(candidates)).tolist()
 
     def rank(candidate: Candidate) -> tuple[int, int, bool]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -117,14 +118,11 @@ class Student:
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
         """Make samples whose answer states a distribution."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
-        replies = [
-            answer(q.prompt, q.graph, p, q.actions, bare=bool(b), named=q.named)
-            for q, p, b in zip(questions, intents, bare, strict=True)
-        ]
-        return [
-            self._sample(q, q.messages, text, None)
-            for q, text in zip(questions, replies, strict=True)
-        ]
+        samples = []
+        for q, intent, is_bare in zip(questions, intents, bare.tolist(), strict=True):
+            text = answer(q.prompt, q.graph, intent, q.actions, bare=is_bare, named=q.named)
+            samples.append(self._sample(q, q.messages, text, None))
+        return samples
 
     @cached_property
     def asked(self) -> list[Sample]:
@@ -138,28 +136,27 @@ class Student:
 
         Raises UserError if no message reaches the ego in the scenes that are taken.
         """
-        prompts = sum(len(each.prompts) for each in self.lessons)
+        prompts = sum(len(lessons.prompts) for lessons in self.lessons)
         most = self.plan.samples["messages"] // (4 * prompts)  # of each scenario
-        some = [(each, self.some(each.scenes, most)) for each in self.lessons]
-        helpers = {
-            key(each, scene, helper, prompt)
-            for each, scenes in some
-            for scene in scenes
-            for helper in scene.viewers[1:]
-            for prompt in each.prompts
-        }
-        spoke = [
-            (q.key, sample)
-            for q, sample in zip(self.questions, self.asked, strict=True)
-            if q.key in helpers
-        ]
+        scenes_of = [self.some(lessons.scenes, most) for lessons in self.lessons]
+        helpers = set()
+        for lessons, scenes in zip(self.lessons, scenes_of, strict=True):
+            for scene, prompt in product(scenes, lessons.prompts):
+                helpers |= {key(lessons, scene, helper, prompt) for helper in scene.viewers[1:]}
+        names, samples = [], []
+        for question, sample in zip(self.questions, self.asked, strict=True):
+            if question.key in helpers:
+                names.append(question.key)
+                samples.append(sample)
         file = self.work / "heard.pt"
         if not file.is_file():  # after a kill, a later stage's model would read otherwise
-            read = [torch.from_numpy(p) for p in self.read([sample for _, sample in spoke])]
+            read = [torch.from_numpy(intent) for intent in self.read(samples)]
             save({"intents": read}, file)
-        stored = [p.numpy() for p in torch.load(file, weights_only=True)["intents"]]
-        intents = dict(zip((name for name, _ in spoke), stored, strict=True))
-        heard = [q for each, scenes in some for q in with_messages(each, scenes, intents)]
+        stored = [intent.numpy() for intent in torch.load(file, weights_only=True)["intents"]]
+        intents = dict(zip(names, stored, strict=True))
+        heard: list[Question] = []
+        for lessons, scenes in zip(self.lessons, scenes_of, strict=True):
+            heard += with_messages(lessons, scenes, intents)
         if not heard:
             raise UserError(
                 f"--samples: {self.plan.samples['messages']} sequences of the stage messages take "
@@ -181,13 +178,15 @@ class Student:
         # As many texts of the ego, alone and with messages, as of all helpers: each decision needs
         # the ego's.
         pairs = list(zip(self.questions, self.asked, strict=True))
-        kinds = [
-            [pair for pair in pairs if pair[0].graph.role == role] for role in ("helper", "ego")
-        ]
-        kinds.append(list(zip(heard, with_heard, strict=True)))
+        of_helpers = [pair for pair in pairs if pair[0].graph.role == "helper"]
+        of_egos = [pair for pair in pairs if pair[0].graph.role == "ego"]
+        of_heard = list(zip(heard, with_heard, strict=True))
         most = self.plan.samples["answers"] // 6
-        stated = [pair for kind in kinds for pair in self.some(kind, most)]
-        texts = self.writing([q for q, _ in stated], self.read([sample for _, sample in stated]))
+        drawn: list[tuple[Question, Sample]] = []
+        for kind in (of_helpers, of_egos, of_heard):
+            drawn += self.some(kind, most)
+        intents = self.read([sample for _, sample in drawn])
+        texts = self.writing([question for question, _ in drawn], intents)
         return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
