@@ -65,44 +65,6 @@ def sentences(runs: Runs) -> list[Markup]:
     return sentences
 
 
-def left_out(self, run: Run) -> LeftOut:
-    """Return what is drawn beside the answers of decision points:
-    what they became without one thing.
-    """
-    ...
-
-
-REMARKS: Plugins[Remarks] = Plugins("swarmdrive.remarks", Remarks, {})
-
-
-def sentences(runs: Runs) -> list[Markup]:
-    """Return what extensions say above the list.
-    Of one that fails, a sentence says so in its place.
-
-    Raises UserError if a file of a run is broken.
-    """
-
-    def escaped(remarks: Remarks) -> list[Markup]:
-        said = list(remarks.sentences(runs))
-        texts(said)  # raises what stands for a failure if one is no text
-        return [escape(sentence) for sentence in said]
-
-    sentences: list[Markup] = []
-    for name in REMARKS:
-        try:
-            sentences += REMARKS.ask(name, escaped)
-        except Failed as error:
-            sentences.append(escape(visible(str(error))))
-    return sentences
-
-
-def _escaped(sentences: Iterable[str]) -> list[Markup]:
-    """Return sentences for a page. Raises what stands for a failure if one is no text."""
-    each = list(sentences)
-    texts(each)
-    return [escape(sentence) for sentence in each]
-
-
 def left_out(run: Run) -> LeftOut:
     """Return what extensions have beside a run's answers; of one that fails, nothing.
 
