@@ -379,17 +379,7 @@ def trust_study(bench: Bench) -> Study:
     import pandas as pd
 
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
-    cells = [
-        {
-            "rule": c.rule,
-            "attack": c.attack or None,
-            "share": c.share,
-            "success": as_mapping(over_episodes(SUCCESS, c.success)),
-            bench.counting.metric: as_mapping(bench.counting.estimate(c.success)),
-            "detection": {k: as_mapping(e) for k, e in c.detection().items()} or None,
-        }
-        for c in bench.cells.values()
-    ]
+    cells = [_cell(bench, cell) for cell in bench.cells.values()]
     means = [
         {"rule": rule, "share": share, **as_mapping(bench.mean(rule, share))}
         for share in bench.shares
@@ -433,22 +423,31 @@ def trust_study(bench: Bench) -> Study:
     )
 
 
+def _cell(bench: Bench, cell: Cell) -> dict[str, Any]:
+    """Return a cell as the study's manifest has it: what was played, and what it came to."""
+    detection = {name: as_mapping(estimate) for name, estimate in cell.detection().items()}
+    return {
+        "rule": cell.rule,
+        "attack": cell.attack or None,
+        "share": cell.share,
+        "success": as_mapping(over_episodes(SUCCESS, cell.success)),
+        bench.counting.metric: as_mapping(bench.counting.estimate(cell.success)),
+        "detection": detection or None,
+    }
+
+
 def _heat_map(bench: Bench) -> "Figure":
     """Draw success of each rule under each attack, a panel a share of attackers."""
     from harness.studies.figures.heat_map import heat_map
 
-    panels = {
-        _title(share): np.array(
-            [
-                [
-                    100 * bench.success(rule, attack, share * bool(attack)).value
-                    for rule in bench.rules
-                ]
-                for attack in (PEACE, *bench.attacks)
-            ]
-        )
-        for share in bench.shares
-    }
+    panels = {}
+    for share in bench.shares:
+        rows = []
+        for attack in (PEACE, *bench.attacks):
+            of_attack = share if attack else 0.0
+            successes = [bench.success(rule, attack, of_attack) for rule in bench.rules]
+            rows.append([100 * success.value for success in successes])
+        panels[_title(share)] = np.array(rows)
     return heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)
 
 
@@ -527,29 +526,21 @@ def _title(share: float) -> str:
 
 
 def _tables(bench: Bench, share: float) -> Iterator[Table]:
-    rows: list[Sequence[str]] = [
-        (
-            rule,
-            _price(bench, rule),
-            shown(bench.mean(rule, share)),
-            attack := bench.worst(rule, share),
-            shown(bench.success(rule, attack, share)),
-        )
-        for rule in bench.rules
-    ]
+    """Yield a table of the rules at a share of attackers, and one of each attack under each."""
+    rows: list[Sequence[str]] = []
+    for rule in bench.rules:
+        mean, worst = shown(bench.mean(rule, share)), bench.worst(rule, share)
+        there = shown(bench.success(rule, worst, share))
+        rows.append((rule, _price(bench, rule), mean, worst, there))
     heads = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
     yield Table(_title(share), heads, rows, terminal=range(len(heads)))
     rows = [("nobody attacks", *(shown(bench.success(rule)) for rule in bench.rules))]
-    rows += [
-        (
-            attack,
-            *(
-                strong(shown(bench.success(rule, attack, share)), bench.clear(rule, attack, share))
-                for rule in bench.rules
-            ),
-        )
-        for attack in bench.attacks
-    ]
+    for attack in bench.attacks:
+        cells = []
+        for rule in bench.rules:
+            success = shown(bench.success(rule, attack, share))
+            cells.append(strong(success, bench.clear(rule, attack, share)))
+        rows.append((attack, *cells))
     yield Table(
         f"{_title(share)}: {bench.counting.words}, %",
         ("attack", *bench.rules),
@@ -564,17 +555,14 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
 def _detections(bench: Bench) -> Iterator[Table]:
     """Yield how rules that judge helpers find attackers, and whom they take for one in peace."""
     for rule in bench.rules:
-        rows = [
-            (
-                c.attack or "nobody attacks",
-                f"{c.share:.2f}",
-                *map(shown, c.detection().values()),
-                "–" if not c.caught else f"{c.time_to_detection:.0f}",
-                f"{len(c.caught)} of {len(c.first)}",
-            )
-            for c in bench.cells.values()
-            if c.rule == rule and c.flagged is not None
-        ]
+        rows = []
+        for cell in bench.cells.values():
+            if cell.rule == rule and cell.flagged is not None:
+                found = [shown(estimate) for estimate in cell.detection().values()]
+                time = f"{cell.time_to_detection:.0f}" if cell.caught else "–"
+                caught = f"{len(cell.caught)} of {len(cell.first)}"
+                attack = cell.attack or "nobody attacks"
+                rows.append((attack, f"{cell.share:.2f}", *found, time, caught))
         if rows:
             yield Table(
                 f"How well {rule} finds attackers",
