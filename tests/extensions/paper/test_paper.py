@@ -37,14 +37,14 @@ def found(paper: Study) -> pd.DataFrame:
     return paper.data["ledger"]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_every_number_of_the_paper_is_in_the_ledger(found: pd.DataFrame) -> None:
     assert set(found.id) == {row["id"] for row in paper_numbers()}
     assert set(found.verdict) <= {"within", "unclear", "misses", "cited"}
     assert found[found.kind == "cited"].id.tolist() == ["A1"]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_the_ledger_is_inside_its_aims(found: pd.DataFrame) -> None:
     """One row misses (benchmarks/measured/studies.md):
     at 40 % loss more is heard than in the paper.
@@ -75,7 +75,7 @@ def test_on_any_seeds_28_rows_hold_at_the_papers_own_sizes(first: int) -> None:
     assert tally(ledger(joined(parts).summary))["within"] >= 28
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_twelve_rows_are_predictions(found: pd.DataFrame) -> None:
     predicted = found[found.kind == "predicted"].id.unique()
     assert " ".join(predicted) == "A4 A5 A7 B1 B4 B5 B10 B11 B12 B14 B17 B19"
@@ -93,7 +93,7 @@ def test_five_seeds_that_round_alike_are_not_taken_for_exact() -> None:
     assert verdict(30.0, np.nan, np.nan, 89.0, 91.0) == "unclear"
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_seeds_are_the_studys_own() -> None:
     one, again, other = (
         run_paper(panels(10, 10), seeds, lambda done: None) for seeds in ((7,), (7,), (3,))
@@ -104,7 +104,7 @@ def test_seeds_are_the_studys_own() -> None:
     assert other.manifest["seeds"] == [3]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_what_equation_2_does_is_measured(study: Path) -> None:
     """The witness has 1/6 of 1/6 + 1/25 + 2/20, more than half;
     of equal weights it has a quarter.
@@ -121,7 +121,7 @@ def test_what_equation_2_does_is_measured(study: Path) -> None:
     assert f"{100 * without:.1f} [" in page
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_the_papers_values_are_drawn_in_every_panel(study: Path) -> None:
     numbers = pd.read_csv(study / "ledger.csv")
     numbers["value"] = numbers["value"].fillna("")
@@ -136,7 +136,7 @@ def test_the_papers_values_are_drawn_in_every_panel(study: Path) -> None:
             assert len(after.lines) > len(before.lines), after.get_ylabel()
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_grid_points_that_are_the_same_point_give_the_same_number(found: pd.DataFrame) -> None:
     """N = 4 with density-coupled loss, 6.6 %, is tau at its lowest,
     where all helpers load the channel.
@@ -146,7 +146,7 @@ def test_grid_points_that_are_the_same_point_give_the_same_number(found: pd.Data
     assert size == pytest.approx(low)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> None:
     names = {f"figure-{f}.{kind}" for f in "ab" for kind in ("svg", "pdf", "png")}
     assert {p.name for p in study.iterdir()} == names | {
@@ -159,7 +159,7 @@ def test_the_folder_holds_figures_tables_and_what_was_fitted(study: Path) -> Non
     assert len(manifest["source"]["parameters"]) <= 10
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_episodes_add_up_to_the_conditions(study: Path) -> None:
     episodes, conditions = (
         pd.read_csv(study / f"{name}.csv", dtype={"value": float})
