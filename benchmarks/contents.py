@@ -161,7 +161,7 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
         cells = [
             (
                 *cells,
-                shown(driven[cells[0]].leading),
+                shown(driven[cells[0]].success),
                 ""
                 if cells[0] == "intent"
                 else shown(driven[cells[0]].over(driven["intent"]), sign="+"),

@@ -7,7 +7,8 @@ differences to intents are paired by episode within each family.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import corrected, refuse_other
 from harness.studies.sweep import point_of, settings
 from harness.world.lookouts import radios
-from harness.world.parameters import frames
+from harness.world.parameters import Parameters, frames
 
 NOTHING = "nothing"
 PLAYED = (NOTHING, *OF_HELPERS)
@@ -82,28 +83,28 @@ class Outcome:
     """What a model's runs came to at one point."""
 
     families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
-    counting: Mapping[str, Success]  # how success counts in each family: alike in all
+    success_rules: Mapping[str, Success]  # of each family; the metric is the same in all
 
     @property
-    def lead(self) -> str:
-        """The metric by which it is read."""
-        return next(iter(self.counting.values())).metric
+    def headline_metric(self) -> str:
+        """The metric of success by which it is read, plain or balanced."""
+        return next(iter(self.success_rules.values())).metric
 
     @property
-    def leading(self) -> Estimate:
-        """What leads, as the mean over families."""
-        return self.estimate(self.lead)
+    def success(self) -> Estimate:
+        """The headline metric's estimate, the mean over families."""
+        return self.estimate(self.headline_metric)
 
     def estimate(self, metric: str, family: str = MEAN) -> Estimate:
         """Return a metric of a family, or its mean over families."""
-
-        def of(name: str) -> Estimate:
-            each = self.families[name]
+        estimates = []
+        for name in self._of(family):
+            values = self.families[name]
             if metric == BALANCED:
-                return self.counting[name].estimate(each[SUCCESS])
-            return over_episodes(metric, each[metric])
-
-        return mean_of([*map(of, self._of(family))])
+                estimates.append(self.success_rules[name].estimate(values[SUCCESS]))
+            else:
+                estimates.append(over_episodes(metric, values[metric]))
+        return mean_of(estimates)
 
     def over(
         self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = ""
@@ -118,15 +119,19 @@ class Outcome:
     def _pairs(
         self, other: "Outcome", family: str, metric: str = ""
     ) -> Iterator[tuple[Success, Floats, Floats]]:
+        """Yield the success rule of each family, and success (S, E) of this and of the other."""
         for name in self._of(family):
-            how = self.counting[name].plain if metric == SUCCESS else self.counting[name]
-            yield how, self.families[name][SUCCESS], other.families[name][SUCCESS]
+            rule = self.success_rules[name]
+            if metric == SUCCESS:
+                rule = rule.plain
+            yield rule, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
         """Return success of the episodes of all families that are in a group, (S, n)."""
-        return np.hstack(
-            [each[SUCCESS][:, groups[family]] for family, each in self.families.items()]
-        )
+        parts = []
+        for family, values in self.families.items():
+            parts.append(values[SUCCESS][:, groups[family]])
+        return np.hstack(parts)
 
     def _of(self, family: str) -> list[str]:
         return list(self.families) if family == MEAN else [family]
@@ -170,11 +175,13 @@ class Result:
 
     @cached_property
     def _p(self) -> dict[Place, float | None]:
-        pairs = [(setting, content) for setting in self.points for content in self.others]
-        raw = [
-            self.at(setting, content).p_over(self.at(setting, INTENT)) for setting, content in pairs
-        ]
-        return dict(zip([place(*pair) for pair in pairs], corrected(raw), strict=True))
+        places, p_values = list[Place](), list[float | None]()
+        for setting in self.points:
+            intent = self.at(setting, INTENT)
+            for content in self.others:
+                places.append(place(setting, content))
+                p_values.append(self.at(setting, content).p_over(intent))
+        return dict(zip(places, corrected(p_values), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
         """Return the p of a content against intents,
@@ -183,19 +190,19 @@ class Result:
         return self._p.get(place(setting, content))
 
     @property
-    def lead(self) -> str:
-        """The metric by which success is read."""
-        return self.at(self.base, INTENT).lead
+    def headline_metric(self) -> str:
+        """The metric of success by which it is read, plain or balanced."""
+        return self.at(self.base, INTENT).headline_metric
 
     @property
     def words(self) -> str:
-        """The same for people."""
-        return IN_WORDS[self.lead]
+        """The headline metric's name for people."""
+        return IN_WORDS[self.headline_metric]
 
     @property
     def successes(self) -> tuple[str, ...]:
-        """What leads, then what it is the mean of."""
-        return self.lead, *entry(self.lead).halves
+        """The headline metric, then the metrics that it is the mean of."""
+        return self.headline_metric, *entry(self.headline_metric).halves
 
     @property
     def families(self) -> list[str]:
@@ -221,7 +228,8 @@ def place(setting: Setting, content: str) -> Place:
 def distinct(panels: Sequence[Panel]) -> list[Setting]:
     """Return each different grid point once, in order."""
     every = [setting for panel in panels for setting in panel.settings]
-    return list({place(setting, INTENT): setting for setting in reversed(every)}.values())[::-1]
+    last_first = {place(setting, INTENT): setting for setting in reversed(every)}
+    return list(last_first.values())[::-1]
 
 
 def folders(path: Path) -> list[Path]:
@@ -246,24 +254,24 @@ def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> l
         variants = [run.run.manifest.variant for run in runs]
         prompts = " and ".join(dict.fromkeys(variant.prompt for variant in variants))
         name = str(structs.replace(variants[0], prompt=prompts))
-        theirs = by_model.setdefault(name, {})
+        by_family = by_model.setdefault(name, {})
         for run in runs:
             family = run.dataset.scenario.name
-            if family in theirs:
+            if family in by_family:
+                other = by_family[family].run.path
                 raise UserError(
-                    f"{printable(run.run.path)} and {printable(theirs[family].run.path)} are both "
+                    f"{printable(run.run.path)} and {printable(other)} are both "
                     f"{printable(name)} on {printable(family)}; give one of them"
                 )
-            theirs[family] = run
-    result = []
-    for name, theirs in by_model.items():
-        left_out = dict(
-            _unable(list(theirs.values()), [setting.point for setting in distinct(panels)])
-        )
+            by_family[family] = run
+    points = [setting.point for setting in distinct(panels)]
+    models = []
+    for name, by_family in by_model.items():
+        left_out = dict(_unable(list(by_family.values()), points))
         if INTENT in left_out:
             raise UserError(f"{printable(name)}: {left_out[INTENT]}")
-        result.append(Model(name, theirs, left_out))
-    return result
+        models.append(Model(name, by_family, left_out))
+    return models
 
 
 def _unable(
@@ -296,11 +304,9 @@ def panels_of(
             f"--grid: {len(grids)} given for {len(over)} of --over; give one for each, in order"
         )
     if conditions or over:
-        values = [*grids, *[None] * (len(over) - len(grids))]
         conditions = conditions or [BASE]
-        varied = [
-            (c, axis, text) for c in conditions for axis, text in zip(over, values, strict=True)
-        ]
+        axes = list(zip_longest(over, grids))  # None where an axis has no grid
+        varied = [(condition, *axis) for condition in conditions for axis in axes]
     else:
         varied = list(USUAL)
         conditions = [BASE]
@@ -318,23 +324,15 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 
     They are about the decision points that the run or a reference driver comes to.
     """
-    points = tuple(
-        {
-            holding(setting.point, content)
-            for panel in panels
-            for setting in panel.settings
-            for content in model.contents
-        }
-    )
-    return {
-        family: lacking(
-            replace(run.spec, points=points),
-            run.dataset,
-            sorted({*run.dataset.courses(), *run.run.decisions.scenes}),
-            run.answers,
-        )
-        for family, run in model.runs.items()
-    }
+    points = set[OperatingPoint]()
+    for setting in distinct(panels):
+        points |= {holding(setting.point, content) for content in model.contents}
+    counts = {}
+    for family, run in model.runs.items():
+        spec = replace(run.spec, points=tuple(points))
+        scenes = sorted({*run.dataset.courses(), *run.run.decisions.scenes})
+        counts[family] = lacking(spec, run.dataset, scenes, run.answers)
+    return counts
 
 
 def manifest_of(
@@ -366,8 +364,9 @@ def run_contents(
     points = distinct(panels)
     progress.more(sum(len(model.contents) * len(model.runs) * len(points) for model in swarms))
     results = [_played(model, panels, points, seeds, progress) for model in swarms]
-    for run in (run for model in swarms for run in model.runs.values()):
-        run.settle()
+    for model in swarms:
+        for run in model.runs.values():
+            run.settle()
     return results
 
 
@@ -378,34 +377,38 @@ def _played(
     seeds: Sequence[int],
     progress: Progress,
 ) -> Result:
-    every = [
+    """Return what a model's runs come to with every content at every point."""
+    settings = [
         replace(setting, point=holding(setting.point, content))
         for content in model.contents
         for setting in points
     ]
-    by_family: dict[Place, dict[str, Mapping[str, Floats]]] = {
-        (s.point, s.vehicles): {} for s in every
-    }
+    metrics: dict[Place, dict[str, Mapping[str, Floats]]] = {}  # by place and family
     for family, run in model.runs.items():
-        p = run.dataset.scenario.parameters
-
-        def read(
-            part: Decided[Any], lag: int = p.lag_frames, hz: int = p.simulation_hz
-        ) -> dict[str, Floats]:
-            values = metric_columns(part)
-            seconds, at = np.unique(part.result.latency_s, return_inverse=True)
-            off = np.array(
-                [frames(each, hz) != lag if each == each else np.nan for each in seconds.tolist()]
-            )
-            return {**values, "off_lag": off[at]}
-
-        for setting, [walk] in zip(every, run.walked(every, seeds, read), strict=True):
-            metrics = {**walk.ends, **by_episode(walk, METRICS)}
-            by_family[setting.point, setting.vehicles][family] = metrics
+        columns = partial(_columns, run.dataset.scenario.parameters)
+        walks = run.walked(settings, seeds, columns)
+        for setting, [walk] in zip(settings, walks, strict=True):
+            of_family = {**walk.ends, **by_episode(walk, METRICS)}
+            metrics.setdefault((setting.point, setting.vehicles), {})[family] = of_family
             progress(1)
     by_run = counted(list(model.runs.values()))
-    counting = {family: by_run[run] for family, run in model.runs.items()}
-    return Result(model, panels, {key: Outcome(of, counting) for key, of in by_family.items()})
+    rules = {family: by_run[run] for family, run in model.runs.items()}
+    outcomes = {key: Outcome(by_family, rules) for key, by_family in metrics.items()}
+    return Result(model, panels, outcomes)
+
+
+def _columns(parameters: Parameters, part: Decided[Any]) -> dict[str, Floats]:
+    """Return the columns that the metrics are of, and `off_lag`: whether a decision would begin
+    in another frame than that of its world, each (n,).
+    """
+    seconds, place = np.unique(part.result.latency_s, return_inverse=True)
+    is_off = []
+    for each in seconds.tolist():
+        if np.isnan(each):
+            is_off.append(np.nan)
+        else:
+            is_off.append(frames(each, parameters.simulation_hz) != parameters.lag_frames)
+    return {**metric_columns(part), "off_lag": np.array(is_off)[place]}
 
 
 def witnesses(run: ReplayedRun) -> Ints:
@@ -414,15 +417,18 @@ def witnesses(run: ReplayedRun) -> Ints:
     `SAFE` without a danger, `HEARD` where it has a radio: its beacons tell of it, whoever sees it.
     """
     forest, scenario = run.dataset.forest, run.dataset.scenario
+    roots = [forest.ids[n] for n in forest.root.tolist()]
     counts = []
-    for scene in run.dataset.scenes([forest.ids[n] for n in forest.root.tolist()]):
+    for scene in run.dataset.scenes(roots):
         danger = scene.record.danger
-        seen = [
-            any(node.id == danger.vehicle for node in scene.graphs[v].nodes)
-            for v in scene.viewers[1:]
-        ]
-        heard = radios(scenario, scene.state.episode_seed, danger.sector)["danger_radio"]
-        counts.append(SAFE if danger.vehicle is None else HEARD if heard else sum(seen))
+        if danger.vehicle is None:
+            counts.append(SAFE)
+        elif radios(scenario, scene.state.episode_seed, danger.sector)["danger_radio"]:
+            counts.append(HEARD)
+        else:
+            graphs = [scene.graphs[helper] for helper in scene.viewers[1:]]
+            seen = [any(node.id == danger.vehicle for node in graph.nodes) for graph in graphs]
+            counts.append(sum(seen))
     return np.array(counts)
 
 
@@ -431,10 +437,17 @@ def groups(model: Model) -> dict[str, dict[str, Bools]]:
     by who sees the danger.
     """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
-    most = max(int(each.max()) for each in counts.values())
-    numbers = {"no danger": SAFE, **{f"a danger, seen by {n}": n for n in range(most + 1)}}
+    most = max(int(of_family.max()) for of_family in counts.values())
+    numbers = {"no danger": SAFE}
+    for n in range(most + 1):
+        numbers[f"a danger, seen by {n}"] = n
     numbers["a danger with a radio"] = HEARD
-    named = {
-        name: {family: each == n for family, each in counts.items()} for name, n in numbers.items()
-    } | {"any danger": {family: each != SAFE for family, each in counts.items()}}
-    return {name: within for name, within in named.items() if any(map(np.any, within.values()))}
+    named = {}
+    for name, number in numbers.items():
+        named[name] = {family: of_family == number for family, of_family in counts.items()}
+    named["any danger"] = {family: of_family != SAFE for family, of_family in counts.items()}
+    return {
+        name: episodes
+        for name, episodes in named.items()
+        if any(of_family.any() for of_family in episodes.values())
+    }

@@ -103,12 +103,13 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 def headline(result: Result) -> list[str]:
     """Say which content wins where, and what each costs at the first condition."""
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
-    gains = [f"{c} {shown(result.at(base, c).over(intent), sign='+')}" for c in result.sent]
-    costs = [
-        f"{content} {shown(each.leading)} % with {_kbit(each):.1f} kbit and {_age(each):.0f} ms"
-        for content in result.model.contents
-        if (each := result.at(base, content))
-    ]
+    gains, costs = list[str](), list[str]()
+    for content in result.sent:
+        gains.append(f"{content} {shown(result.at(base, content).over(intent), sign='+')}")
+    for content in result.model.contents:
+        outcome = result.at(base, content)
+        cost = f"{_kbit(outcome):.1f} kbit and {_age(outcome):.0f} ms"
+        costs.append(f"{content} {shown(outcome.success)} % with {cost}")
     return [
         f"{name}, {base.condition}, points of {result.words} over intents: {'; '.join(gains)}. "
         f"Of {len(result.points)} points, "
@@ -187,37 +188,24 @@ def _over(result: Result, setting: Setting, content: str) -> str:
 
 
 def _at_base(result: Result) -> Table:
+    halves = entry(result.headline_metric).halves
     rows = []
     for content in result.model.contents:
         outcome = result.at(result.base, content)
-        late, off_lag = (f"{100 * outcome.estimate(name).value:.1f}" for name in (LATE, OFF_LAG))
+        gain = _over(result, result.base, content)
         p = "" if content == INTENT else p_cell(result.p(result.base, content))
-        rows.append(
-            (
-                content,
-                shown(outcome.leading),
-                _over(result, result.base, content),
-                p,
-                f"{_kbit(outcome):.2f}",
-                f"{_age(outcome):.1f}",
-                late,
-                off_lag,
-                *(shown(outcome.estimate(half)) for half in entry(result.lead).halves),
-            )
-        )
+        costs = (f"{_kbit(outcome):.2f}", f"{_age(outcome):.1f}")
+        late = f"{100 * outcome.estimate(LATE).value:.1f}"
+        off_lag = f"{100 * outcome.estimate(OFF_LAG).value:.1f}"
+        of_halves = [shown(outcome.estimate(half)) for half in halves]
+        rows.append((content, shown(outcome.success), gain, p, *costs, late, off_lag, *of_halves))
+    heads = ["content", f"{result.words} %", "over intents", "p"]
+    heads += ["kbit", "age, ms", "late %", "off lag %"]
+    if halves:
+        heads += ["with a danger %", "without %"]
     return Table(
         f"{result.model.name}, {result.base.condition}",
-        (
-            "content",
-            f"{result.words} %",
-            "over intents",
-            "p",
-            "kbit",
-            "age, ms",
-            "late %",
-            "off lag %",
-            *(("with a danger %", "without %") if entry(result.lead).halves else ()),
-        ),
+        heads,
         rows,
         "Over intents: in points, bold where it is clear. kbit: of all requests and replies of an "
         "episode. Age: of what the ego knows when it acts. Late: decisions longer than the window.",
@@ -226,27 +214,30 @@ def _at_base(result: Result) -> Table:
 
 
 def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> Table:
-    """Of settings in the first condition that cost no more than intents in it,
-    show each content's best.
+    """Return a row for each content with its best setting in the first condition,
+    of those that cost no more than intents in it.
     """
     intent = result.at(result.base, INTENT)
-    settings = {"as it is": result.base} | {
-        f"{panel.axis} {_value(setting)}": setting
-        for panel in result.panels
-        for setting in panel.settings
-        if setting.condition == result.base.condition and panel.axis in SPENDING
-    }
+    settings = {"as it is": result.base}
+    for panel in result.panels:
+        for setting in panel.settings:
+            if setting.condition == result.base.condition and panel.axis in SPENDING:
+                settings[f"{panel.axis} {_value(setting)}"] = setting
     rows = []
     for content in result.model.contents:
-        outcomes = [(result.at(setting, content), name) for name, setting in settings.items()]
-        within = [each for each in outcomes if cost(each[0]) <= cost(intent) + 1e-9]
-        if not within:
+        affordable = {}
+        for name, setting in settings.items():
+            outcome = result.at(setting, content)
+            if cost(outcome) <= cost(intent) + 1e-9:
+                affordable[name] = outcome
+        if not affordable:
             rows.append((content, "none", "", "", "", ""))
             continue
-        best, name = max(within, key=lambda each: each[0].leading.value)
+        best_name = max(affordable, key=lambda name: affordable[name].success.value)
+        best = affordable[best_name]
         gain = "" if best is intent else shown(best.over(intent), sign="+")
         costs = (f"{_kbit(best):.2f}", f"{_age(best):.1f}")
-        rows.append((content, name, shown(best.leading), gain, *costs))
+        rows.append((content, best_name, shown(best.success), gain, *costs))
     return Table(
         f"{result.model.name}, {result.base.condition}: at the {title} of intents",
         ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"),
@@ -262,8 +253,9 @@ def _by_family(result: Result) -> Table:
     rows = []
     for family in result.families:
         outcomes = {content: result.at(result.base, content) for content in contents}
-        gains = (shown(outcomes[c].over(outcomes[INTENT], family), sign="+") for c in result.sent)
-        scores = (shown(outcome.estimate(result.lead, family)) for outcome in outcomes.values())
+        metric, intent = result.headline_metric, outcomes[INTENT]
+        scores = [shown(outcome.estimate(metric, family)) for outcome in outcomes.values()]
+        gains = [shown(outcomes[c].over(intent, family), sign="+") for c in result.sent]
         rows.append((family, *scores, *gains))
     heads = (
         "family",
@@ -277,23 +269,18 @@ def _by_family(result: Result) -> Table:
 
 def _along(result: Result, panel: Panel) -> Table:
     contents, rows = result.model.contents, []
-    theirs = _theirs(panel.axis)
+    of_paper = _of_paper(panel.axis)
     for setting in panel.settings:
-        outcomes = [result.at(setting, content) for content in contents]
-        rows.append(
-            (
-                _value(setting),
-                *(shown(outcome.leading) for outcome in outcomes),
-                *(_over(result, setting, content) for content in result.sent),
-                *([theirs.get(setting.value, "")] if theirs else []),
-            )
-        )
-    heads = (
-        panel.axis,
-        *(f"{content}, %" for content in contents),
-        *(f"{c} over intents" for c in result.sent),
-        *(["the paper, %"] if theirs else []),
-    )
+        row = [_value(setting)]
+        row += [shown(result.at(setting, content).success) for content in contents]
+        row += [_over(result, setting, content) for content in result.sent]
+        if of_paper:
+            row.append(of_paper.get(setting.value, ""))
+        rows.append(row)
+    heads = [panel.axis, *(f"{content}, %" for content in contents)]
+    heads += [f"{content} over intents" for content in result.sent]
+    if of_paper:
+        heads.append("the paper, %")
     note = (
         "Differences are in points, bold where they are clear. The paper's value is of intents and "
         "of plain success, in scenes of its own."
@@ -331,61 +318,57 @@ def _costs(result: Result) -> "Iterator[tuple[str, str, list[Steps]]]":
     for title, cost in costs:
         steps = []
         for n, content in enumerate(result.model.contents):
-            look: dict[str, Any] = {"color": COLOURS[n % len(COLOURS)]}
-            places = sorted(
-                (cost(outcome), -100 * outcome.leading.value)
-                for setting in result.points
-                if (outcome := result.at(setting, content))
-            )
+            outcomes = [result.at(setting, content) for setting in result.points]
+            # The cheapest first, of equals the most successful.
+            places = sorted((cost(each), -100 * each.success.value) for each in outcomes)
             x, y = np.array(places).T * [[1], [-1]]
             best = y >= np.maximum.accumulate(y)
-            marker = look | {"marker": MARKERS[n % len(MARKERS)], "markersize": 4}
-            steps += [
-                Steps(content, x, y, marker | {"linestyle": ""}),
-                Steps("", x[best], y[best], look),
-            ]
+            colour = {"color": COLOURS[n % len(COLOURS)]}
+            marker = {"marker": MARKERS[n % len(MARKERS)], "markersize": 4, "linestyle": ""}
+            steps.append(Steps(content, x, y, colour | marker))
+            steps.append(Steps("", x[best], y[best], colour))
         yield result.model.name, title, steps
 
 
 def _curves(result: Result) -> "list[pd.DataFrame]":
-    """Return a part of a summary for each panel, as figures take it:
-    a content in place of a condition.
+    """Return the curves of each panel with an axis in the columns of a sweep's summary,
+    with the content as condition.
     """
     import pandas as pd
 
-    return [
-        pd.DataFrame(
-            [
-                {
+    curves = []
+    for panel in result.panels:
+        if not panel.axis:
+            continue
+        rows = []
+        for content in result.model.contents:
+            for setting in panel.settings:
+                success = result.at(setting, content).success
+                row = {
                     "source": result.model.name,
                     "panel": PAPER.get(panel.axis, (panel.axis,))[0],
                     "condition": content,
                     "variable": panel.axis,
                     "value": setting.value,
-                    "metric": result.lead,
-                    "mean": e.value,
-                    "ci_low": e.low,
-                    "ci_high": e.high,
+                    "metric": result.headline_metric,
+                    "mean": success.value,
+                    "ci_low": success.low,
+                    "ci_high": success.high,
                     "interval": "episodes",
                 }
-                for content in result.model.contents
-                for setting in panel.settings
-                if (e := result.at(setting, content).leading)
-            ]
-        )
-        for panel in result.panels
-        if panel.axis
-    ]
+                rows.append(row)
+        curves.append(pd.DataFrame(rows))
+    return curves
 
 
-def _theirs(axis: str) -> dict[Any, str]:
+def _of_paper(axis: str) -> dict[Any, str]:
     """Return the paper's success of intents by the value of an axis, in percent."""
     panel, shift = PAPER.get(axis, ("", 0.0))
-    return {
-        float(row["value"]) + shift: row["paper_value"]
-        for row in paper_numbers()
-        if row["panel"] == panel and row["metric"] == "success" and row["paper_value"]
-    }
+    values = {}
+    for row in paper_numbers():
+        if row["panel"] == panel and row["metric"] == "success" and row["paper_value"]:
+            values[float(row["value"]) + shift] = row["paper_value"]
+    return values
 
 
 def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
@@ -394,62 +377,51 @@ def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
     """
     import pandas as pd
 
-    return pd.DataFrame(
-        [
-            {
-                "panel": curve.panel[0],
-                "metric": SUCCESS,
-                "value": value,
-                "low": float(text),
-                "high": float(text),
-            }
-            for curve in curves
-            for value, text in _theirs(curve.variable[0]).items()
-            if curve.value.min() <= value <= curve.value.max()
-        ],
-        columns=["panel", "metric", "value", "low", "high"],
-    )
+    rows = []
+    for curve in curves:
+        for value, percent_text in _of_paper(curve.variable[0]).items():
+            if curve.value.min() <= value <= curve.value.max():
+                success = float(percent_text)
+                rows.append((curve.panel[0], SUCCESS, value, success, success))
+    return pd.DataFrame(rows, columns=["panel", "metric", "value", "low", "high"])
 
 
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return a row for each model, grid point, content and family, with the mean over families."""
     import pandas as pd
 
-    def row(
-        result: Result, panel: Panel, setting: Setting, content: str, family: str
-    ) -> dict[str, Any]:
-        outcome, intent = result.at(setting, content), result.at(setting, INTENT)
-        last = family == result.families[-1]
-        return {
-            "model": result.model.name,
-            "family": family,
-            "condition": setting.condition,
-            "variable": panel.axis,
-            "value": setting.value,
-            "content": content,
-            **_success(
-                outcome.estimate(SUCCESS, family), outcome.over(intent, family, metric=SUCCESS)
-            ),
-            **_balanced(result, outcome, intent, family),
-            "lead": result.lead,
-            "p_holm": result.p(setting, content) if last else None,
-            **{
-                key: value
-                for name in METRICS
-                for key, value in _ends(name, outcome.estimate(name, family)).items()
-            },
-        }
+    rows = []
+    for result in results:
+        for panel in result.panels:
+            for setting in panel.settings:
+                for content in result.model.contents:
+                    for family in result.families:
+                        rows.append(_points_row(result, panel, setting, content, family))
+    return pd.DataFrame(rows)
 
-    return pd.DataFrame(
-        [
-            row(result, panel, setting, content, family)
-            for result in results
-            for panel in result.panels
-            for setting in panel.settings
-            for content in result.model.contents
-            for family in result.families
-        ]
-    )
+
+def _points_row(
+    result: Result, panel: Panel, setting: Setting, content: str, family: str
+) -> dict[str, Any]:
+    outcome, intent = result.at(setting, content), result.at(setting, INTENT)
+    success = outcome.estimate(SUCCESS, family)
+    gain = outcome.over(intent, family, metric=SUCCESS)
+    p = result.p(setting, content) if family == result.families[-1] else None
+    row = {
+        "model": result.model.name,
+        "family": family,
+        "condition": setting.condition,
+        "variable": panel.axis,
+        "value": setting.value,
+        "content": content,
+        **_success(success, gain),
+        **_balanced(result, outcome, intent, family),
+        "lead": result.headline_metric,
+        "p_holm": p,
+    }
+    for name in METRICS:
+        row |= _ends(name, outcome.estimate(name, family))
+    return row
 
 
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
@@ -462,28 +434,28 @@ def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
             intent = result.at(result.base, INTENT).pooled(within)
             for content in result.model.contents:
                 success = result.at(result.base, content).pooled(within)
-                rows.append(
-                    {
-                        "model": result.model.name,
-                        "condition": result.base.condition,
-                        "group": name,
-                        "content": content,
-                        **_success(
-                            over_episodes(SUCCESS, success),
-                            difference(SUCCESS, [(success.T, intent.T)]),
-                        ),
-                    }
-                )
+                gain = difference(SUCCESS, [(success.T, intent.T)])
+                row = {
+                    "model": result.model.name,
+                    "condition": result.base.condition,
+                    "group": name,
+                    "content": content,
+                    **_success(over_episodes(SUCCESS, success), gain),
+                }
+                rows.append(row)
     return pd.DataFrame(rows)
 
 
 def _balanced(result: Result, outcome: Outcome, intent: Outcome, family: str) -> dict[str, Any]:
-    """Return what leads, its halves and what it is over intents, where it is not plain success."""
-    if result.lead == SUCCESS:
+    """Return balanced success, its halves and its gain over intents as columns of a row;
+    none where plain success is the headline metric.
+    """
+    if result.headline_metric == SUCCESS:
         return {}
-    each = {name.removesuffix("_rate"): outcome.estimate(name, family) for name in result.successes}
-    each["balanced_over_intent"] = outcome.over(intent, family)
-    return {key: value for name, e in each.items() for key, value in _ends(name, e).items()}
+    columns: dict[str, Any] = {}
+    for name in result.successes:
+        columns |= _ends(name.removesuffix("_rate"), outcome.estimate(name, family))
+    return columns | _ends("balanced_over_intent", outcome.over(intent, family))
 
 
 def _success(e: Estimate, gain: Estimate) -> dict[str, Any]:

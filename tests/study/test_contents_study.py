@@ -129,7 +129,7 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
         for n, v in a.items()
         for half in (dangerous[n], ~dangerous[n])
     ]
-    assert (balanced.lead, balanced.leading) == (
+    assert (balanced.headline_metric, balanced.success) == (
         BALANCED,
         mean_of([mean_of(parts[:2]), mean_of(parts[2:])]),
     )
