@@ -6,7 +6,7 @@ differs between repeats is the model's chance alone. All intervals are over epis
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -111,26 +111,26 @@ class Repeats:
     @cached_property
     def scores(self) -> tuple[Score, ...]:
         """All figures, as a run's summary has its own."""
-        estimates = [
-            (c, *figure) for n, c in enumerate(self.conditions) for figure in self._of_condition(n)
-        ]
-        estimates += [(ALL, *figure) for figure in self._doubts()]
-        return tuple(Score.of(*figure, "episodes") for figure in estimates)
+        scores = []
+        for place, condition in enumerate(self.conditions):
+            for metric, estimate in self._of_condition(place):
+                scores.append(Score.of(condition, metric, estimate, "episodes"))
+        for metric, estimate in self._doubts():
+            scores.append(Score.of(ALL, metric, estimate, "episodes"))
+        return tuple(scores)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
         """Return one figure; NaN where it is not known."""
-        return next(
-            s.estimate for s in self.scores if (s.condition, s.metric) == (condition, metric)
-        )
+        key = (condition, metric)
+        return next(s.estimate for s in self.scores if (s.condition, s.metric) == key)
 
     def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
+        """Yield the figures of the condition at a place, each with its metric."""
         _, counts, episodes = self._actions
-        asked = counts[place].sum(axis=(-2, -1)) > 0
+        reached = counts[place].sum(axis=(-2, -1)) > 0
         for metric, share in ((FLIPS, flips), (STABLE, stable)):
-            yield (
-                metric,
-                rate_interval(known_mean(share(counts[place]), axis=-1)[asked], episodes[asked]),
-            )
+            shares = known_mean(share(counts[place]), axis=-1)
+            yield metric, rate_interval(shares[reached], episodes[reached])
         success = self._success[:, place]
         yield SUCCESS, rate_interval(success.mean(axis=(0, 1)))
         wins = success.sum(axis=0)
@@ -142,10 +142,11 @@ class Repeats:
     @cached_property
     def _success(self) -> Floats:
         """Whether each episode succeeded, (k, C, S, E)."""
-        metrics = [METRICS[SUCCESS]]
-        return np.array(
-            [by_episode(metrics, r.grid, r.decisions, r.episodes)[SUCCESS] for r in self.runs]
-        )
+        successes = []
+        for run in self.runs:
+            values = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes)
+            successes.append(values[SUCCESS])
+        return np.array(successes)
 
     @cached_property
     def _actions(self) -> tuple[list[str], Ints, Ints]:
@@ -159,12 +160,10 @@ class Repeats:
         episodes = np.zeros(len(scenes), dtype=np.int64)
         for run in self.runs:
             scene = run.decisions.codes("scene", scenes)
-            condition, seed, episode = np.unravel_index(
-                run.grid.places(run.decisions), run.grid.shape
-            )
-            np.add.at(
-                counts, (condition, scene, seed, run.decisions.codes("action", run.actions)), 1
-            )
+            action = run.decisions.codes("action", run.actions)
+            places = run.grid.places(run.decisions)
+            condition, seed, episode = np.unravel_index(places, run.grid.shape)
+            np.add.at(counts, (condition, scene, seed, action), 1)
             episodes[scene] = episode
         return scenes, counts, episodes
 
@@ -188,20 +187,22 @@ class Repeats:
         """Yield the entropy that the ego's answers state,
         and that of the actions which they rank first.
         """
-        intents: dict[str, list[tuple[float, ...]]] = {}
+        intents: dict[str, list[tuple[float, ...]]] = {}  # by scene
         for run in self.runs:
             for answer in run.answers:
                 if answer.role == "ego":
-                    intents.setdefault(answer.scene, []).extend(
-                        [answer.intent] if answer.intent else []
-                    )
-        both = np.array(
-            [_doubt(np.array(p)) if len(p) > 1 else (math.nan,) * 2 for p in intents.values()]
-        )
+                    of_scene = intents.setdefault(answer.scene, [])
+                    if answer.intent:
+                        of_scene.append(answer.intent)
+        entropies = np.full((len(intents), 2), math.nan)  # stated, and sampled
+        for n, of_scene in enumerate(intents.values()):
+            if len(of_scene) > 1:
+                entropies[n] = _doubt(np.array(of_scene))
+        stated, sampled = entropies.T
         episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
-        for name, values in ((STATED, both[:, 0]), (SAMPLED, both[:, 1])):
+        for name, values in ((STATED, stated), (SAMPLED, sampled)):
             yield name, in_range(name, episode_interval(values, episodes))
-        yield DOUBT, episode_interval(both[:, 0] - both[:, 1], episodes)
+        yield DOUBT, episode_interval(stated - sampled, episodes)
 
 
 def flips(counts: Ints) -> Floats:
@@ -263,8 +264,8 @@ def between_share(values: Floats) -> Estimate:
 
 
 def _doubt(p: Floats) -> tuple[float, float]:
-    """Mean entropy of intents (n, A), and the entropy of their likeliest actions,
-    by Miller and Madow (1955).
+    """Return the mean entropy of intents (n, A), and the entropy of their likeliest actions,
+    by Miller and Madow (1955), both in nats.
 
     The entropy of a few draws is too small on average;
     they add half of one less than the number of different actions that were drawn, over n.
@@ -288,11 +289,12 @@ def repeats_study(repeats: Repeats) -> Study:
     first, source, k = repeats.runs[0].manifest, repeats.runs[0].source, repeats.k
     variant, place = msgspec.to_builtins(first.variant), beside(repeats.path / PAGE)
     rows = [{**variant, **msgspec.to_builtins(score)} for score in repeats.scores]
-    reports = ((place(run), run.path.name) for run in repeats.runs)
-    links = (
-        Markup('<p><a href="{}">Report of {}</a></p>').format(*each) for each in reports if each[0]
-    )
-    found = of_runs({run.path.name: run for run in repeats.runs}, Kind.VOID, Kind.CAVEAT)
+    links = []
+    for run in repeats.runs:
+        if address := place(run):
+            link = Markup('<p><a href="{}">Report of {}</a></p>').format(address, run.path.name)
+            links.append(link)
+    warnings = of_runs({run.path.name: run for run in repeats.runs}, Kind.VOID, Kind.CAVEAT)
     return Study(
         "repeats",
         f"{k} repeats of {first.variant} on {source}",
@@ -322,7 +324,7 @@ def repeats_study(repeats: Repeats) -> Study:
             "temperature": first.settings.temperature,
             "figures": rows,
         },
-        caveats=[finding.sentence for finding in found],
+        caveats=[finding.sentence for finding in warnings],
         more=Markup("\n").join(links),
         figures=lambda: {"repeats": _figure(repeats)},
     )
@@ -332,24 +334,17 @@ def _figure(repeats: Repeats) -> "Figure":
     """Draw how often decisions stay the same, and what is left of success over several repeats."""
     from harness.studies.figures.points import Rows, intervals
 
-    most = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
-    parts = {
-        "share, %": {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN},
-        "episodes, %": {f"any@{j}": f"any@{j}" for j in reversed(most)}
-        | {"succeed": SUCCESS}
-        | {f"pass^{j}": f"pass^{j}" for j in most},
-    }
-    panels = [
-        Rows(
-            quantity,
-            list(rows),
-            {
-                c: [repeats.estimate(c, metric) for metric in rows.values()]
-                for c in repeats.conditions
-            },
-        )
-        for quantity, rows in parts.items()
-    ]
+    drawn = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
+    shares = {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN}
+    successes = {f"any@{j}": f"any@{j}" for j in reversed(drawn)}
+    successes["succeed"] = SUCCESS
+    successes |= {f"pass^{j}": f"pass^{j}" for j in drawn}
+    panels = []
+    for quantity, metrics in (("share, %", shares), ("episodes, %", successes)):
+        estimates = {}
+        for name in repeats.conditions:
+            estimates[name] = [repeats.estimate(name, metric) for metric in metrics.values()]
+        panels.append(Rows(quantity, list(metrics), estimates))
     return intervals(panels, conditions(repeats.conditions))
 
 
@@ -359,13 +354,14 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
     def cells(condition: str, *metrics: str) -> list[str]:
         return [shown(repeats.estimate(condition, metric)) for metric in metrics]
 
+    rows = list[Sequence[str]]()
+    for name in repeats.conditions:
+        n = str(repeats.estimate(name, FLIPS).n)
+        rows.append((name, *cells(name, FLIPS, STABLE), n, *cells(name, BETWEEN)))
     yield Table(
         "Decisions",
         ("condition", "decisions flip, %", "same in all, %", "n", "variance between %"),
-        [
-            (c, *cells(c, FLIPS, STABLE), str(repeats.estimate(c, FLIPS).n), *cells(c, BETWEEN))
-            for c in repeats.conditions
-        ],
+        rows,
         "A decision flips if two repeats that both reached a decision point chose different "
         "actions there. The first column is the share of such pairs; the second is the share of "
         "the n decision points at which all repeats that reached them chose the same action. "
@@ -375,7 +371,8 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
         f"the same; n is {episodes} episodes.",
         terminal=range(5),
     )
-    passes, anys = ([f"{name}{j}" for j in range(2, k + 1)] for name in ("pass^", "any@"))
+    passes = [f"pass^{j}" for j in range(2, k + 1)]
+    anys = [f"any@{j}" for j in range(2, k + 1)]
     heads = ("condition", "episodes succeed, %", *passes, *anys)
     yield Table(
         "Episodes",
@@ -385,32 +382,30 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
         f"one or more succeeds; in percent of n = {episodes} episodes.",
         terminal=(0, 1, k, len(heads) - 1),
     )
+    rows = []
+    for metric in (STATED, SAMPLED, DOUBT):
+        entropy = repeats.estimate(ALL, metric)
+        name = metric.removesuffix("_nats").replace("_", " ")
+        rows.append((name, nats(entropy), str(entropy.n)))
     yield Table(
         "Stated and sampled entropy",
         ("entropy of the ego's own answers", "nats", "decision points"),
-        [
-            (name.removesuffix("_nats").replace("_", " "), nats(e), str(e.n))
-            for name in (STATED, SAMPLED, DOUBT)
-            if (e := repeats.estimate(ALL, name))
-        ],
+        rows,
         "Stated: the mean entropy of the distributions in the answers. Sampled: the entropy, "
         "over repeats, of the most probable action, with the correction of Miller and Madow. "
         f"From {k} repeats it is a rough estimate, and too small on average. Points with fewer "
         "than two answers that could be read are left out.",
     )
     if points := repeats.wavering(MOST_POINTS):
+        rows = []
+        for point in points:
+            actions = [f"{n} × {action}" for action, n in point.actions.items()]
+            flips = f"{100 * point.flips:.0f}"
+            rows.append((point.scene, point.condition, flips, ", ".join(actions)))
         yield Table(
             "Where most pairs of repeats disagree",
             ("decision point", "condition", "pairs that differ, %", "actions chosen"),
-            [
-                (
-                    point.scene,
-                    point.condition,
-                    f"{100 * point.flips:.0f}",
-                    ", ".join(f"{n} × {action}" for action, n in point.actions.items()),
-                )
-                for point in points
-            ],
+            rows,
             f"Over all repeats and channel seeds. harness report {repeats.runs[0].path.name}, "
             "typed in this folder, shows the prompts and answers.",
         )
@@ -443,11 +438,8 @@ def _flip_sentence(repeats: Repeats) -> str:
 
 
 def _variance_sentence(repeats: Repeats) -> Iterator[str]:
-    shares = {
-        c: e
-        for c in repeats.conditions
-        if not math.isnan((e := repeats.estimate(c, BETWEEN)).value)
-    }
+    shares = {c: repeats.estimate(c, BETWEEN) for c in repeats.conditions}
+    shares = {c: share for c, share in shares.items() if not math.isnan(share.value)}
     if shares:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
@@ -457,7 +449,8 @@ def _variance_sentence(repeats: Repeats) -> Iterator[str]:
 
 
 def _entropy_sentence(repeats: Repeats) -> Iterator[str]:
-    stated, sampled, more = (repeats.estimate(ALL, name) for name in (STATED, SAMPLED, DOUBT))
+    stated, sampled = repeats.estimate(ALL, STATED), repeats.estimate(ALL, SAMPLED)
+    more = repeats.estimate(ALL, DOUBT)
     if math.isnan(more.value):
         return
     verdict = "not clearly more or less than its repeats show"

@@ -35,7 +35,7 @@ class Study:
     """A finished study."""
 
     kind: str  # names its manifest, `<kind>.json`
-    title: str  # what was played
+    title: str  # what was run
     headline: Sequence[str]  # the outcome in sentences, with n and intervals
     # how it was made: n, what the intervals are over, and what the outcome is conditional on
     about: Sequence[str]
@@ -90,10 +90,9 @@ def write_study(study: Study, out: Path) -> Path:
         more=study.more,
     )
     write_whole(out / "index.html", document([section]))
-    manifest = json.dumps(
-        {"format": f"swarmdrive-{study.kind}/1", **study.manifest}, allow_nan=False
-    )
-    write_whole(out / f"{study.kind}.json", msgspec.json.format(manifest, indent=1) + "\n")
+    manifest = {"format": f"swarmdrive-{study.kind}/1", **study.manifest}
+    text = msgspec.json.format(json.dumps(manifest, allow_nan=False), indent=1)
+    write_whole(out / f"{study.kind}.json", text + "\n")
     return out / "index.html"
 
 
@@ -125,16 +124,12 @@ def _pictures(study: Study, out: Path) -> dict[str, tuple[str, int]]:
 
 def write_table(table: "pd.DataFrame", path: Path) -> None:
     """Write a table as CSV, whose texts no spreadsheet takes for formulas, and as JSON Lines."""
+    safe = table.copy(deep=False)
     texts = table.select_dtypes(exclude=["number", "bool"])
-    # Few texts are in many rows, so that one look at each is cheaper than `neutral` of every cell.
-    risky = [
-        column
-        for _, column in texts.items()
-        if any(neutral(text) is not text for text in column.unique())
-    ]
-    safe = table.assign(
-        **{str(column.name): column.astype(object).map(neutral) for column in risky}
-    )
+    for name, column in texts.items():
+        # Few texts are in many rows: one check of each is cheaper than `neutral` of every cell.
+        if any(neutral(text) is not text for text in column.unique()):
+            safe[name] = column.astype(object).map(neutral)
     with replacing(path.with_name(f"{path.name}.csv")) as part:
         safe.to_csv(part, index=False, lineterminator="\n", compression=None)
     with replacing(path.with_name(f"{path.name}.jsonl")) as part:
@@ -165,14 +160,16 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
         return
     except (OSError, ValueError, RecursionError):
         stated = None
-    now = json.loads(json.dumps(manifest))
-    theirs = {**now, **stated} if stated and isinstance(stated, dict) else {}  # else it is no study
-    if keys := [
-        key for key, value in now.items() if _lasting(key, theirs.get(key)) != _lasting(key, value)
-    ]:
+    new = json.loads(json.dumps(manifest))
+    old = {**new, **stated} if stated and isinstance(stated, dict) else {}  # else it is no study
+    differing = []
+    for key, value in new.items():
+        if _lasting(key, old.get(key)) != _lasting(key, value):
+            differing.append(key)
+    if differing:
         raise UserError(
-            f"{printable(out)} holds another {kind}, with other {', '.join(keys)}; name another "
-            "folder with --out, or delete it"
+            f"{printable(out)} holds another {kind}, with other {', '.join(differing)}; name "
+            "another folder with --out, or delete it"
         )
 
 
@@ -229,4 +226,9 @@ def _lasting(key: str, value: Any) -> Any:
     """Return a value of a manifest without what changes where a source moves or answers more."""
     if key != "sources" or not isinstance(value, list):
         return value
-    return [{k: of.get(k) for k in SOURCE} if isinstance(of, dict) else of for of in value]
+    sources = []
+    for source in value:
+        if isinstance(source, dict):
+            source = {name: source.get(name) for name in SOURCE}
+        sources.append(source)
+    return sources

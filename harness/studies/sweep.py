@@ -37,9 +37,11 @@ if TYPE_CHECKING:
 
 ESTIMATE = ("mean", "ci_low", "ci_high")
 HEADS = {
-    "trigger %": ("trigger_rate", 100), "msgs": ("messages_per_episode", 1),
-    "latency ms": ("latency_proxy_ms", 1), "late %": ("deadline_miss_rate", 100),
-}  # fmt: skip
+    "trigger %": ("trigger_rate", 100),
+    "msgs": ("messages_per_episode", 1),
+    "latency ms": ("latency_proxy_ms", 1),
+    "late %": ("deadline_miss_rate", 100),
+}
 PAIRED = (
     "Stored answers, scored again at other operating points. All points share their random draws, "
     "so a difference shows the setting and not the draws. 95 % intervals are over episodes, those "
@@ -81,11 +83,12 @@ def settings(
         for values in crossed(axes, lists):
             point, size = start, vehicles
             for axis, value in zip(axes, values, strict=True):
-                point, size = axis.at(point, value), size if axis.field else int(value)
+                point = axis.at(point, value)
+                if axis.field is None:
+                    size = int(value)
             idle.append({axis.name: point.idle(axis.field) for axis in axes})
-            result.append(
-                Setting(condition, point, size, name, values if len(axes) > 1 else values[0])
-            )
+            value_or_values = values if len(axes) > 1 else values[0]
+            result.append(Setting(condition, point, size, name, value_or_values))
         for axis in axes:
             if all(point[axis.name] for point in idle):
                 raise UserError(
@@ -99,12 +102,12 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
     """Return the runs' operating point of that name, or one of the paper's,
     or a change of one of those.
     """
-    theirs = {run.points[name] for run in runs if name in run.points}
-    if len(theirs) > 1:
+    points = {run.points[name] for run in runs if name in run.points}
+    if len(points) > 1:
         raise UserError(
             f"--condition {printable(name)} is not the same in all runs; sweep them one by one"
         )
-    point = theirs.pop() if theirs else named_point(name)
+    point = points.pop() if points else named_point(name)
     if point.radio.profile is None:
         raise UserError(
             f"--condition {printable(name)} has no channel; nothing of it can be varied"
@@ -117,20 +120,17 @@ def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, t
     loss and tau.
     """
     vehicles = min(run.vehicles for run in runs)
-    own = {name: point for run in runs for name, point in run.points.items()}
-    grids = {
-        "size": grid(AXES["size"], f"1:{vehicles}"),
-        "loss": grid(AXES["loss"]),
-        "tau": grid(AXES["tau"]),
-    }
-    panels = {
-        name: settings(runs, [AXES[name]], [values], conditions) for name, values in grids.items()
-    }
-    crowded = (
-        replace(s, point=s.point.changed(density_coupled=True, loss=None)) for s in panels["size"]
-    )
-    core = tuple(Setting(name, point, vehicles) for name, point in own.items())
-    return {CORE: core, **panels, "size": tuple(crowded)}
+    points = {name: point for run in runs for name, point in run.points.items()}
+    core = tuple(Setting(name, point, vehicles) for name, point in points.items())
+    size = []
+    for setting in settings(
+        runs, [AXES["size"]], [grid(AXES["size"], f"1:{vehicles}")], conditions
+    ):
+        coupled = setting.point.changed(density_coupled=True, loss=None)
+        size.append(replace(setting, point=coupled))
+    loss = settings(runs, [AXES["loss"]], [grid(AXES["loss"])], conditions)
+    tau = settings(runs, [AXES["tau"]], [grid(AXES["tau"])], conditions)
+    return {CORE: core, "size": tuple(size), "loss": loss, "tau": tau}
 
 
 def panels_over(
@@ -159,16 +159,16 @@ def panels_over(
             f"--grid: {len(grids)} given for {len(axes)} of --over; give one for each --over, in "
             "the same order"
         )
+    if not axes:
+        return usual(runs, conditions)
     values = [None if text is None else grid(axis, text) for axis, text in zip_longest(axes, grids)]
-    parts = [slice(n, n + 1) for n in range(len(axes))] if apart else [slice(None)]
-    panels = {
-        CROSS.join(axis.name for axis in axes[part]): settings(
-            runs, axes[part], values[part], conditions
-        )
-        for part in parts
-        if axes
-    }
-    return panels or usual(runs, conditions)
+    if not apart:
+        name = CROSS.join(axis.name for axis in axes)
+        return {name: settings(runs, axes, values, conditions)}
+    panels = {}
+    for axis, of_axis in zip(axes, values, strict=True):
+        panels[axis.name] = settings(runs, [axis], [of_axis], conditions)
+    return panels
 
 
 def folder_of(run: Path, panels: Iterable[str]) -> Path:
@@ -201,14 +201,12 @@ def run_sweep(
         # The proxy has no model that could answer a fusion call, or another question.
         return source in runs or not (point.has_fusion_call or point.question != PLAIN)
 
-    results = {
-        panel: [
-            play(source, panel, those, seeds, progress)
-            for source in sources
-            if (those := [setting for setting in points if able(source, setting.point)])
-        ]
-        for panel, points in panels.items()
-    }
+    results: dict[str, list[PanelResult]] = {panel: [] for panel in panels}
+    for panel, points in panels.items():
+        for source in sources:
+            playable = [setting for setting in points if able(source, setting.point)]
+            if playable:
+                results[panel].append(play(source, panel, playable, seeds, progress))
     for run in runs:
         run.settle()
     whole = joined([part for parts in results.values() for part in parts])
@@ -238,34 +236,29 @@ def _figures(
     from harness.studies.figures.bars import operating_points
     from harness.studies.figures.lines import along
 
-    lines = [
-        summary[summary.panel == panel] for panel in results if panel != CORE and CROSS not in panel
-    ]
-    figures = {"sweep": along(lines)} if lines else {}
-    figures |= {
-        f"operating-points-{n}": operating_points(part.summary)
-        for n, part in enumerate(results.get(CORE, ()), 1)
-    }
-    maps = [
-        (part.summary, condition)
-        for panel, parts in results.items()
-        if CROSS in panel
-        for part in parts
-        for condition in dict.fromkeys(part.summary.condition)
-    ]
-    return figures | {
-        "sweep" if n == 0 else f"sweep-{n + 1}": _map(part[part.condition == condition])
-        for n, (part, condition) in enumerate(maps)
-    }
+    figures = {}
+    varied_alone = [panel for panel in results if panel != CORE and CROSS not in panel]
+    if varied_alone:
+        figures["sweep"] = along([summary[summary.panel == panel] for panel in varied_alone])
+    for n, part in enumerate(results.get(CORE, ()), 1):
+        figures[f"operating-points-{n}"] = operating_points(part.summary)
+    crossed_panels = [panel for panel in results if CROSS in panel]
+    maps = []
+    for part in (part for panel in crossed_panels for part in results[panel]):
+        for _, of_condition in part.summary.groupby("condition", sort=False):
+            maps.append(of_condition)
+    for n, of_condition in enumerate(maps, 1):
+        figures["sweep" if n == 1 else f"sweep-{n}"] = _map(of_condition)
+    return figures
 
 
 def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
     """Return how many episodes and seeds each source has, in words."""
-    of_sources = (
-        f"{source.name}: n = {source.episodes} episodes × {len(seeds)} seeds"
-        + (" of their own" if not source.same_episodes else "")
-        for source in sources
-    )
+    of_sources = []
+    for source in sources:
+        whose = "" if source.same_episodes else " of their own"
+        episodes = f"n = {source.episodes} episodes × {len(seeds)} seeds{whose}"
+        of_sources.append(f"{source.name}: {episodes}")
     return f"{'; '.join(of_sources)} (channel seeds {', '.join(map(str, seeds))})"
 
 
@@ -284,7 +277,9 @@ def _map(part: "pd.DataFrame") -> "Figure":
         wide = group.pivot(index=down, columns=across, values="mean")
         wide = wide.reindex(index=group[down].unique(), columns=group[across].unique())
         panels[", ".join([str(group.condition.iloc[0]), *names])] = 100 * wide.to_numpy(dtype=float)
-    return heat_map(panels, [*map(_text, wide.index)], [*map(_text, wide.columns)], down, across)
+    rows_of_map = [_text(value) for value in wide.index]
+    columns_of_map = [_text(value) for value in wide.columns]
+    return heat_map(panels, rows_of_map, columns_of_map, down, across)
 
 
 def tables(summary: "pd.DataFrame") -> list[Table]:
@@ -296,25 +291,23 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
         # Over episodes, but where a seed has episodes of its own.
         metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
         metrics = metrics[~metrics.index.duplicated(keep="last")]
-        means = (f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values())
-        core = panel == CORE
-        title = str(source) if core else f"{source} · {condition} over {panel}"
-        lead = leading(set(metrics.index))
-        heads[title] = "condition" if core else str(panel), f"{IN_WORDS[lead]} %, 95 % CI"
-        cells = (
-            str(condition) if core else _text(value),
-            percent(metrics.loc[lead], *ESTIMATE),
-            *means,
-        )
-        rows.setdefault(title, []).append(cells)
-    return [
-        Table(title, (*head, *HEADS), rows[title], terminal=range(2 + len(HEADS)))
-        for title, head in heads.items()
-    ]
+        means = [f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values()]
+        title, head, name = f"{source} · {condition} over {panel}", str(panel), _text(value)
+        if panel == CORE:
+            title, head, name = str(source), "condition", str(condition)
+        metric = leading(set(metrics.index))
+        heads[title] = head, f"{IN_WORDS[metric]} %, 95 % CI"
+        success = percent(metrics.loc[metric], *ESTIMATE)
+        rows.setdefault(title, []).append((name, success, *means))
+    tables = []
+    for title, head in heads.items():
+        table = Table(title, (*head, *HEADS), rows[title], terminal=range(2 + len(HEADS)))
+        tables.append(table)
+    return tables
 
 
 def in_a_sentence(table: Table) -> str:
-    """Say what leads at the ends of an axis and where it is best;
+    """Say the headline metric at the ends of an axis and where it is best;
     of crossed axes where worst and best.
     """
 
@@ -323,12 +316,10 @@ def in_a_sentence(table: Table) -> str:
 
     best, (axis, head, *_) = max(table.rows, key=success), table.heads
     words = head.partition(" %")[0]
-    around = (
-        [min(table.rows, key=success), best]
-        if CROSS in axis
-        else [table.rows[0], best, table.rows[-1]]
-    )
-    parts = dict.fromkeys(f"{row[1]} % at {axis} {row[0]}" for row in around)
+    rows = [table.rows[0], best, table.rows[-1]]
+    if CROSS in axis:
+        rows = [min(table.rows, key=success), best]
+    parts = dict.fromkeys(f"{row[1]} % at {axis} {row[0]}" for row in rows)
     return f"{words} {'; '.join(parts)}"
 
 
