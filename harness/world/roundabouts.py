@@ -95,10 +95,9 @@ class Roundabout:
         Sections are named as an agent from the arm `own` sees them.
         """
         first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
-        nodes = [
-            RING[k % len(RING)]
-            for k in range(first, last + 1 if last > first else last + len(RING) + 1)
-        ]
+        if last <= first:  # once more past the node where the ring's list begins
+            last += len(RING)
+        nodes = [RING[k % len(RING)] for k in range(first, last + 1)]
         lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
         lanes += [(a, b, 0) for a, b in pairwise(nodes)]
         lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
@@ -111,10 +110,8 @@ class Roundabout:
         """
         boxes = []
         for degrees in (22.5, 45.0, 67.5):
-            x, y = (
-                radius_m * math.cos(math.radians(degrees)),
-                radius_m * math.sin(math.radians(degrees)),
-            )
+            x = radius_m * math.cos(math.radians(degrees))
+            y = radius_m * math.sin(math.radians(degrees))
             boxes.append((-x, -y, x, y))
         return boxes
 

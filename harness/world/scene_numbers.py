@@ -17,10 +17,8 @@ def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]
     """
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
         yield f"ego {name}", getattr(graph.ego, name)
-    for lane in (
-        *sorted({role for path in road.paths.values() for role in path.roles}),
-        "off-lane",
-    ):
+    lanes = sorted({role for path in road.paths.values() for role in path.roles})
+    for lane in (*lanes, "off-lane"):
         nodes = [node for node in graph.nodes if node.lane == lane]
         node = min(nodes, key=lambda n: float(np.hypot(n.forward_m, n.left_m)), default=None)
         yield f"{lane}: vehicles", float(len(nodes))

@@ -13,7 +13,7 @@ from harness.world.environments import environment
 from harness.world.environments.environment import lane_of, reset
 from harness.world.environments.routes import Routes, routes
 from harness.world.parameters import Parameters as Common
-from harness.world.road import ONE_LANE_M, Lane, Path, PathKey, Road, crossings, lanes_of
+from harness.world.road import ONE_LANE_M, Crossing, Lane, Path, PathKey, Road, crossings, lanes_of
 
 CAREFUL_FIRST = ("SLOWER", "IDLE", "FASTER", "LANE_LEFT", "LANE_RIGHT")
 MOST_HZ = 1000
@@ -70,12 +70,11 @@ def first_target_mps(ego: Any) -> float:
 
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
     """Return where a network's lanes begin and end, m."""
-    return {
-        index: tuple(
-            np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3).ravel().tolist()
-        )
-        for index, lane in lanes_of(network).items()
-    }
+    ends = {}
+    for index, lane in lanes_of(network).items():
+        points = np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3)
+        ends[index] = tuple(points.ravel().tolist())
+    return ends
 
 
 @lru_cache(maxsize=16)
@@ -95,12 +94,11 @@ def place(name: str) -> Place:
     ways = next((ways for ways in near.ways.values() if key in ways), (key,))
     begin_m = near.paths[key].project(*(ego.position - origin))[0]
     goal_m = goal(begin_m, p)
-    meetings = {
-        other: at
-        for way in (*ways, key)
-        for other, at in crossings(near.paths, way).items()
-        if begin_m < at.ego_arc_m < goal_m + BEYOND_M
-    }
+    meetings: dict[PathKey, Crossing] = {}
+    for way_key in (*ways, key):
+        for other, at in crossings(near.paths, way_key).items():
+            if begin_m < at.ego_arc_m < goal_m + BEYOND_M:
+                meetings[other] = at
     zone_m = min((goal_m, *(at.ego_arc_m for at in meetings.values())))
     road = Road(
         facts={"kind": type(env).__name__, "ego": "/".join(key)},

@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -159,12 +159,11 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
 
 def _goes_on(network: Any, street: Street, following: Street) -> bool:
     """Return whether some lane of the second road continues one of the first."""
-    return any(
-        _apart_m(a, b) <= GAP_M
-        and math.cos(a.heading_at(a.length) - b.heading_at(0.0)) > math.cos(TURN_RAD)
-        for a in _lanes(network, street)
-        for b in _lanes(network, following)
-    )
+    for lane, other in product(_lanes(network, street), _lanes(network, following)):
+        turn_rad = lane.heading_at(lane.length) - other.heading_at(0.0)
+        if _apart_m(lane, other) <= GAP_M and math.cos(turn_rad) > math.cos(TURN_RAD):
+            return True
+    return False
 
 
 def _lanes(network: Any, street: Street) -> Sequence[Any]:

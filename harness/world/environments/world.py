@@ -175,13 +175,10 @@ class EnvironmentWorld(World):
         if frames:
             poses = self._in_road_frame(frames)
             sizes_m = np.array([[(v.LENGTH, v.WIDTH) for v in self.vehicles]])
-            [gap_m] = least_gaps_m(
-                poses[None], sizes_m, np.array([self.outcome.least_gap_m])
-            ).tolist()
-            first, hz = (
-                np.array([self.frame + 1 - len(frames)]),
-                self.scenario.parameters.simulation_hz,
-            )
+            before_m = np.array([self.outcome.least_gap_m])
+            [gap_m] = least_gaps_m(poses[None], sizes_m, before_m).tolist()
+            first = np.array([self.frame + 1 - len(frames)])
+            hz = self.scenario.parameters.simulation_hz
             [conflicts] = observe([self.journey.conflicts], poses[None], sizes_m, first, hz)
             self.passed(poses)
             speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])

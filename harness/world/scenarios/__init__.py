@@ -80,30 +80,36 @@ def title(scenario: Scenario) -> str:
 
 
 def _changed(scenario: Scenario) -> set[str]:
+    """Return the settings that differ from the scenario's usual ones."""
     usual, p = get(scenario.name).parameters, scenario.parameters
     return {dial for dial in scenario.dials if getattr(p, dial) != getattr(usual, dial)}
 
 
 def _of_suites(scenario: Scenario) -> dict[str, object]:
     """Return what the scenes of suites differ in; nothing of a scenario that is in none."""
-    return {
-        key: getattr(scenario.parameters, key) for key in SCENES if "witnesses" in scenario.dials
-    }
+    if "witnesses" not in scenario.dials:
+        return {}
+    return {key: getattr(scenario.parameters, key) for key in SCENES}
 
 
 def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
-    values = {dial: getattr(scenario.parameters, dial) for dial in scenario.dials if dial in stated}
-    settings = [f"{k}={v if isinstance(v, str) else canonical_json(v)}" for k, v in values.items()]
+    """Return a scenario's name with those of its settings that are `stated`."""
+    settings = []
+    for dial in scenario.dials:
+        if dial in stated:
+            value = getattr(scenario.parameters, dial)
+            text = value if isinstance(value, str) else canonical_json(value)
+            settings.append(f"{dial}={text}")
     return environment.joined(scenario.name, settings)
 
 
 def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
+    """Read a setting such as `ambient=fog`. Raises UserError if it is unknown or not allowed."""
     key, _, value = text.partition("=")
-    shown, known = printable(scenario.name), scenario.dials
-    if key not in known:
-        raise unknown(
-            f"setting of scenario {shown}", key, known, f"; as in {shown}:perfect_knowledge=true"
-        )
+    shown = printable(scenario.name)
+    if key not in scenario.dials:
+        example = f"; as in {shown}:perfect_knowledge=true"
+        raise unknown(f"setting of scenario {shown}", key, scenario.dials, example)
     usual = getattr(scenario.parameters, key)
     setting = value_of(usual, value)
     if isinstance(setting, str) and not isinstance(usual, str):
@@ -138,10 +144,8 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
     or one is of another type or out of bounds.
     """
     scenario = get(name)
-    here = {
-        field.name: getattr(scenario.parameters, field.name)
-        for field in fields(scenario.parameters)
-    }
+    names = [field.name for field in fields(scenario.parameters)]
+    here = {name: getattr(scenario.parameters, name) for name in names}
     where = f"scenario {printable(scenario.name, 80)}"
     if extra := [key for key in parameters if key not in here]:
         raise UserError(
@@ -149,17 +153,12 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
             "use the version that its manifest names"
         )
     earlier = {key: value for key, value in LATER if key in here}
-    # Numbers in a manifest are decoded as floats.
-    values = {
-        key: int(value)
-        if isinstance(value, float) and type(here[key]) is int and value.is_integer()
-        else value
-        for key, value in parameters.items()
-    }
-    return replace(
-        scenario,
-        parameters=convert({**here, **earlier, **values}, type(scenario.parameters), where),
-    )
+    values = here | earlier
+    for key, value in parameters.items():
+        # Numbers in a manifest are decoded as floats.
+        is_whole = isinstance(value, float) and value.is_integer()
+        values[key] = int(value) if is_whole and type(here[key]) is int else value
+    return replace(scenario, parameters=convert(values, type(scenario.parameters), where))
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:

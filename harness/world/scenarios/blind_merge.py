@@ -157,10 +157,8 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
     def car(name: str) -> Spawn:
         approach, _, offset_s = cars[name]
-        speed, late_s = (
-            draws.between(f"{name}_speed", p.main_mps),
-            draws.between(f"{name}_offset", offset_s),
-        )
+        speed = draws.between(f"{name}_speed", p.main_mps)
+        late_s = draws.between(f"{name}_offset", offset_s)
         return timed(ids[name], "car", "other", approach, speed, late_s)
 
     spawns += [car(name) for name, (_, share, _) in cars.items() if draws.share(name) < share]

@@ -127,20 +127,17 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         traffic["danger"] = coming(danger)
     if draws.share("late") < p.late_share:
         arm = SECTORS[int(draws.share("late_sector") * len(SECTORS))]
-        speed = draws.between(
-            "late_speed", p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps
-        )
+        speeds_mps = p.truck_speed_mps if arm == "oncoming" else p.crossing_speed_mps
+        speed = draws.between("late_speed", speeds_mps)
         arc = timed(arm, speed, draws.between("late_offset", p.late_offset_s))
         traffic["late"] = ("car", arm, ROUTES[arm], arc, speed)
 
     spawns = [Spawn("v1", "car", "ego", "own", "straight", ego_arc, p.ego_speed_mps)]
-    for n, (approach, exit_name) in enumerate(
-        (("right", "left"), ("left", "right"), ("own", "ahead"))
-    ):
+    start_m = LOOKOUTS_M if draws.seats else p.helper_start_m
+    ways = (("right", "left"), ("left", "right"), ("own", "ahead"))
+    for n, (approach, exit_name) in enumerate(ways):
         arc = paths[approach, "straight"].ends_m[1]
-        arc += draws.between(
-            f"helper_start_{exit_name}", LOOKOUTS_M if draws.seats else p.helper_start_m
-        )
+        arc += draws.between(f"helper_start_{exit_name}", start_m)
         if exit_name == "ahead" and not draws.seats:
             arc += 4.0  # stays clear of the ego that follows it out of the junction
         speed = draws.between(f"helper_speed_{exit_name}", p.helper_speed_mps)
@@ -169,18 +166,15 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
     In seconds from the start. Their ways cross at a right angle and both keep their speed,
     so they touch if both are on the crossing at once.
     """
-    at, truck, car = (
-        road().crossings[approach, "straight"],
-        road().paths["oncoming", "straight"],
-        road().paths[approach, "straight"],
-    )
+    at = road().crossings[approach, "straight"]
+    truck, car = road().paths["oncoming", "straight"], road().paths[approach, "straight"]
     where = truck.points[0, 0], at.y_m
     truck_s = (truck.project(*where)[0] - truck_arc_m) / truck_mps
     (car_length, car_width), (truck_length, truck_width) = SIZES_M["car"], SIZES_M["truck"]
-    apart_s = (car_length + truck_width) / 2 / speed_mps + (
-        truck_length + car_width
-    ) / 2 / truck_mps
-    return truck_s + apart_s + SPARE_S + (at.other_arc_m - car.project(*where)[0]) / speed_mps
+    of_car_s = (car_length + truck_width) / 2 / speed_mps
+    of_truck_s = (truck_length + car_width) / 2 / truck_mps
+    to_conflict_s = (at.other_arc_m - car.project(*where)[0]) / speed_mps
+    return truck_s + (of_car_s + of_truck_s) + SPARE_S + to_conflict_s
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:

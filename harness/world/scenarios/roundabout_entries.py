@@ -30,7 +30,7 @@ from harness.world.parameters import SHARED, Shared
 from harness.world.road import PathKey, Road, crossings
 from harness.world.roundabouts import ARM_M, ARMS, LANE_WIDTH_M, Roundabout, name_of
 from harness.world.scenario import Draws, Layout, Scenario, Seat, Spawn
-from harness.world.state import Building
+from harness.world.state import Building, Part
 
 NAME = "roundabout-entries"
 PLACE = Roundabout(ring_m=12.0, entry_m=10.0, beside_m=3.0)  # 28 m from kerb to kerb
@@ -98,16 +98,18 @@ def road(own: str = EGO) -> Road:
     arms = {name_of(arm, own): arm for arm in ARMS}
     paths = {}
     for (approach, leaves), route in ROUTES.items():
-        end = ARMS[(ARMS.index(arms[approach]) + leaves) % len(ARMS)]
-        paths[approach, route] = PLACE.path(
-            approach, route, arms[approach], end, PRIORITY[approach], own
-        )
+        begin = arms[approach]
+        end = ARMS[(ARMS.index(begin) + leaves) % len(ARMS)]
+        path = PLACE.path(approach, route, begin, end, PRIORITY[approach], own)
+        paths[approach, route] = path
     meetings = crossings(paths, ego)
-    at, mine = meetings["left", "straight"], paths[ego]
-    goal_m = float(
-        mine.arc_m[cleared_from(own)(mine.points[:, None], np.array(ego[0]), None).argmax()]
-    )
+    at, ego_path = meetings["left", "straight"], paths[ego]
+    beyond_goal = cleared_from(own)(ego_path.points[:, None], np.array(ego[0]), None)
+    goal_m = float(ego_path.arc_m[beyond_goal.argmax()])
     back_m = np.linspace(*SECTOR_REACH_M, 13)
+    sectors = {}
+    for sector, key in SECTORS.items():
+        sectors[sector] = paths[key].points_at(meetings[key].other_arc_m - back_m)
     return Road(
         facts={
             "kind": "roundabout",
@@ -119,10 +121,7 @@ def road(own: str = EGO) -> Road:
         ego=ego,
         crossings=meetings,
         zone_m=(at.x_m, at.y_m),
-        sectors={
-            sector: paths[key].points_at(meetings[key].other_arc_m - back_m)
-            for sector, key in SECTORS.items()
-        },
+        sectors=sectors,
         network=PLACE.network,
         goal_m=lambda parameters: goal_m,
     )
@@ -177,24 +176,15 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     for arm in (EGO, *helpers):
         key = key_of(arm, 2)
         arc = paths[key].ends_m[1] - p.speed_mps * enters_s[arm]
-        spawns.append(
-            Spawn(ids[arm], "car", "ego" if arm == EGO else "helper", *key, arc, p.speed_mps)
-        )
+        part: Part = "ego" if arm == EGO else "helper"
+        spawns.append(Spawn(ids[arm], "car", part, *key, arc, p.speed_mps))
     passes_s = ego_s + draws.between("danger_offset", p.danger_offset_s)
     if "w" in arms:
         passes_s = enters_s["w"] + quarter_s + draws.between("headway", p.headway_s)
     (comes,) = draws.ids(("comes",)).values()
-    goes_on, turns_off = (
-        Spawn(
-            comes,
-            "car",
-            "other",
-            *key_of("n", leaves),
-            at.other_arc_m - p.speed_mps * passes_s,
-            p.speed_mps,
-        )
-        for leaves in (3, 2)
-    )
+    arc = at.other_arc_m - p.speed_mps * passes_s
+    goes_on = Spawn(comes, "car", "other", *key_of("n", 3), arc, p.speed_mps)
+    turns_off = Spawn(comes, "car", "other", *key_of("n", 2), arc, p.speed_mps)
     danger = "oncoming" if draws.share("danger") < p.danger_share else None
     if danger:
         spawns.append(goes_on)

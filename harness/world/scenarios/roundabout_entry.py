@@ -125,18 +125,15 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     def arm(what: str) -> str:
         return SECTORS[int(draws.share(what) >= p.sector_shares[0])]
 
-    start, ring_mps = (
-        draws.between("ego_start", p.ego_start_m),
-        draws.between("ring_speed", p.ring_mps),
-    )
+    start = draws.between("ego_start", p.ego_start_m)
+    ring_mps = draws.between("ring_speed", p.ring_mps)
 
     def helper(
         id_: str, key: PathKey, begin_m: float, what: str, beyond_m: tuple[float, float]
     ) -> Spawn:
         arc = begin_m + draws.between(f"helper_{what}", beyond_m)
-        return Spawn(
-            id_, "car", "helper", *key, arc, draws.between(f"helper_{what}_speed", p.helper_mps)
-        )
+        speed = draws.between(f"helper_{what}_speed", p.helper_mps)
+        return Spawn(id_, "car", "helper", *key, arc, speed)
 
     leaves, crosses, enters = ("oncoming", "right"), ("own", "left"), ("own", "straight")
     spawns = [
