@@ -88,19 +88,12 @@ def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
 
     They are inf where nothing came near in time, and NaN where nothing was measured.
     """
-    named = {
-        "ttc": (ttc_s.round(DECIMALS), SHORT_TTC_S),
-        "pet": (pet_s.round(DECIMALS), SHORT_PET_S),
-    }
+    ttc_s, pet_s = ttc_s.round(DECIMALS), pet_s.round(DECIMALS)
     return {
-        **{
-            f"{name}_s": np.where(np.isfinite(values), values, np.nan)
-            for name, (values, _) in named.items()
-        },
-        **{
-            f"short_{name}": np.where(np.isnan(values), np.nan, values < short)
-            for name, (values, short) in named.items()
-        },
+        "ttc_s": np.where(np.isfinite(ttc_s), ttc_s, np.nan),
+        "pet_s": np.where(np.isfinite(pet_s), pet_s, np.nan),
+        "short_ttc": np.where(np.isnan(ttc_s), np.nan, ttc_s < SHORT_TTC_S),
+        "short_pet": np.where(np.isnan(pet_s), np.nan, pet_s < SHORT_PET_S),
     }
 
 
@@ -178,10 +171,10 @@ def times_to_collision(
     outline, the extents of two that move evenly overlap in one interval; the outlines do in what
     all four share.
     """
-    cos, sin, its_cos, its_sin = (
-        turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin)
-    )
-    (dx, dy), speed, its_speed = (others - poses)[:, :2].T, poses[:, 3], others[:, 3]
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])
+    speed, its_speed = poses[:, 3], others[:, 3]
+    dx, dy = (others - poses)[:, :2].T
     vx, vy = its_speed * its_cos - speed * cos, its_speed * its_sin - speed * sin
     dot, cross = np.abs(cos * its_cos + sin * its_sin), np.abs(cos * its_sin - sin * its_cos)
     enter, leave = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)

@@ -110,18 +110,14 @@ def _measure(
     if places.any():  # each agent comes first in its own
         order = np.tile(np.arange(poses.shape[2]), (len(rows), 1))
         order[np.arange(len(rows)), places], order[:, 0] = 0, places
-        poses, sizes_m = (
-            poses[rows[:, None], :, order].swapaxes(1, 2),
-            sizes_m[rows[:, None], order],
-        )
+        poses = poses[rows[:, None], :, order].swapaxes(1, 2)
+        sizes_m = sizes_m[rows[:, None], order]
         ended_s = [np.inf if j.outcome.time_s is None else j.outcome.time_s for j in journeys]
         ends = np.minimum(ends, np.rint(np.array(ended_s) * hz) - begun[rows]).astype(int)
-        np.copyto(
-            poses, np.nan, where=(np.arange(poses.shape[1]) >= ends[:, None])[..., None, None]
-        )
-    gaps_m = least_gaps_m(
-        poses, sizes_m, np.array([j.outcome.least_gap_m for j in journeys])
-    ).tolist()
+        after = np.arange(poses.shape[1]) >= ends[:, None]
+        np.copyto(poses, np.nan, where=after[..., None, None])
+    before_m = np.array([journey.outcome.least_gap_m for journey in journeys])
+    gaps_m = least_gaps_m(poses, sizes_m, before_m).tolist()
     conflicts = observe([j.conflicts for j in journeys], poses, sizes_m, begun[rows] + 1, hz)
     speeds_mps = np.concatenate([before_mps[:, None], poses[:, :, 0, 3]], axis=1)
     for n, journey in enumerate(journeys):
@@ -468,11 +464,8 @@ class Fleet:
             vehicles = self.worlds[row].vehicles
             for k in (first, second):
                 v, at = vehicles[k], (row, k)
-                v.position, v.heading, v.speed = (
-                    self.xy[at],
-                    float(self.heading[at]),
-                    float(self.speed[at]),
-                )
+                v.position = self.xy[at]
+                v.heading, v.speed = float(self.heading[at]), float(self.speed[at])
                 v.impact, v.crashed = None, False
             vehicles[first].handle_collisions(vehicles[second], self.dt)
             for k in (first, second):

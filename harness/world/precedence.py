@@ -56,19 +56,16 @@ def _turn_rad(road: Road, conflict: Conflict) -> float:
 
 
 def _sooner(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
-    own_s, other_s = (
-        np.inf if arrival.time_s is None else arrival.time_s
-        for arrival in (conflict.ego, conflict.other)
-    )
+    """Return whether the ego is at the conflict sooner than the other."""
+    own_s = np.inf if conflict.ego.time_s is None else conflict.ego.time_s
+    other_s = np.inf if conflict.other.time_s is None else conflict.other.time_s
     # they meet in the middle, wherever each has to wait
     if np.cos(_turn_rad(road, conflict)) < HEAD_ON:
-        path, at = (
-            road.paths[conflict.sector, conflict.route],
-            road.crossings[conflict.sector, conflict.route],
-        )
+        path = road.paths[conflict.sector, conflict.route]
+        at = road.crossings[conflict.sector, conflict.route]
         ahead_m = path.project(*road.zone_m)[0] - at.other_arc_m + conflict.other.arc_m
-        speeds_mps = max(graph.ego.speed_mps, STANDS_MPS), max(conflict.other.speed_mps, STANDS_MPS)
-        own_s, other_s = graph.ego.zone_m / speeds_mps[0], ahead_m / speeds_mps[1]
+        own_s = graph.ego.zone_m / max(graph.ego.speed_mps, STANDS_MPS)
+        other_s = ahead_m / max(conflict.other.speed_mps, STANDS_MPS)
     if own_s == other_s or abs(own_s - other_s) < TIE_S:
         return _lower(graph, conflict)
     return own_s < other_s

@@ -94,10 +94,10 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
 
     Each has x, y and heading, (n, 3), and length and width, (n, 2).
     """
-    (dx, dy), apart = (others - poses)[:, :2].T, np.full(len(poses), -np.inf)
-    cos, sin, its_cos, its_sin = (
-        turn(p[:, 2]) for p in (poses, others) for turn in (np.cos, np.sin)
-    )
+    dx, dy = (others - poses)[:, :2].T
+    apart = np.full(len(poses), -np.inf)
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])
     dot, cross = np.abs(cos * its_cos + sin * its_sin), np.abs(cos * its_sin - sin * its_cos)
     for c, s, (length, width), (its_length, its_width) in (
         (cos, sin, sizes_m.T, their_sizes_m.T),

@@ -247,21 +247,17 @@ class World:
         """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
         p, radios = self.scenario.parameters, self.answering
         ids = [self.vehicles[n].spawn.id for n in radios]
-        announce, sent = (
-            [n for n, v in enumerate(self.vehicles) if v.spawn.radio],
-            tuple[Beacon, ...](),
-        )
+        senders = [n for n, v in enumerate(self.vehicles) if v.spawn.radio]
+        sent: tuple[Beacon, ...] = ()
         if len(self.journeys) > 1:  # everybody with a radio hears everybody
-            announce = [*radios, *announce]
+            senders = [*radios, *senders]
         else:
-            loss, target_mps = (
-                beacons.losses(p, self.state, ids, poses),
-                float(self.vehicles[0].target_speed),
-            )
+            loss = beacons.losses(p, self.state, ids, poses)
+            target_mps = float(self.vehicles[0].target_speed)
             sent = beacons.broadcast(
                 p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
             )
-        for n in announce:
+        for n in senders:
             sender = self.vehicles[n].spawn.id
             hearers = [id_ for id_ in ids if id_ != sender]
             loss = beacons.losses(p, self.state, [sender, *hearers], poses)
@@ -273,19 +269,19 @@ class World:
 
     def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
         """Return whom an agent hit, and how; empty if it hit an object on the road."""
-        mine = self._state_of(ego)
-        hit = [(float(outline(mine).distance(outline(v))), v) for v in map(self._state_of, wrecks)]
-        apart_m, partner = min(hit, key=lambda pair: pair[0], default=(math.inf, mine))
-        if apart_m > TOUCHING_M:
+        itself, others = self._state_of(ego), [self._state_of(wreck) for wreck in wrecks]
+        distances_m = [float(outline(itself).distance(outline(other))) for other in others]
+        if min(distances_m, default=math.inf) > TOUCHING_M:
             return {}
-        blamed = fault(mine, partner, self.scenario.road().paths)
-        return {"partner": partner.id, "striker": striker(mine, partner), "fault": blamed}
+        partner = others[distances_m.index(min(distances_m))]
+        at_fault = fault(itself, partner, self.scenario.road().paths)
+        return {"partner": partner.id, "striker": striker(itself, partner), "fault": at_fault}
 
     def seat(self, agent: int) -> Scenario:
         """Return the scenario as it is for an agent."""
-        return (
-            seat_of(self.scenario, self.vehicles[agent].spawn).scenario if agent else self.scenario
-        )
+        if not agent:
+            return self.scenario
+        return seat_of(self.scenario, self.vehicles[agent].spawn).scenario
 
     @property
     def answering(self) -> list[int]:
@@ -294,18 +290,15 @@ class World:
 
     def _cleared(self, agent: int) -> bool:
         """Return whether an agent has reached its goal."""
-        xy_m, names = (
-            np.array([v.position for v in self.vehicles]),
-            [v.spawn.approach for v in self.vehicles],
-        )
+        p = self.scenario.parameters
+        xy_m = np.array([v.position for v in self.vehicles])
         if not agent:
-            return bool(self.scenario.cleared(xy_m, np.array(names), self.scenario.parameters))
+            approaches = np.array([v.spawn.approach for v in self.vehicles])
+            return bool(self.scenario.cleared(xy_m, approaches, p))
         spawn = self.vehicles[agent].spawn
         seat = seat_of(self.scenario, spawn)
-        name, _ = seat.names[spawn.approach, spawn.route]
-        return bool(
-            seat.scenario.cleared(xy_m[[agent]], np.array([name]), self.scenario.parameters)
-        )
+        approach, _ = seat.names[spawn.approach, spawn.route]
+        return bool(seat.scenario.cleared(xy_m[[agent]], np.array([approach]), p))
 
     def judge(self, standing: Set[str]) -> None:
         """Decide what the last frame has decided; `standing` had crashed before, by id."""

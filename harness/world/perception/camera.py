@@ -48,12 +48,8 @@ GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
 WALL, BRICK = (182, 166, 142), (150, 132, 108)
 ROWS, COLUMNS = 32, 48  # resolution of the paint on a wall
 GLASS, TYRE, PLATE = (38, 48, 60), (28, 28, 30), (226, 226, 220)
-HEADLAMP, REAR_LAMP, BRAKE_LAMP, AMBER = (
-    (250, 246, 222),
-    (128, 22, 26),
-    (255, 36, 32),
-    (255, 170, 20),
-)
+HEADLAMP, AMBER = (250, 246, 222), (255, 170, 20)
+REAR_LAMP, BRAKE_LAMP = (128, 22, 26), (255, 36, 32)
 # No coat has the colour of a lamp.
 COATS = (
     (36, 74, 140),
@@ -105,21 +101,18 @@ def frame(
     viewer = state.vehicle(viewer_id)
     ambient = scenario.parameters.light
     reported = detect(state, viewer, scenario.parameters)
-    boxes = [
-        *(_vehicle(state, state.vehicle(d.id)) for d in reported),
-        *(_building(b.id, b.corners()) for b in state.buildings),
-    ]
-    halves = [_half(scenario, viewer, boxes, turned, width, height // 2) for turned in (0.0, np.pi)]
-    pixels, owners = (np.concatenate(both) for both in zip(*halves, strict=True))
-    if ambient.glare_rad:
-        sun = sun_rad(state.episode_seed) - viewer.heading_rad
-        pixels = np.concatenate(
-            [
-                _dazzling(half, sun - turned, ambient)
-                for half, turned in zip(np.split(pixels, 2), (0.0, np.pi), strict=True)
-            ]
-        )
-    return Frame(pixels, owners, tuple(box.name for box in boxes))
+    boxes = [_vehicle(state, state.vehicle(d.id)) for d in reported]
+    boxes += [_building(b.id, b.corners()) for b in state.buildings]
+    halves, owners = list[Pixels](), list[Places]()
+    for turned_rad in (0.0, np.pi):  # the front camera, and the rear one
+        half, of_half = _half(scenario, viewer, boxes, turned_rad, width, height // 2)
+        if ambient.glare_rad:
+            sun = sun_rad(state.episode_seed) - viewer.heading_rad
+            half = _dazzling(half, sun - turned_rad, ambient)
+        halves.append(half)
+        owners.append(of_half)
+    names = tuple(box.name for box in boxes)
+    return Frame(np.concatenate(halves), np.concatenate(owners), names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,10 +169,8 @@ def _half(
     """Render pixels and owners of one camera, (rows, width, ...)."""
     eye, focal = np.array([viewer.x_m, viewer.y_m]), focal_px(width)
     heading = viewer.heading_rad + turned_rad
-    ahead, right = (
-        np.array([np.cos(heading), np.sin(heading)]),
-        np.array([-np.sin(heading), np.cos(heading)]),
-    )
+    ahead = np.array([np.cos(heading), np.sin(heading)])
+    right = np.array([-np.sin(heading), np.cos(heading)])
     # A column's ray has a component of 1 m ahead, so that its parameter is the depth in metres.
     across = (np.arange(width) + 0.5 - width / 2) / focal
     rays = ahead + across[:, None] * right
@@ -192,16 +183,14 @@ def _half(
     t, along = meetings(eye, rays, np.array([box.corners for box in boxes]))
     t, along = t.reshape(width, -1, 4), along.reshape(width, -1, 4)
     wall = t.argmin(axis=2)
-    depth, along = (np.take_along_axis(a, wall[..., None], axis=2)[..., 0] for a in (t, along))
-    heights, walls = (
-        np.array([box.height_m for box in boxes]),
-        np.array([box.walls for box in boxes]),
-    )
+    depth = np.take_along_axis(t, wall[..., None], axis=2)[..., 0]
+    along = np.take_along_axis(along, wall[..., None], axis=2)[..., 0]
+    heights = np.array([box.height_m for box in boxes])
+    walls = np.array([box.walls for box in boxes])
     lamps = np.array([box.lamps for box in boxes])
     near_first = np.argsort(depth, axis=1, kind="stable")
-    up_to_m = np.where(
-        np.isfinite(np.take_along_axis(depth, near_first, axis=1)), heights[near_first], 0.0
-    )
+    is_there = np.isfinite(np.take_along_axis(depth, near_first, axis=1))
+    up_to_m = np.where(is_there, heights[near_first], 0.0)
     nearer_m = np.pad(np.maximum.accumulate(up_to_m, axis=1), ((0, 0), (1, 0)))[:, :-1]
     # All boxes are higher than the camera, so one shows only if it is higher than all nearer ones.
     for place, shows in reversed(list(zip(near_first.T, (up_to_m > nearer_m).T, strict=True))):
@@ -304,15 +293,16 @@ def _background(scenario: Scenario, eye: Floats, rays: Floats, below: Floats) ->
     pixels[:sky] = (up * np.array(ambient.sky) + (1 - up) * np.array(ambient.haze))[:, None]
     depth_m = EYE_M * focal_px(len(rays)) / below[sky:]
     ground = _ground_map(scenario)
-    x, y = (
-        ((np.multiply.outer(depth_m, rays[:, k]) + (eye[k] + REACH_M)) / CELL_M)
-        .astype(np.int32)
-        .clip(0, len(ground) - 1)
-        for k in (0, 1)
-    )
+
+    def cell(axis: int) -> NDArray[np.int32]:
+        """Return the map's cell of each pixel along an axis, (rows, width)."""
+        place_m = np.multiply.outer(depth_m, rays[:, axis]) + (eye[axis] + REACH_M)
+        cells: NDArray[np.int32] = (place_m / CELL_M).astype(np.int32).clip(0, len(ground) - 1)
+        return cells
+
     # Of each row.
     colours = _hazy(ambient.light * np.array([GRASS, ASPHALT, PAINT]), depth_m[:, None], ambient)
-    what = ground[y, x] + 3 * np.arange(len(depth_m))[:, None]
+    what = ground[cell(1), cell(0)] + 3 * np.arange(len(depth_m))[:, None]
     pixels[sky:] = colours.astype(np.uint8).reshape(-1, 3)[what]
     return pixels
 

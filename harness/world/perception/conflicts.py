@@ -88,13 +88,10 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     That is the nearest that fits its heading and indicator;
     of equally good paths, the road's first one.
     """
-    x, y, own = (
-        np.array(
-            [(d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad) for d in detections]
-        )
-        .reshape(-1, 3)
-        .T
-    )
+    poses = []
+    for d in detections:
+        poses.append((d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad))
+    x, y, own = np.array(poses).reshape(-1, 3).T
     # (3, n, paths)
     projected = np.stack([path.project_all(x, y) for path in road.paths.values()], axis=-1)
     thing, path = np.nonzero(projected[1] <= ON_PATH_M)
@@ -104,9 +101,8 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     near: list[dict[PathKey, tuple[float, float]]] = [{} for _ in detections]
     best: list[tuple[float, PathKey] | None] = [None] * len(detections)
     alike = ALIKE if road.form == 2 else 0.0
-    for n, p, arc_m, lateral_m, to_rad, turned in zip(
-        *(column.tolist() for column in (thing, path, arc, lateral, heading, cos)), strict=True
-    ):
+    columns = [column.tolist() for column in (thing, path, arc, lateral, heading, cos)]
+    for n, p, arc_m, lateral_m, to_rad, turned in zip(*columns, strict=True):
         key, d = keys[p], detections[n]
         near[n][key] = arc_m, to_rad
         if d.heading_rad is None:
@@ -120,23 +116,23 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
         least = best[n]
         if lateral_m < ON_PATH_M and (least is None or cost < least[0] - alike):
             best[n] = cost, key
-    return [Place(on, of and of[1]) for on, of in zip(near, best, strict=True)]
+    return [Place(on, fit and fit[1]) for on, fit in zip(near, best, strict=True)]
 
 
 def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]]:
     """Return the conflicts of each vehicle with the ego."""
-    met: list[list[Conflict]] = [[] for _ in all_known]
+    conflicts_of: list[list[Conflict]] = [[] for _ in all_known]
     if road.form == 2:
         for n, conflict in _along(road, all_known):
-            met[n].append(conflict)
+            conflicts_of[n].append(conflict)
     for n, known in enumerate(all_known):
         # Who comes on a path of its own through a lane that both share has one place to meet, the
         # crossing.
-        if all(conflict.kind == "oncoming" for conflict in met[n]) and (
-            meeting := _meeting(road, known)
-        ):
-            met[n] = [meeting]
-    return met
+        if all(conflict.kind == "oncoming" for conflict in conflicts_of[n]):
+            meeting = _meeting(road, known)
+            if meeting:
+                conflicts_of[n] = [meeting]
+    return conflicts_of
 
 
 def _meeting(road: Road, known: Encounter) -> Conflict | None:
@@ -150,19 +146,18 @@ def _meeting(road: Road, known: Encounter) -> Conflict | None:
     length = SIZES_M[d.kind or "car"][0]
     if road.ways and road.paths[known.own].project(crossing.x_m, crossing.y_m)[1] > ON_PATH_M:
         return None  # it meets another of the ego's ways
-    to_go, ego_to_go = (
-        crossing.other_arc_m - known.place.arc_m,
-        crossing.ego_arc_m - known.ego_arc_m,
-    )
+    to_go = crossing.other_arc_m - known.place.arc_m
+    ego_to_go = crossing.ego_arc_m - known.ego_arc_m
     if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
         return None
+    kind_and_lane = (crossing.kind, "own") if road.form == 2 else ()
     return Conflict(
         d.id,
         *known.key,
         known.seat.relative(crossing.x_m, crossing.y_m),
         EgoArrival(tenths(ego_to_go), _time_s(ego_to_go, ego.speed_mps)),
         known.arrival(to_go, _time_s(to_go, d.speed_mps)),
-        *((crossing.kind, "own") if road.form == 2 else ()),
+        *kind_and_lane,
     )
 
 
@@ -177,12 +172,10 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
     Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a
     distance to go; of two that meet head-on, both have.
     """
-    shared = [
-        (n, side, key)
-        for n, known in enumerate(all_known)
-        for side, key in road.beside(known.own).items()
-        if key in known.place.near
-    ]
+    shared = []
+    for n, known in enumerate(all_known):
+        ways = road.beside(known.own).items()
+        shared += [(n, side, key) for side, key in ways if key in known.place.near]
     apart = _apart(road, [(all_known[n], key) for n, _, key in shared])
     its_heading = _at(road, [(known.key, known.place.arc_m) for known in all_known])[:, 2]
     numbers = [n for n, _, _ in shared]
@@ -203,29 +196,22 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
         share = {"ahead": 1.0, "behind": 0.0, "oncoming": ego_mps / max(closing_mps, 0.1)}[kind]
         time_s = tenths(abs(gap) / closing_mps) if closing_mps > 0.5 else None
         pairs.append((n, side, key, kind, gap, share, time_s))
-    points = _at(
-        road,
-        [
-            (key, all_known[n].ego_arc_m + max(gap, 0.0) * share)
-            for n, _, key, _, gap, share, _ in pairs
-        ],
-    )
-    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(
-        pairs, points.tolist(), strict=True
-    ):
+    arcs = []
+    for n, _, key, _, gap, share, _ in pairs:
+        arcs.append((key, all_known[n].ego_arc_m + max(gap, 0.0) * share))
+    points = _at(road, arcs).tolist()
+    for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(pairs, points, strict=True):
         known = all_known[n]
-        yield (
-            n,
-            Conflict(
-                known.d.id,
-                *known.key,
-                known.seat.relative(x, y),
-                EgoArrival(tenths(abs(gap) * share), time_s),
-                known.arrival(abs(gap) * (1 - share), time_s),
-                kind,
-                side,
-            ),
+        conflict = Conflict(
+            known.d.id,
+            *known.key,
+            known.seat.relative(x, y),
+            EgoArrival(tenths(abs(gap) * share), time_s),
+            known.arrival(abs(gap) * (1 - share), time_s),
+            kind,
+            side,
         )
+        yield n, conflict
 
 
 def _apart(road: Road, shared: Sequence[tuple[Encounter, PathKey]]) -> list[bool]:
