@@ -300,8 +300,8 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
         success = percent(metrics.loc[metric], *ESTIMATE)
         rows.setdefault(title, []).append((name, success, *means))
     tables = []
-    for title, head in heads.items():
-        table = Table(title, (*head, *HEADS), rows[title], terminal=range(2 + len(HEADS)))
+    for title, columns in heads.items():
+        table = Table(title, (*columns, *HEADS), rows[title], terminal=range(2 + len(HEADS)))
         tables.append(table)
     return tables
 
