@@ -17,7 +17,7 @@ from harness.coordination.intents import OF_EGO, WITH_EGO, Intents
 from harness.coordination.sent import SentIntents
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, check_distributions, check_shape, read_only
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.strangers import worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
 from harness.extensions.trust.attacks import Attack, Turn, attackers
@@ -91,7 +91,7 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
     kind = type(attack)
     if kind.__module__.startswith("harness."):
         return attack.act(said, turn)
-    with worded(f"attack {kind.__name__}"):
+    with worded(f"attack {kind.__name__} of {printable(kind.__module__)}"):
         after = attack.act(read_only(said), read_only(turn))
         if after.voice_of is None:
             after = replace(after, site=said.site, outlook=said.outlook, plans=said.plans)
@@ -100,9 +100,32 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
             check_shape("voices", after.voice_of, after.helpers.shape[:2])
             if np.any((after.voice_of < 0) | (after.voice_of >= said.helpers.shape[1])):
                 raise ValueError("a voice of nobody who is there")
+            if said.voice_of is None:
+                after = _with_honest_voices(said, after, turn.attackers)
         check_distributions("intents", after.helpers, after.valid)
         if not np.array_equal(after.own, said.own, equal_nan=True):
             raise ValueError("it changes the ego's own intent")
+    return after
+
+
+def _with_honest_voices(said: Intents, after: Intents, attackers: Bools) -> Intents:
+    """Return the voices that an attack added to, where those of honest helpers are as they were.
+
+    Raises ValueError if it changes, leaves out or doubles one.
+    """
+    voice_of = after.voice_of
+    assert voice_of is not None
+    before = replace(said.of_helpers(voice_of), voice_of=voice_of)
+    after = replace(after, site=before.site, outlook=before.outlook, plans=before.plans)
+    present = np.isfinite(after.range_m)
+    honest = present & ~np.take_along_axis(attackers, voice_of, axis=1)
+    _refuse_of_others(before, after, ~honest)
+    for owners, is_honest, attack, range_m in zip(
+        voice_of, honest, attackers, said.range_m, strict=True
+    ):
+        expected = np.flatnonzero(~attack & np.isfinite(range_m))
+        if not np.array_equal(np.sort(owners[is_honest]), expected):
+            raise ValueError("a helper that is no attacker has no voice, or more than one")
     return after
 
 

@@ -288,7 +288,9 @@ def test_a_packages_attack_says_what_an_attacker_can_or_is_one_line(
 ) -> None:
     monkeypatch.setitem(ATTACKS._loaded, "bent", Bent())
     monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
-    with pytest.raises(UserError, match=re.escape(f"attack Bent fails (ValueError: {says}")):
+    with pytest.raises(
+        UserError, match=rf"attack Bent of \S+ fails .ValueError: {re.escape(says)}"
+    ):
         told_by(
             (under(f"bent:way={way}")).speaker(),
             many(TRUTH, 9),

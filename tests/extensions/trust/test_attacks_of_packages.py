@@ -10,7 +10,7 @@ import pytest
 from harness.coordination.intents import Intents
 from harness.core.errors import UserError
 from harness.extensions.trust.attackers import _acted
-from harness.extensions.trust.attacks import ATTACKS, Attack, Turn
+from harness.extensions.trust.attacks import ATTACKS, Attack, Turn, with_voices
 
 Typed = Callable[..., tuple[int, str, str]]
 P = np.full((2, 2), 0.5)
@@ -58,8 +58,36 @@ class Lie(Attack):
     ],
 )
 def test_an_attack_changes_what_is_its_own(lie: Callable[[Intents], Intents], says: str) -> None:
-    with pytest.raises(UserError, match=f"^attack Lie fails .ValueError: {says}"):
+    with pytest.raises(UserError, match=rf"^attack Lie of \S+ fails .ValueError: {says}"):
         _acted(Lie(lie=lie), SAID, TURN)
+
+
+@pytest.mark.parametrize(
+    ("lie", "says"),
+    [
+        (lambda s: replace(s, helpers=s.helpers[:, :, ::-1] * [0.2, 1.8]), "it changes helpers of"),
+        (
+            lambda s: replace(s, inference_s=s.inference_s + 1),
+            "it changes inference_s of the ego, or",
+        ),
+        (
+            lambda s: replace(s, range_m=np.where([True, False, True], s.range_m, np.nan)),
+            "has no v",
+        ),
+        (
+            lambda s: replace(s, voice_of=np.array([[0, 1, 1]] * 2)),
+            "it changes distance_m of the ego, or",
+        ),
+    ],
+)
+def test_voices_that_an_attack_adds_leave_honest_ones_alone(
+    lie: Callable[[Intents], Intents], says: str
+) -> None:
+    """With its own further voice, the attacker's, it may do as it likes."""
+    added = with_voices(SAID, TURN.attackers, 2)
+    assert _acted(Lie(lie=lambda said: added), SAID, TURN).voice_of is not None
+    with pytest.raises(UserError, match=f"fails .ValueError: .*{says}"):
+        _acted(Lie(lie=lambda said: lie(added)), SAID, TURN)
 
 
 def test_an_attacker_may_be_silent_far_away_and_late() -> None:
@@ -86,4 +114,4 @@ def test_an_attack_that_fails_is_one_line(
     typed = ("eval", "--dataset", two_path, "--attack", "mine", "--limit", "1", "--quiet")
     code, out, said = harness(*typed, "--out", "run")
     assert (code, out, said.count("\n")) == (2, "", 1)
-    assert said.startswith("harness: attack Failing fails (ValueError: intents of shape (")
+    assert said.startswith("harness: attack Failing of ")
