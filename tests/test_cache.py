@@ -102,8 +102,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "cache" / "completions.sqlite"
 
 
-# -- what is in the key
-# -------------------------------------------------------------------------------------
+# -- what is in the key ----------------------------------------------------------------------------
 
 
 def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None:
@@ -153,8 +152,7 @@ def test_another_model_in_any_respect_is_asked(tmp_path: Path) -> None:
     assert key(identity, "prompt, as another template writes it", BASE) != base
 
 
-# -- what comes out
-# -----------------------------------------------------------------------------------------
+# -- what comes out --------------------------------------------------------------------------------
 
 
 def test_what_was_answered_is_not_asked_again_and_the_order_holds(file: Path) -> None:
@@ -253,8 +251,7 @@ def test_a_file_that_computes_is_left_alone(
     assert "a view or a trigger" in capsys.readouterr().err
 
 
-# -- the file is no more than a help
-# ------------------------------------------------------------------------
+# -- the file is no more than a help ---------------------------------------------------------------
 
 
 def test_a_deleted_file_is_an_empty_cache_also_while_a_run_goes_on(file: Path) -> None:
@@ -337,8 +334,7 @@ def test_the_file_lies_where_the_environment_says(
     assert default_file() == tmp_path / ".cache" / "swarmdrive-harness" / "completions.sqlite"
 
 
-# -- runs
-# ---------------------------------------------------------------------------------------------------
+# -- runs ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

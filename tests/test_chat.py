@@ -134,8 +134,7 @@ def test_an_answer_ends_at_the_token_that_the_template_writes_after_it(
     assert Chat("m", Marked(template)).turn_end == (7 if end else None)
 
 
-# -- real weights
-# --------------------------------------------------------------------------------------------
+# -- real weights ----------------------------------------------------------------------------------
 
 
 def with_template(folder: Path, template: str) -> Path:

@@ -66,8 +66,7 @@ def loose(draw: st.DrawFn) -> tuple[tuple[str, str], str]:
     return form, f"{draw(blank)}{written(schema(request(*form)))}{draw(blank)}"
 
 
-# -- what fits
-# ----------------------------------------------------------------------------------------------
+# -- what fits -------------------------------------------------------------------------------------
 
 
 @given(compact, st.sampled_from(PATTERNS), st.data())
@@ -94,8 +93,7 @@ def test_what_the_schema_allows_fits_and_so_does_its_beginning(
     assert broken(kind, asked, cut, ended=True)
 
 
-# -- what does not
-# ------------------------------------------------------------------------------------------
+# -- what does not ---------------------------------------------------------------------------------
 
 spoilt = st.tuples(
     st.integers(0, 200), st.integers(0, 3), st.text(' {}":,0159.-eSLOWERIx\n', max_size=3)
@@ -172,8 +170,7 @@ def test_what_may_still_become_an_answer_is_cut_off_and_not_broken(kind: Kind, t
     assert broken(kind, request(), text, ended=False) is None
 
 
-# -- through the backend
-# ------------------------------------------------------------------------------------
+# -- through the backend ---------------------------------------------------------------------------
 
 
 def asked_for(

@@ -4,6 +4,7 @@ The two are of `tests/plugin`, here put where an entry point would put them.
 """
 
 import re
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -143,8 +144,7 @@ def test_an_override_that_a_channel_does_not_have_is_refused(override):
         OperatingPoint.of("x", "fog", **override)
 
 
-# -- every plug-in, those of installed packages included
-# ---------------------------------------------------
+# -- every plug-in, those of installed packages included -------------------------------------------
 
 
 def somewhere(shape: tuple[int, ...], rng: np.random.Generator) -> Site:
@@ -243,8 +243,7 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
         state, alone = fused.state, single.state
 
 
-# -- how packages add them
-# ---------------------------------------------------------------------------------
+# -- how packages add them -------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -356,6 +355,28 @@ def test_a_packages_schedule_says_what_asking_is_worth_and_writes_to_nothing(
     monkeypatch.setattr(type(SCHEDULES), "__iter__", lambda self: iter(self._loaded))
     with pytest.raises(UserError, match=re.escape(f"schedule mine fails (ValueError: {says}")):
         coordinate(OperatingPoint.of("x", "6g", schedule="mine"), *three())
+
+
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [
+        ("threshold=float('nan')", "has threshold nan; allowed: a finite number, or None"),
+        ("threshold='much'", "has threshold 'much'; allowed: a finite number, or None"),
+        ("needs=('luck',)", "has needs ('luck',); allowed: a tuple of in_time, outlook, lot"),
+        ("needs='lot'", "has needs 'lot'; allowed: a tuple of in_time, outlook, lot"),
+    ],
+)
+def test_what_a_packages_schedule_states_is_what_it_may_be(
+    stated: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = (
+        f"from harness.extend import Formula\nODD = Formula(lambda known: known.range_m, {stated})"
+    )
+    register(tmp_path, "[swarmdrive.schedules]\nodd = odd_schedule:ODD\n", odd_schedule=source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "odd_schedule", raising=False)
+    with pytest.raises(UserError, match=re.escape(says)):
+        SCHEDULES["odd"]
 
 
 @dataclass(frozen=True)

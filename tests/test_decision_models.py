@@ -309,8 +309,7 @@ def test_a_decision_model_does_nothing_else(how: dict[str, Any], reason: str) ->
         Agent(cards.load("systemone-example"), versions.load("v9"), **how)
 
 
-# -- a real one
-# -------------------------------------------------------------------------------------
+# -- a real one ------------------------------------------------------------------------------------
 
 
 def questions_of(name: str) -> tuple[Spec, list[Request]]:

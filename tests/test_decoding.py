@@ -92,8 +92,7 @@ def best(backend: LanguageModel, ids: Sequence[int], texts: Sequence[str]) -> st
     return texts[int(naive(backend, ids)[tokens].argmax())]
 
 
-# -- json
-# ---------------------------------------------------------------------------------------------
+# -- json ------------------------------------------------------------------------------------------
 
 
 def test_free_text_is_what_generate_says_greedily(backend: LanguageModel) -> None:
@@ -138,8 +137,7 @@ def test_what_is_guessed_saves_forwards_and_changes_no_answer(small: Dataset) ->
     assert len(forwards) < 0.8 * max(c.completion_tokens or 0 for c in alone)
 
 
-# -- times
-# ------------------------------------------------------------------------------------------
+# -- times -----------------------------------------------------------------------------------------
 
 
 class Ticking:
@@ -195,8 +193,7 @@ def test_the_first_token_is_there_when_the_model_has_chosen_it(
     }
 
 
-# -- constrained
-# --------------------------------------------------------------------------------------
+# -- constrained -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("i", [0, 3, 8])
@@ -261,8 +258,7 @@ def test_an_answer_that_does_not_fit_its_bound_is_the_users_to_know(backend: Lan
         backend.complete([ask(1, "constrained", max_tokens=24)])
 
 
-# -- readout
-# ------------------------------------------------------------------------------------------
+# -- readout ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("i", [0, 3, 8])
@@ -386,8 +382,7 @@ def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
         Decoding(engine).room(ask(0, "readout"))
 
 
-# -- all of them
-# --------------------------------------------------------------------------------------
+# -- all of them -----------------------------------------------------------------------------------
 
 
 def same(one: Sequence[Completion], other: Sequence[Completion]) -> None:

@@ -55,8 +55,7 @@ DESK = Device(
 )  # fmt: skip
 
 
-# -- one decision by hand
-# -------------------------------------------------------------------------------
+# -- one decision by hand --------------------------------------------------------------------------
 
 ALONE = OperatingPoint.of("single-local", None)
 CLEAR = OperatingPoint.of("clear", "v2x", loss=0.0, window_s=0.6)  # serial, 25 ms a slot, 10 Mbit/s
@@ -251,8 +250,7 @@ def test_a_radio_sends_with_the_channels_power_where_it_has_one() -> None:
     assert np.isnan(transmit_watts(silent, named_point("6g")))
 
 
-# -- what must always hold
-# ------------------------------------------------------------------------------
+# -- what must always hold -------------------------------------------------------------------------
 
 RATES = st.floats(1, 1e5)
 COUNTS = st.integers(0, 4000)
@@ -383,8 +381,7 @@ def test_workers_change_no_row(tmp_path: Path) -> None:
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
 
 
-# -- files
-# ----------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", devices.names())

@@ -67,8 +67,7 @@ def with_examples(spec: Spec, shown: Examples = SHOWN) -> Spec:
     return with_ego(spec, prompt=replace(spec.ego.prompt, examples=shown))
 
 
-# -- what a model is sent
-# -------------------------------------------------------------------------------
+# -- what a model is sent --------------------------------------------------------------------------
 
 
 def test_they_are_turns_between_the_systems_message_and_the_question(draft: Any) -> None:
@@ -138,8 +137,7 @@ def test_free_and_constrained_answers_have_the_same_chat(small: Dataset) -> None
     assert free == constrained
 
 
-# -- what is refused
-# ------------------------------------------------------------------------------------
+# -- what is refused -------------------------------------------------------------------------------
 
 LINE = {"layout_seed": 100_007, "graph": SEES.plain(), "answer": YIELD}
 FILE = {"scenario": scenarios.DEFAULT, "ego": [LINE], "helper": []}
@@ -230,8 +228,7 @@ def test_reasons_may_stand_before_an_answer_where_the_prompt_asks_for_them() -> 
     assert example_actions(asks, "ego", ACTIONS) == ["SLOWER", "FASTER"]
 
 
-# -- with the model that ships
-# --------------------------------------------------------------------------
+# -- with the model that ships ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("answer", some(["readout"], exhaustive=["json", "constrained"]))
@@ -259,8 +256,7 @@ def test_a_replay_gives_the_run_again(small: Dataset, tmp_path: Path) -> None:
         run(plain, tmp_path / "plain")
 
 
-# -- differences
-# ----------------------------------------------------------------------------------------
+# -- differences -----------------------------------------------------------------------------------
 
 
 def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:
@@ -278,8 +274,7 @@ def test_a_difference_names_them_and_counts_their_words(small: Dataset) -> None:
     assert difference.change(mine, reworded), "the same layouts, and another answer"
 
 
-# -- the command
-# ----------------------------------------------------------------------------------------
+# -- the command -----------------------------------------------------------------------------------
 
 
 @pytest.fixture

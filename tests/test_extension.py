@@ -102,8 +102,7 @@ def values(schema: Any) -> st.SearchStrategy[Any]:
     return st.sampled_from(bounds)
 
 
-# -- filled in
-# ------------------------------------------------------------------------------------------
+# -- filled in -------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -160,8 +159,7 @@ def test_a_number_is_one_of_a_hundred_to_a_thousand(
     assert all(least <= float(text) <= most for text in found)
 
 
-# -- read
-# -----------------------------------------------------------------------------------------------
+# -- read ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -197,8 +195,7 @@ def test_unasked_for_they_are_a_field_too_many() -> None:
     assert (parsed.repairs, parsed.extension) == (("extra_field",), None)
 
 
-# -- servers
-# --------------------------------------------------------------------------------------------
+# -- servers ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -222,8 +219,7 @@ def test_what_a_server_is_sent_is_what_it_is_held_to(data: st.DataObject, shape:
     assert broken("generic", asked, json.dumps(json.loads(text), indent=1), ended=True) is None
 
 
-# -- a version
-# ------------------------------------------------------------------------------------------
+# -- a version -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -297,8 +293,7 @@ def test_the_pages_example_is_one_and_a_run_of_it_keeps_what_was_added(
     assert (tmp_path / "run/sources/prompts/mine/answer.json").read_text() == example
 
 
-# -- what is refused
-# ------------------------------------------------------------------------------------
+# -- what is refused -------------------------------------------------------------------------------
 
 TEXT = {"type": "string", "maxLength": 9}
 

@@ -205,8 +205,7 @@ def test_who_can_merge_nothing_is_told_so(
         spec_of(small, model, points=(FUSION,), **options)
 
 
-# -- with the model that ships
-# --------------------------------------------------------------------------
+# -- with the model that ships ---------------------------------------------------------------------
 
 CONDITIONS = (POINTS["single-local"], POINTS["6g"], FUSION)
 
@@ -362,8 +361,7 @@ def test_a_resumed_run_has_the_times_that_it_began_with(
         )
 
 
-# -- in a sweep
-# -----------------------------------------------------------------------------------------
+# -- in a sweep ------------------------------------------------------------------------------------
 
 
 def test_a_sweep_asks_what_the_run_has_not_and_asks_it_once(

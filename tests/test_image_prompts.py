@@ -53,8 +53,7 @@ def asked(of: Spec, scene: Scene, question: Question = PLAIN) -> dict[str, Reque
     return {r.id.partition("/")[2]: r for r in requests(of, [scene], question)}
 
 
-# -- pictures of a question
-# ----------------------------------------------------------------------------------
+# -- pictures of a question ------------------------------------------------------------------------
 
 
 def test_every_viewer_is_shown_what_its_own_cameras_see(crossing: Dataset):
@@ -140,8 +139,7 @@ def test_a_prompt_that_shows_no_objects_is_not_asked_again_with_more_of_them(
     assert replace(spec(crossing, image, "v7"), points=(point,)).points == (point,)
 
 
-# -- what is refused
-# -----------------------------------------------------------------------------------------
+# -- what is refused -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -191,8 +189,7 @@ def test_a_prompt_with_examples_shows_no_picture(tmp_path: Path):
         prompts.load("vx", tmp_path)
 
 
-# -- tokens of a picture
-# -------------------------------------------------------------------------------------
+# -- tokens of a picture ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,7 @@ def site(distance_m, sight=CLEAR, corner_m=np.nan) -> Site:
     return Site(there, np.full(n, sight), np.full(n, 1.6), np.full((n, 2), corner_m))
 
 
-# -- by hand
-# -----------------------------------------------------------------------------------------------
+# -- by hand ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("size_bytes", "airtime_us"), [(190, 304), (300, 448), (350, 512)])
@@ -86,8 +85,7 @@ def test_other_block_error_curves_hold_at_the_rate_that_they_were_made_for_and_s
     )
 
 
-# -- limits and directions
-# ---------------------------------------------------------------------------------
+# -- limits and directions -------------------------------------------------------------------------
 
 
 def test_reception_is_the_mean_of_what_links_have_over_their_shadowing():
@@ -124,8 +122,7 @@ def test_what_stands_between_costs_reception():
     assert CROWD.loss(site(28.3, BUILDING, 20.0), np.zeros(1), 800.0) < 0.5
 
 
-# -- the closed forms beside a simulation of the slots
-# -----------------------------------------------------
+# -- the closed forms beside a simulation of the slots ---------------------------------------------
 
 
 def simulated(
@@ -196,8 +193,7 @@ def test_the_waits_drawn_have_the_mean_of_the_closed_form(busy):
     )
 
 
-# -- the seam
-# ----------------------------------------------------------------------------------------------
+# -- the seam --------------------------------------------------------------------------------------
 
 
 def links_and_draws(n: int) -> tuple[Links, Draws]:

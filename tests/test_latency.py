@@ -42,8 +42,7 @@ LANGUAGE_MODEL = "swarm-tiny"
 ROWS = ("decisions.parquet", "episodes.csv", "summary.csv")
 
 
-# -- which one counts
-# -----------------------------------------------------------------------------------
+# -- which one counts ------------------------------------------------------------------------------
 
 
 def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
@@ -111,8 +110,7 @@ def test_a_replay_keeps_its_runs_times_unless_others_are_declared(
     assert (other.ego_s, other.helper_s) == (0.3, 0.3)
 
 
-# -- measured, by name
-# ----------------------------------------------------------------------------------
+# -- measured, by name -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -209,8 +207,7 @@ def test_a_model_that_fails_has_no_times(small: Dataset) -> None:
         measured(spec_of(small, LANGUAGE_MODEL), Clock(lines), timing.spread_over(scenes_of(small)))
 
 
-# -- and what answers took decides nothing
-# ----------------------------------------------------------------
+# -- and what answers took decides nothing ---------------------------------------------------------
 
 
 @pytest.mark.slow

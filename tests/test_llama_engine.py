@@ -114,8 +114,7 @@ PROMPTS = [[1, 7, 8, *range(20, 20 + n), 9] for n in (4, 11, 1, 30, 17)]
 TOKENS = st.lists(st.integers(0, VOCABULARY - 1), max_size=5)
 
 
-# -- what goes in
-# -------------------------------------------------------------------------------------
+# -- what goes in ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prompt", ["v1", "v2"])
@@ -149,8 +148,7 @@ def test_special_tokens_are_read_whole_and_thoughts_stay_in_the_text(engine: Lla
     assert engine.chat.decode(ids) == "a<think>b</think>"
 
 
-# -- logits
-# -------------------------------------------------------------------------------------------
+# -- logits ----------------------------------------------------------------------------------------
 
 
 def test_f32_says_what_transformers_says_to_the_fifth_digit(
@@ -262,8 +260,7 @@ def test_tokens_that_are_none_fail_and_the_next_prompts_do_not(tiny: Path, their
         engine.begin(PROMPTS[:4])
 
 
-# -- answers
-# ------------------------------------------------------------------------------------------
+# -- answers ---------------------------------------------------------------------------------------
 
 
 def in_mode(request: Request, answer: Any) -> Request:
@@ -327,8 +324,7 @@ def test_its_chat_can_be_asked_from_here(backend: LlamaBackend, theirs: Any) -> 
     assert backend.chat.bos == 0
 
 
-# -- what a user can get wrong
-# ------------------------------------------------------------------------
+# -- what a user can get wrong ---------------------------------------------------------------------
 
 
 def rename(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
@@ -407,8 +403,7 @@ def test_without_the_package_it_says_how_to_get_it(
         open_backend(card)
 
 
-# -- where it lies, and what it is
-# --------------------------------------------------------------------
+# -- where it lies, and what it is -----------------------------------------------------------------
 
 
 def test_a_file_is_found_by_its_path_beside_the_cards_or_in_a_folder(

@@ -117,8 +117,7 @@ def prompt(image: Image, *rest: int) -> Prompt:
     return [*SYSTEM, START, image, END, *rest]
 
 
-# -- what the two engines say
-# -------------------------------------------------------------------------
+# -- what the two engines say ----------------------------------------------------------------------
 
 
 def test_after_a_picture_it_says_what_transformers_says(engine: LlamaEngine, theirs: Any) -> None:
@@ -179,8 +178,7 @@ def test_texts_and_pictures_in_any_order_in_any_company(
         np.testing.assert_allclose(session.log_probs(), expected, atol=ROUNDED)
 
 
-# -- answers
-# ------------------------------------------------------------------------------------------
+# -- answers ---------------------------------------------------------------------------------------
 
 
 def question(n: int, image: Image | None, answer: Any, text: str = "Scene") -> Request:
@@ -248,8 +246,7 @@ def test_who_reads_pictures_with_which_projector_is_part_of_a_backends_identity(
     assert "projector" not in open_backend(card_of(tiny, projector=None, vision=None)).identity()
 
 
-# -- what is computed once
-# ----------------------------------------------------------------------------
+# -- what is computed once -------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -347,8 +344,7 @@ def test_its_tokens_are_negative_the_same_for_the_same_pixels_and_others_for_oth
     assert set(seen).isdisjoint(engine.look(B))
 
 
-# -- what a user can get wrong
-# ------------------------------------------------------------------------
+# -- what a user can get wrong ---------------------------------------------------------------------
 
 
 def opened(card: Card) -> UserError:

@@ -228,8 +228,7 @@ def test_what_a_model_has_not_is_one_line(
     assert said in err
 
 
-# -- models that see
-# -----------------------------------------------------------------------------------------
+# -- models that see -------------------------------------------------------------------------------
 
 SERVED = """\
 engine = "openai"

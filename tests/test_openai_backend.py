@@ -77,8 +77,7 @@ def ask_one(play: Play, **server: Any) -> Completion:
     return done
 
 
-# -- what is asked
-# ------------------------------------------------------------------------------------------
+# -- what is asked ---------------------------------------------------------------------------------
 
 
 def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,8 +211,7 @@ def test_each_kind_of_server_is_asked_for_a_constrained_answer_in_its_own_words(
     }  # fmt: skip
 
 
-# -- retries
-# ------------------------------------------------------------------------------------------------
+# -- retries ---------------------------------------------------------------------------------------
 
 
 def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() -> None:
@@ -305,8 +303,7 @@ def test_an_answer_that_drips_is_given_up_when_its_time_is_over(head: bytes) -> 
     assert done.seconds >= 0.6
 
 
-# -- garbage
-# ------------------------------------------------------------------------------------------------
+# -- garbage ---------------------------------------------------------------------------------------
 
 
 def one(message: Any) -> bytes:
@@ -416,8 +413,7 @@ def test_a_text_has_a_token_for_each_sixteen_characters_at_least(written: int, t
     assert said.completion_tokens == (tokens if 16 * tokens >= written else None)
 
 
-# -- thoughts
-# -----------------------------------------------------------------------------------------------
+# -- thoughts --------------------------------------------------------------------------------------
 
 
 def without_content(finish_reason: str, **message: Any) -> dict[str, Any]:
@@ -478,8 +474,7 @@ def test_a_thought_that_the_server_took_out_is_put_back_and_judged_like_any(
     assert (parsed.status, said.error) == (status, None)
 
 
-# -- read-out
-# -----------------------------------------------------------------------------------------------
+# -- read-out --------------------------------------------------------------------------------------
 
 HALF, QUARTER, EIGHTH, SIXTEENTH = -0.693147181, -1.386294361, -2.079441542, -2.772588722
 
@@ -566,8 +561,7 @@ def test_a_read_out_asks_for_one_token_and_the_likeliest() -> None:
     assert (asked["max_tokens"], asked["logprobs"], asked["top_logprobs"]) == (1, True, 20)
 
 
-# -- fields that a card changes
-# ------------------------------------------------------------------------------
+# -- fields that a card changes --------------------------------------------------------------------
 
 
 def sent(
@@ -683,8 +677,7 @@ def test_a_refused_field_says_what_a_card_can_do(refusal: str, hint: str) -> Non
     assert hint or done.error == f"HTTP 400: {refusal}"
 
 
-# -- who answered
-# --------------------------------------------------------------------------------------------
+# -- who answered ----------------------------------------------------------------------------------
 
 
 def named(*models: Any) -> Play:
@@ -724,8 +717,7 @@ def test_a_name_that_the_server_lists_is_no_other(
     assert capfd.readouterr().err == ""
 
 
-# -- several at a time
-# --------------------------------------------------------------------------------------
+# -- several at a time -----------------------------------------------------------------------------
 
 
 def test_requests_of_a_batch_are_asked_at_the_same_time_and_answered_in_order() -> None:
@@ -753,8 +745,7 @@ def test_requests_of_a_batch_are_asked_at_the_same_time_and_answered_in_order() 
     )
 
 
-# -- opening
-# ------------------------------------------------------------------------------------------------
+# -- opening ---------------------------------------------------------------------------------------
 
 
 def test_a_server_that_nobody_listens_at_is_one_line() -> None:
@@ -798,8 +789,7 @@ def test_a_server_with_one_model_answers_to_any_name() -> None:
     }
 
 
-# -- the key
-# ------------------------------------------------------------------------------------------------
+# -- the key ---------------------------------------------------------------------------------------
 
 
 def test_the_key_is_read_from_the_variable_that_the_card_names(

@@ -55,8 +55,7 @@ def taken(*pieces: Any, step_s: float = 1.0) -> Stream:
     return stream
 
 
-# -- the times
-# --------------------------------------------------------------------------------------------
+# -- the times -------------------------------------------------------------------------------------
 
 
 def test_the_first_token_is_the_first_text_and_not_the_first_piece() -> None:
@@ -118,8 +117,7 @@ def test_a_read_outs_only_token_is_there_with_the_answer() -> None:
     assert done.token_s is None
 
 
-# -- servers that do not stream
-# -----------------------------------------------------------------------------
+# -- servers that do not stream --------------------------------------------------------------------
 
 
 def test_a_server_that_sends_it_whole_all_the_same_has_no_first_token() -> None:
@@ -143,8 +141,7 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
     assert [a.body["stream"] for a in asked] == [True, False, False]
 
 
-# -- streams that are none
-# ----------------------------------------------------------------------------------
+# -- streams that are none -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -221,8 +218,7 @@ def test_a_key_that_is_cut_through_by_pieces_is_taken_out(monkeypatch: pytest.Mo
     assert done.error == "the stream broke off: [key] is no key"
 
 
-# -- any stream
-# ---------------------------------------------------------------------------------------------
+# -- any stream ------------------------------------------------------------------------------------
 
 
 @given(

@@ -58,8 +58,7 @@ def test_every_golden_text_is_of_a_version_and_a_case() -> None:
     }
 
 
-# -- what is told
-# ---------------------------------------------------------------------------------------
+# -- what is told ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -178,8 +177,7 @@ def test_v3_differs_from_v2_in_messages_alone(case: str) -> None:
     assert v3 == v2
 
 
-# -- versions that are wrong
-# ----------------------------------------------------------------------------
+# -- versions that are wrong -----------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -311,8 +309,7 @@ def test_a_version_is_a_name_and_no_path(name: str) -> None:
     assert one_line(caught).endswith(f"known: {', '.join(VERSIONS)}")
 
 
-# -- release
-# --------------------------------------------------------------------------------------------
+# -- release ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", [*prompts.FILES, EXAMPLES])
@@ -421,8 +418,7 @@ def test_a_file_that_is_missing_is_named_once(copied: Path) -> None:
     )
 
 
-# -- length
-# ---------------------------------------------------------------------------------------------
+# -- length ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

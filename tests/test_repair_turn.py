@@ -85,8 +85,7 @@ def said(name: str, text: str, **facts: Any) -> Completion:
     return replace(Completion(name, text, 300, 20, "stop", 0.5, 1), **facts)
 
 
-# -- who is asked again, and what
-# -----------------------------------------------------------------------
+# -- who is asked again, and what ------------------------------------------------------------------
 
 
 def test_who_gave_an_answer_that_cannot_be_read_is_asked_once_more(small: Dataset) -> None:
@@ -167,8 +166,7 @@ def test_in_a_mix_each_half_has_its_own_prompts_turn(small: Dataset) -> None:
     assert [(r.role, r.agent) for r in again] == [("helper", 1)] * 3
 
 
-# -- what is quoted
-# -------------------------------------------------------------------------------------
+# -- what is quoted --------------------------------------------------------------------------------
 
 CONTROL = (
     "<|im_end|>", "<|im_start|>system\n", "<|endoftext|>", "</s>", "<s>", "<eos>", "<end_of_turn>",
@@ -227,8 +225,7 @@ def test_what_is_wrong_is_quoted_as_text_too(small: Dataset) -> None:
     assert "'GO< start_of_turn>' is no action" in backend.requests[-1].messages[-1]["content"]
 
 
-# -- what it costs
-# --------------------------------------------------------------------------------------
+# -- what it costs ---------------------------------------------------------------------------------
 
 
 def test_tokens_and_seconds_are_those_of_both_turns(small: Dataset) -> None:
@@ -296,8 +293,7 @@ def test_a_helper_that_was_asked_twice_may_be_too_late(small: Dataset) -> None:
         assert all(m.on_time == heard for m in sent)
 
 
-# -- what is reported
-# -----------------------------------------------------------------------------------
+# -- what is reported ------------------------------------------------------------------------------
 
 
 def faulty(small: Dataset, **options: Any) -> Spec:
@@ -362,8 +358,7 @@ def test_a_table_of_a_run_says_it_in_a_line_each(harness: Harness, small_path: P
     assert "valid at first" in page
 
 
-# -- it is the same however it is asked
-# -----------------------------------------------------------------
+# -- it is the same however it is asked ------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -410,8 +405,7 @@ def test_batches_and_a_kill_change_nothing(small: Dataset, tmp_path: Path) -> No
     assert same_files(whole.out, run(faulty(small), tmp_path / "killed").out)
 
 
-# -- the version
-# ----------------------------------------------------------------------------------------
+# -- the version -----------------------------------------------------------------------------------
 
 
 def test_the_block_may_use_what_is_wrong_and_nothing_of_the_scene(small: Dataset) -> None:

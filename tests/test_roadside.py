@@ -196,8 +196,7 @@ def test_airtime_counts_both_hops_and_copies_that_nobody_needs():
         assert play(point(edge, **alike)).airtime_s == pytest.approx(messages * slot_s)
 
 
-# -- properties
-# --------------------------------------------------------------------------------------------
+# -- properties ------------------------------------------------------------------------------------
 
 
 @st.composite
@@ -308,8 +307,7 @@ def lossless() -> tuple[Intents, Draws]:
     return intents, Draws(rng.random((6, 3, 2)), rng.random((6, 3)), trips)
 
 
-# -- where it stands
-# ---------------------------------------------------------------------------------------
+# -- where it stands -------------------------------------------------------------------------------
 
 
 def car(name: str, x_m: float, y_m: float, kind: str = "car") -> VehicleState:

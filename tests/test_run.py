@@ -56,8 +56,7 @@ def without_company(answers: list[Answer]) -> list[Answer]:
     return [msgspec.structs.replace(answer, batch_size=0, **UNTIMED) for answer in answers]
 
 
-# -- twins
-# ----------------------------------------------------------------------------------------------
+# -- twins -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -163,8 +162,7 @@ def test_prompts_that_are_too_long_for_the_model_got_no_answer(
     assert {answer.finish_reason for answer in answers.values()} <= {"stop", "length"}
 
 
-# -- replay
-# ---------------------------------------------------------------------------------------------
+# -- replay ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -276,8 +274,7 @@ def test_a_drivers_run_is_not_replayed_but_run_again(small: Dataset, tmp_path: P
     assert said.endswith("is a run of a driver; run it again with --model local-view")
 
 
-# -- refused, and nothing written
-# -------------------------------------------------------------------------
+# -- refused, and nothing written ------------------------------------------------------------------
 
 
 def test_a_folder_in_use_is_refused_and_left_as_it_is(
@@ -376,8 +373,7 @@ def test_a_model_that_always_thinks_is_read_as_one_that_was_asked_to() -> None:
     assert Agent(cards.load("qwen3-4b"), prompts.load("v2")).thinking is False
 
 
-# -- conditions
-# -------------------------------------------------------------------------------------------
+# -- conditions ------------------------------------------------------------------------------------
 
 
 def test_single_local_never_sends_and_hears_nobody(proxy_run: Path) -> None:
@@ -481,8 +477,7 @@ def test_the_driver_that_sees_everything_is_the_upper_reference(
     assert figure(worst, "6g", "success_rate").value < 1.0
 
 
-# -- the record
-# -------------------------------------------------------------------------------------------
+# -- the record ------------------------------------------------------------------------------------
 
 
 def test_the_summary_can_be_made_again_from_the_decisions(proxy_run: Path) -> None:

@@ -302,8 +302,7 @@ def test_a_consensus_weighs_those_heard_by_their_distance(told: Walked, played: 
     assert told.result(DEAF, "fused")[at] == pytest.approx([0.3, 0.4, 0.3])
 
 
-# -- seeds
-# ------------------------------------------------------------------------------------------------
+# -- seeds -----------------------------------------------------------------------------------------
 
 
 def test_intervals_of_what_hangs_on_the_seed(small: Dataset) -> None:
@@ -339,8 +338,7 @@ def test_outcomes_that_no_seed_changes_have_wilsons_interval(told: Walked) -> No
     assert (row.low, row.high) == pytest.approx((0.5 - half, 0.5 + half))
 
 
-# -- failed answers
-# ---------------------------------------------------------------------------------------
+# -- failed answers --------------------------------------------------------------------------------
 
 
 def test_a_failed_ego_answer_is_undecided_so_it_asks(played: Dataset) -> None:

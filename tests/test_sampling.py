@@ -36,8 +36,7 @@ logits = st.lists(
 shares = st.floats(0, 1, exclude_max=True)
 
 
-# -- one token, by hand
-# -------------------------------------------------------------------------------------
+# -- one token, by hand ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -77,8 +76,7 @@ def test_a_draw_is_allowed_and_possible(
     assert drawn(barred, None, heat, u) < len(values)
 
 
-# -- a real tiny model
-# --------------------------------------------------------------------------------------
+# -- a real tiny model -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -180,8 +178,7 @@ def test_tokens_come_as_often_as_the_model_says(tiny: Path) -> None:
         assert abs(texts.count(text) / n - expected) < 4 * (expected * (1 - expected) / n) ** 0.5
 
 
-# -- what a server is sent
-# ----------------------------------------------------------------------------------
+# -- what a server is sent -------------------------------------------------------------------------
 
 
 def test_a_server_is_sent_temperature_and_seed() -> None:
@@ -198,8 +195,7 @@ def test_a_server_is_sent_temperature_and_seed() -> None:
     assert (greedy["temperature"], greedy["seed"]) == (0, 0)
 
 
-# -- a run
-# --------------------------------------------------------------------------------------------------
+# -- a run -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

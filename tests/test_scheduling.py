@@ -165,8 +165,7 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
     assert (expected[0] == expected[0][0]).all()
 
 
-# -- every schedule
-# ----------------------------------------------------------------------------------------
+# -- every schedule --------------------------------------------------------------------------------
 
 
 def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> ScheduleInputs:

@@ -222,8 +222,7 @@ def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() ->
     assert not same_model({**before, "helpers": 3}, {**now, "helpers": [now]})
 
 
-# -- the cache follows
-# --------------------------------------------------------------------------------------
+# -- the cache follows -----------------------------------------------------------------------------
 
 
 def request(name: str = "s/v1") -> Request:
@@ -267,8 +266,7 @@ def test_a_server_that_cannot_tell_its_weights_is_doubted_once_and_where_it_matt
     )
 
 
-# -- hostile servers
-# ----------------------------------------------------------------------------------------
+# -- hostile servers -------------------------------------------------------------------------------
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),

@@ -65,8 +65,7 @@ def streamed(*deltas: dict[str, Any], finish_reason: str = "stop") -> Stream:
     return stream
 
 
-# -- why it ends
-# --------------------------------------------------------------------------------------------
+# -- why it ends -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("finish", ["error", "abort", "ABORTED", "insufficient_system_resource"])
@@ -106,8 +105,7 @@ def test_any_other_word_says_that_it_is_whole(finish: Any) -> None:
     assert read(completion(GOOD, finish), request()).finish_reason == "stop"
 
 
-# -- refusals
-# -----------------------------------------------------------------------------------------------
+# -- refusals --------------------------------------------------------------------------------------
 
 NO = "I cannot help with driving."
 
@@ -153,8 +151,7 @@ def test_a_refusal_in_one_of_several_orders_is_that_of_all() -> None:
     assert (done.finish_reason, done.text, done.request_id) == ("refusal", NO, "s/v1")
 
 
-# -- contents in parts
-# --------------------------------------------------------------------------------------
+# -- contents in parts -----------------------------------------------------------------------------
 
 TEXT = {"type": "text", "text": GOOD}
 THINKS = {"type": "thinking", "thinking": [{"type": "text", "text": THOUGHT}]}
@@ -219,8 +216,7 @@ def test_whatever_parts_come_are_texts_or_an_error(parts: list[Any]) -> None:
     assert said.error is None or said.error.isprintable()
 
 
-# -- packed bodies
-# ------------------------------------------------------------------------------------------
+# -- packed bodies ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -84,8 +84,7 @@ def opened(*servers: Server, batch_size: int = 4, **options: Any) -> openai_back
     )
 
 
-# -- who is asked
-# -------------------------------------------------------------------------------------------
+# -- who is asked ----------------------------------------------------------------------------------
 
 
 def test_requests_of_a_decision_go_to_one_server_and_each_server_has_some_decisions() -> None:
@@ -210,8 +209,7 @@ def test_a_server_that_is_gone_moves_no_decision_but_its_own(
     assert ranked(left) == ranked(left[::-1]) == [url for url in ranked(urls) if url != gone]
 
 
-# -- who is set aside
-# ---------------------------------------------------------------------------------------
+# -- who is set aside ------------------------------------------------------------------------------
 
 
 def broken(asked: Asked) -> None:
@@ -348,8 +346,7 @@ def test_a_header_that_is_none_says_nothing_on_the_terminal(
     assert caplog.records == []
 
 
-# -- the same model
-# -----------------------------------------------------------------------------------------
+# -- the same model --------------------------------------------------------------------------------
 
 
 def lists(entry: Any, version: str | None = None) -> Play:
@@ -398,8 +395,7 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
     assert identities == [expected, expected]
 
 
-# -- whole runs
-# ---------------------------------------------------------------------------------------------
+# -- whole runs ------------------------------------------------------------------------------------
 
 
 def served_spec(small: Dataset, *urls: str) -> Spec:
@@ -660,8 +656,7 @@ def test_an_interrupted_run_ends_at_once_and_goes_on(small_path: Path, project: 
     assert f"to continue: harness eval --model mine --server {there.url}" in err
 
 
-# -- what is typed
-# ------------------------------------------------------------------------------------------
+# -- what is typed ---------------------------------------------------------------------------------
 
 
 @pytest.fixture

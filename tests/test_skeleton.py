@@ -90,8 +90,7 @@ def played(
             return ids, choices, end.value
 
 
-# -- the text
-# -----------------------------------------------------------------------------------------
+# -- the text --------------------------------------------------------------------------------------
 
 
 def test_the_egos_text_is_a_distribution_with_two_digits_an_action() -> None:
@@ -176,8 +175,7 @@ def test_every_filling_fits_the_schema_and_is_read_as_it_stands(
         assert parsed.intent == pytest.approx(tuple(n / sum(digits) for n in digits))
 
 
-# -- the walk
-# -----------------------------------------------------------------------------------------
+# -- the walk --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("actions", [THREE, FIVE], ids=["three", "five"])

@@ -70,8 +70,7 @@ def said(completions: list[Completion]) -> list[tuple[object, ...]]:
     ]
 
 
-# -- answers
-# ------------------------------------------------------------------------------------------
+# -- answers ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -172,8 +171,7 @@ def test_no_requests_no_completions(backend: LanguageModel) -> None:
     assert backend.complete([]) == []
 
 
-# -- failures that are data
-# ---------------------------------------------------------------------------
+# -- failures that are data ------------------------------------------------------------------------
 
 
 def test_a_prompt_that_leaves_no_room_is_an_error_and_its_neighbours_are_answered(
@@ -225,8 +223,7 @@ def test_ctrl_c_is_no_engine_failure(tiny: Path) -> None:
         opened.complete([ask(0)])
 
 
-# -- what a user can get wrong
-# ------------------------------------------------------------------------
+# -- what a user can get wrong ---------------------------------------------------------------------
 
 
 def remove(pattern: str) -> Callable[[Path], None]:
@@ -413,8 +410,7 @@ def test_a_template_that_refuses_the_messages_is_the_users_to_know(tmp_path: Pat
         open_tiny(tiny_qwen3.build(tmp_path / "gruff", template=template)).complete([ask(0)])
 
 
-# -- identity, place, quiet
-# ---------------------------------------------------------------------------
+# -- identity, place, quiet ------------------------------------------------------------------------
 
 
 def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them(

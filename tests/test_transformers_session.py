@@ -80,8 +80,7 @@ def widths(model: Any) -> Iterator[list[tuple[int, int]]]:
         hook.remove()
 
 
-# -- a session
-# ----------------------------------------------------------------------------------------
+# -- a session -------------------------------------------------------------------------------------
 
 
 shared_beginnings = st.lists(tokens, max_size=20)
@@ -259,8 +258,7 @@ def test_bfloat16_goes_forward_too(qwen: Any) -> None:
         )
 
 
-# -- what prompts begin with in common
-# ----------------------------------------------------------------
+# -- what prompts begin with in common -------------------------------------------------------------
 
 SYSTEM = [(7 * i) % 64 for i in range(40)]
 

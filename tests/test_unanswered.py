@@ -392,8 +392,7 @@ def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
     assert set(play.bodies) == refused(refuses, before)
 
 
-# -- runs of older versions, which hold errors of the ego
-# -------------------------------------------------
+# -- runs of older versions, which hold errors of the ego ------------------------------------------
 
 
 @pytest.fixture
@@ -443,8 +442,7 @@ def test_it_is_not_replayed(old: Path, harness: Typed) -> None:
     assert "lacks answers, so nothing replays it: HTTP 404" in err
 
 
-# -- the rule, and what a check of a model ends with
-# ------------------------------------------------------
+# -- the rule, and what a check of a model ends with -----------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -45,8 +45,7 @@ def mine(tmp_path: Path) -> None:
     (tmp_path / "models/mine.toml").write_text(CARD.format(weights="a/b", patch_px=16))
 
 
-# -- how it looks
-# --------------------------------------------------------------------------------------------
+# -- how it looks ----------------------------------------------------------------------------------
 
 
 def test_a_character_shows_the_means_of_two_parts_of_a_picture() -> None:
@@ -136,8 +135,7 @@ def test_what_says_json_has_the_digest_and_no_pixels(harness: Harness, small_pat
         }  # fmt: skip
 
 
-# -- how many tokens it has
-# ----------------------------------------------------------------------------------
+# -- how many tokens it has ------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("mine")
@@ -198,8 +196,7 @@ def test_a_processor_that_is_here_is_asked_and_a_difference_ends_with_one(
         )  # fmt: skip
 
 
-# -- what is refused
-# -----------------------------------------------------------------------------------------
+# -- what is refused -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

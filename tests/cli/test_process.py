@@ -78,8 +78,7 @@ def test_a_signal_at_any_moment_of_a_command(tmp_path: Path) -> None:
         assert said in (b"harness: terminated\n", b"")
 
 
-# -- consoles and streams
-# -------------------------------------------------------------------------------
+# -- consoles and streams --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -127,8 +126,7 @@ def test_what_nobody_hears_still_has_its_exit_code(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (2, b""), "an error is no output"
 
 
-# -- surroundings
-# ---------------------------------------------------------------------------------------
+# -- surroundings ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

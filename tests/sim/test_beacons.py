@@ -252,8 +252,7 @@ def test_any_rate_up_to_one_a_frame_has_everybody_heard_at_the_start(hz):
             assert all(0.1 - 1e-9 <= age <= 0.1 + 1 / hz + 0.02 for age in ages)
 
 
-# -- CAM: sent as the vehicle moves
-# ------------------------------------------------------------------------
+# -- CAM: sent as the vehicle moves ----------------------------------------------------------------
 
 
 def cams(scenario, speeds_mps, turn_rad=0.0):
@@ -322,8 +321,7 @@ def test_under_cam_a_lost_beacon_is_still_the_last_one_that_was_sent():
     assert 5 < len(times(0)) < 30
 
 
-# -- beacons over a radio
-# ----------------------------------------------------------------------------------
+# -- beacons over a radio --------------------------------------------------------------------------
 
 
 def heard(dials, seeds=range(3)):

@@ -94,8 +94,7 @@ def repeated(
     return run_repeats(spec, k, out, Watched(done), cache)
 
 
-# -- figures
-# ------------------------------------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------------
 
 
 def test_pairs_that_differ_are_counted() -> None:
@@ -186,8 +185,7 @@ def test_every_figure_has_its_n_and_interval(
     assert len(of.scores) == len({(s.condition, s.metric) for s in of.scores}) == 8 + 3
 
 
-# -- runs
-# ---------------------------------------------------------------------------------------------------
+# -- runs ------------------------------------------------------------------------------------------
 
 
 def test_a_repeat_is_a_run_with_its_own_sampling_seed(
@@ -241,8 +239,7 @@ def test_the_cache_keeps_repeats_apart(small: Dataset, tmp_path: Path, wanderer:
     assert wanderer.asked
 
 
-# -- the command
-# --------------------------------------------------------------------------------------------
+# -- the command -----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -141,8 +141,7 @@ def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
         assert sum(asked[0]) > 0
 
 
-# -- fronts and areas, by hand
-# -----------------------------------------------------------------------------
+# -- fronts and areas, by hand ---------------------------------------------------------------------
 
 
 PLAIN = Success(np.zeros(4, dtype=bool))
@@ -310,8 +309,7 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
     )
 
 
-# -- the commands
-# ------------------------------------------------------------------------------------------
+# -- the commands ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -362,8 +360,7 @@ def test_the_same_twice(stored: ReplayedRun):
         ]
 
 
-# -- learning
-# ----------------------------------------------------------------------------------------------
+# -- learning --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,7 @@ def quiet(done):
     pass
 
 
-# -- ranks, by hand
-# ---------------------------------------------------------------------------------
+# -- ranks, by hand --------------------------------------------------------------------------------
 
 
 def test_an_auc_is_the_share_of_pairs_in_their_order_and_a_tie_is_half():
@@ -67,8 +66,7 @@ def test_layouts_are_drawn_whole():
     assert (often.low, often.high) == pytest.approx((once.low, once.high))
 
 
-# -- the classifier on numbers whose answer is known
-# ------------------------------------------------
+# -- the classifier on numbers whose answer is known -----------------------------------------------
 
 
 @pytest.fixture
@@ -120,8 +118,7 @@ def test_a_number_of_which_one_fold_alone_knows_anything_is_left_out(known):
     assert auc == judge(moments(np.delete(table, 2, axis=1), danger), ("left", "right"))[0]
 
 
-# -- scenarios
-# --------------------------------------------------------------------------------------
+# -- scenarios -------------------------------------------------------------------------------------
 
 
 def telling(seed, parameters):

@@ -147,8 +147,7 @@ def student(once: Any) -> Path:
     return once("student", fill)
 
 
-# -- the teacher
-# ------------------------------------------------------------------------------------
+# -- the teacher -----------------------------------------------------------------------------------
 
 
 def test_the_teacher_wants_what_turned_out_safe_and_least_late() -> None:
@@ -190,8 +189,7 @@ def test_scenes_that_look_alike_are_best_answered_by_their_mean() -> None:
     assert kl_nats(labels, labels) == 0.0
 
 
-# -- what it learns to say
-# --------------------------------------------------------------------------
+# -- what it learns to say -------------------------------------------------------------------------
 
 
 @given(st.data(), st.booleans())
@@ -274,8 +272,7 @@ def test_a_read_out_asks_for_a_letter_alone_as_an_evaluation_does(
     assert "0.90" in told.read_out[-1]["content"], "the messages are there as well"
 
 
-# -- its optimizer
-# ----------------------------------------------------------------------------------
+# -- its optimizer ---------------------------------------------------------------------------------
 
 
 def test_muon_in_float32_goes_where_pytorchs_goes_in_bfloat16() -> None:
@@ -306,8 +303,7 @@ def test_an_orthogonal_factor_has_singular_values_near_one() -> None:
         assert values.max() < 1.3
 
 
-# -- a run
-# ------------------------------------------------------------------------------------------
+# -- a run -----------------------------------------------------------------------------------------
 
 
 def test_it_writes_a_model_that_every_engine_can_take(student: Path) -> None:
@@ -438,8 +434,7 @@ def test_bad_input_writes_nothing(options: list[str], said: str, tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
-# -- data that stay apart
-# ---------------------------------------------------------------------------
+# -- data that stay apart --------------------------------------------------------------------------
 
 
 def test_held_out_layouts_are_in_neither_half_twice(few: list[Lessons]) -> None:

@@ -94,8 +94,7 @@ def open_backend(card: Card, **options: Any) -> Any:
 QUESTIONS = [asked(n) for n in range(3)]
 
 
-# -- an adapter
-# -------------------------------------------------------------------------------------
+# -- an adapter ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -232,8 +231,7 @@ def test_a_card_without_its_adapter_lacks_weights() -> None:
     assert card.record()["adapter"] == "no-such-folder"
 
 
-# -- a training
-# -------------------------------------------------------------------------------------
+# -- a training ------------------------------------------------------------------------------------
 
 
 def test_a_taught_model_is_its_base_and_an_adapter(taught: Path) -> None:
@@ -279,8 +277,7 @@ def test_a_killed_teaching_goes_on_to_the_same_adapter(
     assert (out / name).read_bytes() == (taught / name).read_bytes()
 
 
-# -- what is learnt
-# ----------------------------------------------------------------------------------
+# -- what is learnt --------------------------------------------------------------------------------
 
 
 def test_a_decisions_gradient_is_the_exact_policy_gradient() -> None:

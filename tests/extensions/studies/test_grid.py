@@ -92,8 +92,7 @@ def test_a_stopped_grid_goes_on_and_asks_only_what_is_missing(
         run_cells(spec(small), others, others, tmp_path / "grid", Watched(), None)
 
 
-# -- effects, played by hand
-# --------------------------------------------------------------------------------
+# -- effects, played by hand -----------------------------------------------------------------------
 
 
 def made_up(
