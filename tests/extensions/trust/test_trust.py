@@ -63,7 +63,7 @@ def test_its_cells_are_what_a_run_says_under_the_same_condition(
     assert attacked.value == pytest.approx(
         figure(done, ATTACKED.name, "balanced_success_rate").value
     )
-    alone = bench.counting.mean(bench.alone)
+    alone = bench.success_rule.mean(bench.alone)
     assert alone == pytest.approx(figure(done, "single-local", "balanced_success_rate").value)
 
 
