@@ -426,9 +426,11 @@ def witnesses(run: ReplayedRun) -> Ints:
         elif radios(scenario, scene.state.episode_seed, danger.sector)["danger_radio"]:
             counts.append(HEARD)
         else:
-            graphs = [scene.graphs[helper] for helper in scene.viewers[1:]]
-            seen = [any(node.id == danger.vehicle for node in graph.nodes) for graph in graphs]
-            counts.append(sum(seen))
+            count = 0
+            for helper in scene.viewers[1:]:
+                nodes = scene.graphs[helper].nodes
+                count += any(node.id == danger.vehicle for node in nodes)
+            counts.append(count)
     return np.array(counts)
 
 
@@ -446,8 +448,8 @@ def groups(model: Model) -> dict[str, dict[str, Bools]]:
     for name, number in numbers.items():
         named[name] = {family: of_family == number for family, of_family in counts.items()}
     named["any danger"] = {family: of_family != SAFE for family, of_family in counts.items()}
-    return {
-        name: episodes
-        for name, episodes in named.items()
-        if any(of_family.any() for of_family in episodes.values())
-    }
+    groups = {}
+    for name, episodes in named.items():
+        if any(of_family.any() for of_family in episodes.values()):
+            groups[name] = episodes
+    return groups

@@ -98,9 +98,8 @@ class Play:
         """Messages, milliseconds on air and joules of an episode,
         and milliseconds of a decision.
         """
-        means = dict(
-            zip(COSTS, (self.costs.sum(axis=(0, 1)) / self.success.size).tolist(), strict=True)
-        )
+        of_episode = self.costs.sum(axis=(0, 1)) / self.success.size
+        means = dict(zip(COSTS, of_episode.tolist(), strict=True))
         decisions = means.pop("decisions")
         return {**means, "latency_ms": means["latency_ms"] / decisions}
 
@@ -217,18 +216,21 @@ class Compared:
 
         Without tune layouts the best on these, which flatters them. The first asks nobody.
         """
+
+        def order(ranked: tuple[Play, float]) -> tuple[float, float]:
+            play, rank = ranked
+            return float(play.of(cost).mean()), -rank
+
         taken, best = list[Play](), -np.inf
-        for play, rank in sorted(
-            self._ranked(schedule), key=lambda pair: (pair[0].of(cost).mean(), -pair[1])
-        ):
+        for play, rank in sorted(self._ranked(schedule), key=order):
             if rank > best:
                 taken.append(play)
                 best = rank
         return taken
 
     def _ranked(self, schedule: str) -> list[tuple[Play, float]]:
-        """A schedule's plays, and never asking, each with its success on tune layouts,
-        else its own.
+        """Return a schedule's plays, and never asking, each with its success on tune layouts,
+        without these on its own.
         """
         every = [self.plays[NEVER][0], *(self.plays[schedule] if schedule != NEVER else ())]
         tuned = {play.candidate: play for of in self.tune.values() for play in of}
@@ -276,11 +278,12 @@ class Compared:
     @cached_property
     def rows(self) -> list[Chosen]:
         """The paper's schedule, the chosen candidate of every one, and last the oracle."""
-        plays = [self.paper, *map(self.chosen, self.names), self.oracle]
-        raw = [self.counting.p_value(play.success, self.paper.success) for play in plays[1:-1]]
-        return [
-            self._row(play, p) for play, p in zip(plays, [None, *corrected(raw), None], strict=True)
-        ]
+        chosen = [self.chosen(name) for name in self.names]
+        raw = [self.counting.p_value(play.success, self.paper.success) for play in chosen]
+        rows = [self._row(self.paper, None)]
+        for play, p in zip(chosen, corrected(raw), strict=True):
+            rows.append(self._row(play, p))
+        return [*rows, self._row(self.oracle, None)]
 
     def _row(self, play: Play, p: float | None) -> Chosen:
         counting, success = self.counting, self._successes([play, self.paper, self.oracle])
@@ -369,20 +372,16 @@ def run_schedules(
     every = [*runs, *tune]
     for run in tune:
         layouts(run, "tune", runs)
-    refuse_other(
-        out,
-        "schedule",
-        {
-            "sources": [run.manifest() for run in every],
-            "condition": condition,
-            "schedules": list(names),
-            "budget": budget,
-            "seeds": list(seeds),
-        },
-    )
-    progress.more(
-        sum(run.dataset.scenario.parameters.decisions for run in every) + len(runs) * len(names)
-    )
+    manifest = {
+        "sources": [run.manifest() for run in every],
+        "condition": condition,
+        "schedules": list(names),
+        "budget": budget,
+        "seeds": list(seeds),
+    }
+    refuse_other(out, "schedule", manifest)
+    steps = sum(run.dataset.scenario.parameters.decisions for run in every)
+    progress.more(steps + len(runs) * len(names))
     counting = counted(every)
     compared = [
         compare(run, tune_run, point_of([run], condition), names, seeds, budget, counting, progress)
@@ -405,7 +404,7 @@ def _at(plays: Sequence[Play], candidate: Candidate) -> Play:
 
 
 def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Floats:
-    """Mean over budgets from 0 to `most`, (B,), of the success, (B, P),
+    """Return the mean over budgets from 0 to `most`, (B,), of the success, (B, P),
     of the setting taken at each budget.
 
     At a budget that setting is taken which ranks highest, (P,), of those whose messages,
@@ -511,11 +510,8 @@ def name_of(row: Chosen) -> str:
 
 def headline(compared: Compared) -> list[str]:
     """Say the paper's regret, and what the best schedule within half of its messages closes."""
-    regret, bound, words = (
-        compared.regret,
-        compared.oracle.means["messages"],
-        compared.counting.words,
-    )
+    regret, words = compared.regret, compared.counting.words
+    bound = compared.oracle.means["messages"]
     sentences = [
         f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points "
         f"above that of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), "
@@ -524,23 +520,22 @@ def headline(compared: Compared) -> list[str]:
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
         by_name = {name_of(row): row for row in within}
-        first, *close = compared.counting.most(
-            {name: row.play.success for name, row in by_name.items()}
-        )
+        success = {name: row.play.success for name, row in by_name.items()}
+        first, *close = compared.counting.most(success)
         best = by_name[first]
-        within_budget = (
-            f"Chosen on tune layouts within {100 * compared.budget:g} % of the paper's messages, "
-        )
-        sentences.append(
-            f"{within_budget}no schedule clearly has the most {words}: it is {shown(best.success)} "
-            f"%, and these cannot be told apart there: {some_of([first, *close])}."
-            if close
-            else f"{within_budget}{first} has the most {words}, {shown(best.success)} %, a "
-            "difference of "
-            f"{shown(best.over_paper)} points from the paper's schedule: it closes "
-            f"{shown(best.closed)} % "
-            f"of that gap with {shown(best.messages)} % of the messages."
-        )
+        if close:
+            outcome = (
+                f"no schedule clearly has the most {words}: it is {shown(best.success)} %, and "
+                f"these cannot be told apart there: {some_of([first, *close])}."
+            )
+        else:
+            outcome = (
+                f"{first} has the most {words}, {shown(best.success)} %, a difference of "
+                f"{shown(best.over_paper)} points from the paper's schedule: it closes "
+                f"{shown(best.closed)} % of that gap with {shown(best.messages)} % of the messages."
+            )
+        budget = f"{100 * compared.budget:g} % of the paper's messages"
+        sentences.append(f"Chosen on tune layouts within {budget}, {outcome}")
     return sentences
 
 
@@ -635,37 +630,28 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
         where = {"run": run.name, "condition": run.point.name}
         return {**where, "schedule": of.schedule, "threshold": of.threshold, "max_helpers": of.most}
 
-    schedules = [
-        {
-            **place(run, row.play),
-            "lead": run.counting.metric,
-            **ends("success", row.plain),
-            **(ends("balanced_success", row.success) if run.counting.metric == BALANCED else {}),
-            "n": row.success.n,
-            **row.play.means,
-            **ends("over_paper", row.over_paper),
-            "p_holm": row.p,
-            **ends("over_random", row.over_random),
-            **ends("gap_closed", row.closed),
-            **ends("messages_share", row.messages),
-            **ends("area", row.area),
-            **ends("area_j", row.area_j),
-        }
-        for run in compared
-        for row in run.rows
-    ]
-    settings = [
-        {
-            **place(run, play),
-            **_rates(play),
-            **play.means,
-            **_on_tune(run, play),
-            "on_front": any(play is taken for taken in run.front(play.candidate.schedule)),
-        }
-        for run in compared
-        for plays in run.plays.values()
-        for play in plays
-    ]
+    schedules, settings = list[dict[str, Any]](), list[dict[str, Any]]()
+    for run in compared:
+        for row in run.rows:
+            values = {**place(run, row.play), "lead": run.counting.metric}
+            values |= ends("success", row.plain)
+            if run.counting.metric == BALANCED:
+                values |= ends("balanced_success", row.success)
+            values |= {"n": row.success.n, **row.play.means}
+            values |= ends("over_paper", row.over_paper)
+            values["p_holm"] = row.p
+            values |= ends("over_random", row.over_random)
+            values |= ends("gap_closed", row.closed)
+            values |= ends("messages_share", row.messages)
+            values |= ends("area", row.area)
+            values |= ends("area_j", row.area_j)
+            schedules.append(values)
+        for schedule, plays in run.plays.items():
+            front = run.front(schedule)
+            for play in plays:
+                values = {**place(run, play), **_rates(play), **play.means, **_on_tune(run, play)}
+                values["on_front"] = any(play is taken for taken in front)
+                settings.append(values)
     return {"schedules": pd.DataFrame(schedules), "settings": pd.DataFrame(settings)}
 
 
@@ -675,6 +661,6 @@ def _rates(play: Play) -> dict[str, float]:
 
 
 def _on_tune(run: Compared, play: Play) -> dict[str, float | None]:
-    tuned = {of.candidate: of for of in run.tune.get(play.candidate.schedule, ())}
-    rates = _rates(tuned[play.candidate]) if tuned else {"success": None}
+    on_tune = {each.candidate: each for each in run.tune.get(play.candidate.schedule, ())}
+    rates = _rates(on_tune[play.candidate]) if on_tune else {"success": None}
     return {f"{name}_on_tune": rate for name, rate in rates.items()}

@@ -123,9 +123,8 @@ def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, t
     points = {name: point for run in runs for name, point in run.points.items()}
     core = tuple(Setting(name, point, vehicles) for name, point in points.items())
     size = []
-    for setting in settings(
-        runs, [AXES["size"]], [grid(AXES["size"], f"1:{vehicles}")], conditions
-    ):
+    sizes = grid(AXES["size"], f"1:{vehicles}")
+    for setting in settings(runs, [AXES["size"]], [sizes], conditions):
         coupled = setting.point.changed(density_coupled=True, loss=None)
         size.append(replace(setting, point=coupled))
     loss = settings(runs, [AXES["loss"]], [grid(AXES["loss"])], conditions)
@@ -292,11 +291,12 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
         metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
         metrics = metrics[~metrics.index.duplicated(keep="last")]
         means = [f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values()]
-        title, head, name = f"{source} · {condition} over {panel}", str(panel), _text(value)
         if panel == CORE:
-            title, head, name = str(source), "condition", str(condition)
+            title, axis, name = str(source), "condition", str(condition)
+        else:
+            title, axis, name = f"{source} · {condition} over {panel}", str(panel), _text(value)
         metric = leading(set(metrics.index))
-        heads[title] = head, f"{IN_WORDS[metric]} %, 95 % CI"
+        heads[title] = axis, f"{IN_WORDS[metric]} %, 95 % CI"
         success = percent(metrics.loc[metric], *ESTIMATE)
         rows.setdefault(title, []).append((name, success, *means))
     tables = []
