@@ -76,11 +76,11 @@ class Cell:
     def values(self) -> Mapping[str, Floats]:
         """Success, latency and tokens of a decision, each (C, S, E); NaN where unknown."""
         run = self.run
-        values = by_episode(
-            [METRICS[SUCCESS], METRICS[LATENCY]], run.grid, run.decisions, run.episodes
-        )
-        places, n = run.grid.places(run.decisions), len(run.episodes)
-        return {**values, "tokens": mean_by_place(tokens(run), places, n).reshape(run.grid.shape)}
+        metrics = [METRICS[SUCCESS], METRICS[LATENCY]]
+        values = by_episode(metrics, run.grid, run.decisions, run.episodes)
+        places = run.grid.places(run.decisions)
+        of_episodes = mean_by_place(tokens(run), places, len(run.episodes))
+        return {**values, "tokens": of_episodes.reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
         """Return a metric under a condition, over episodes."""
@@ -89,7 +89,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of level is worth in what leads, averaged over all other factors."""
+    """What a change of level is worth in the headline metric, averaged over all other factors."""
 
     condition: str  # the operating point
     what: str  # the factor and its two levels; two of them for an interaction
@@ -106,7 +106,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Halves:
-    """Shares of the variance of what leads between the cells that each half explains.
+    """Shares of the variance of the headline metric between the cells that each half explains.
 
     What episodes by chance add is taken off, as a bootstrap over episodes says;
     so are intervals made.
@@ -135,10 +135,9 @@ def tokens(run: Run) -> Floats:
         counts = (answer.prompt_tokens, answer.completion_tokens)
         total = math.nan if None in counts else float(sum(c or 0 for c in counts))
         by_scene.setdefault(answer.scene, {}).setdefault(answer.role, []).append(total)
-    means = {
-        scene: [float(np.mean(roles.get(role, [0.0]))) for role in HALVES]
-        for scene, roles in by_scene.items()
-    }
+    means = {}
+    for scene, by_role in by_scene.items():
+        means[scene] = [float(np.mean(by_role.get(role, [0.0]))) for role in HALVES]
     ego, helper = np.array([means[scene] for scene in run.decisions.labels("scene")]).T
     messages = run.decisions["messages"]
     total = ego + np.where(messages > 0, messages * helper, 0.0)
@@ -160,24 +159,23 @@ def run_cells(
     Raises:
         UserError: the folder holds another grid, or a model is not available.
     """
-    opens, asked = cache(open_backend), dict[tuple[str, str], dict[str, Answer]]()
+    opens = cache(open_backend)
+    answers: dict[tuple[str, str], dict[str, Answer]] = {}  # by role and agent, then by id
     cells = []
     pairs = list(product(enumerate(egos, 1), enumerate(helpers, 1)))
     # All are checked first.
     specs = [replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs]
     for ((i, ego), (j, helper)), both in zip(pairs, specs, strict=True):
-        given = {
-            name: answer
-            for (role, of_agent), answers in asked.items()
-            if of_agent == (helper.name if is_helper(role) else ego.name)
-            for name, answer in answers.items()
-        }
+        stored: dict[str, Answer] = {}
+        for (role, of_agent), of_role in answers.items():
+            if of_agent == (helper.name if is_helper(role) else ego.name):
+                stored |= of_role
         folder = out / "cells" / f"{i}-{j}"
-        run = read_or_evaluate(both, folder, progress, cache_file, opens, given)
+        run = read_or_evaluate(both, folder, progress, cache_file, opens, stored)
         for answer in run.answers:
             if answer.role != "merge" and answer.error is None:
                 of_agent = helper.name if is_helper(answer.role) else ego.name
-                asked.setdefault((answer.role, of_agent), {})[answer.id] = answer
+                answers.setdefault((answer.role, of_agent), {})[answer.id] = answer
         cells.append(Cell(ego, helper, run))
     runs = [cell.run for cell in cells]
     episodes = runs[0].episodes[: len(runs[0].grid.episodes)]
@@ -208,15 +206,16 @@ class Grid:
 
     @cached_property
     def factors(self) -> tuple[Factor, ...]:
-        """What has more than one level."""
-        every = (
-            Factor(half, field, tuple(dict.fromkeys(c.level(half, field) for c in self.cells)))
-            for half, field in product(HALVES, FIELDS)
-        )
-        return tuple(factor for factor in every if len(factor.levels) > 1)
+        """The fields of either half that have more than one level."""
+        factors = []
+        for half, field in product(HALVES, FIELDS):
+            levels = tuple(dict.fromkeys(cell.level(half, field) for cell in self.cells))
+            if len(levels) > 1:
+                factors.append(Factor(half, field, levels))
+        return tuple(factors)
 
     def success(self, cell: Cell, condition: str) -> Estimate:
-        """Return what leads of a cell under a condition."""
+        """Return the headline metric of a cell under a condition."""
         return self.counting.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
 
     def name(self, agent: Agent, half: str) -> str:
@@ -227,41 +226,40 @@ class Grid:
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
         """Main effects and interactions of two factors on success, under every condition."""
-        contrasts = [
-            (condition, *contrast)
-            for condition in self.conditions
-            for contrast in (*self._main(condition), *self._interactions(condition))
-        ]
-        p_values = corrected([self.counting.p_value(high, low) for _, _, low, high in contrasts])
-        return tuple(
-            Effect(condition, what, self.counting.difference(high, low), p)
-            for (condition, what, low, high), p in zip(contrasts, p_values, strict=True)
-        )
+        effects, p_values = list[Effect](), list[float | None]()
+        for condition in self.conditions:
+            for name, low, high in (*self._main(condition), *self._interactions(condition)):
+                estimate = self.counting.difference(high, low)
+                effects.append(Effect(condition, name, estimate, None))
+                p_values.append(self.counting.p_value(high, low))
+        pairs = zip(effects, corrected(p_values), strict=True)
+        return tuple(replace(effect, p=p) for effect, p in pairs)
 
     def _mean(self, condition: str, **levels: str) -> Floats:
         """Return mean success of the cells with these levels, by factor's name, (S, E)."""
-        at = self.conditions.index(condition)
-        having = [
-            cell.values[SUCCESS][at]
-            for cell in self.cells
-            if all(cell.level(*name.split()) == wanted for name, wanted in levels.items())
-        ]
-        return np.asarray(np.mean(having, axis=0))
+        place = self.conditions.index(condition)
+        wanted = [(*name.split(), level) for name, level in levels.items()]
+        successes = []
+        for cell in self.cells:
+            if all(cell.level(half, field) == level for half, field, level in wanted):
+                successes.append(cell.values[SUCCESS][place])
+        return np.asarray(np.mean(successes, axis=0))
 
     def _main(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for factor in self.factors:
             base, *levels = factor.levels
+            low = self._mean(condition, **{factor.name: base})
             for new_level in levels:
-                low, high = (self._mean(condition, **{factor.name: at}) for at in (base, new_level))
+                high = self._mean(condition, **{factor.name: new_level})
                 yield f"{factor.name}: {base} → {new_level}", low, high
 
     def _interactions(self, condition: str) -> Iterator[tuple[str, Floats, Floats]]:
         for a, b in combinations(self.factors, 2):
             for x, y in product(a.levels[1:], b.levels[1:]):
-                low_low, low_high, high_low, high_high = (
-                    self._mean(condition, **{a.name: of_a, b.name: of_b})
-                    for of_a, of_b in product((a.levels[0], x), (b.levels[0], y))
-                )
+                low_low = self._mean(condition, **{a.name: a.levels[0], b.name: b.levels[0]})
+                low_high = self._mean(condition, **{a.name: a.levels[0], b.name: y})
+                high_low = self._mean(condition, **{a.name: x, b.name: b.levels[0]})
+                high_high = self._mean(condition, **{a.name: x, b.name: y})
                 name = f"{a.name} → {x} × {b.name} → {y}"
                 yield name, (high_low + low_high) / 2, (low_low + high_high) / 2
 
@@ -354,41 +352,36 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
     from harness.studies.figures.heat_map import heat_map
     from harness.studies.figures.points import Steps, fronts
 
-    rates = {c: [100 * grid.success(cell, c).value for cell in grid.cells] for c in grid.conditions}
-    steps = []
-    for c, colour in conditions(grid.conditions).items():
-        best = front(grid, c)
-        look: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
-        steps += [
-            Steps(
-                c,
-                [cell.estimate(LATENCY, c).value for cell in grid.cells],
-                rates[c],
-                look | {"linestyle": ""},
-            ),
-            Steps(
-                "",
-                [cell.estimate(LATENCY, c).value for cell in best],
-                [100 * grid.success(cell, c).value for cell in best],
-                look,
-                pair(grid, best[-1]),
-            ),
-        ]
+    def latencies_ms(cells: Sequence[Cell], condition: str) -> list[float]:
+        return [cell.estimate(LATENCY, condition).value for cell in cells]
+
+    def percents(cells: Sequence[Cell], condition: str) -> list[float]:
+        return [100 * grid.success(cell, condition).value for cell in cells]
+
+    panels, steps = {}, []
+    for name, colour in conditions(grid.conditions).items():
+        rates, best = percents(grid.cells, name), front(grid, name)
+        panels[name] = np.array(rates).reshape(grid.rows, grid.columns)
+        marker: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
+        points = marker | {"linestyle": ""}
+        steps.append(Steps(name, latencies_ms(grid.cells, name), rates, points))
+        x, y = latencies_ms(best, name), percents(best, name)
+        steps.append(Steps("", x, y, marker, pair(grid, best[-1])))
+    egos = [grid.name(cell.ego, "ego") for cell in grid.cells[:: grid.columns]]
+    helpers = [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]]
     return {
-        "heat-map": heat_map(
-            {c: np.array(rates[c]).reshape(grid.rows, grid.columns) for c in grid.conditions},
-            [grid.name(grid.cells[i * grid.columns].ego, "ego") for i in range(grid.rows)],
-            [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]],
-            "ego",
-            "helpers",
-        ),
+        "heat-map": heat_map(panels, egos, helpers, "ego", "helpers"),
         "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
     }
 
 
 def headline(grid: Grid) -> list[str]:
     """Say under each condition which half matters, or that none can be told to."""
-    return [_halves(grid, h) if (h := grid.halves(c)) else _range(grid, c) for c in grid.conditions]
+    sentences = []
+    for condition in grid.conditions:
+        halves = grid.halves(condition)
+        sentences.append(_halves(grid, halves) if halves else _range(grid, condition))
+    return sentences
 
 
 def _range(grid: Grid, condition: str) -> str:
@@ -422,13 +415,14 @@ def front(grid: Grid, condition: str) -> list[Cell]:
     def success(cell: Cell) -> float:
         return grid.success(cell, condition).value
 
-    taken: list[Cell] = []
-    for cell in sorted(
-        grid.cells, key=lambda cell: (cell.estimate(LATENCY, condition).value, -success(cell))
-    ):
-        if not taken or success(cell) > success(taken[-1]):
-            taken.append(cell)
-    return taken
+    def order(cell: Cell) -> tuple[float, float]:
+        return cell.estimate(LATENCY, condition).value, -success(cell)
+
+    best: list[Cell] = []
+    for cell in sorted(grid.cells, key=order):
+        if not best or success(cell) > success(best[-1]):
+            best.append(cell)
+    return best
 
 
 def pair(grid: Grid, cell: Cell) -> str:
@@ -440,19 +434,12 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
     best = {cell.run.path for cell in front(grid, condition)}
     place, rows = beside(out / "index.html"), []
     for cell in sorted(grid.cells, key=lambda cell: -grid.success(cell, condition).value):
-        run = f"cells/{cell.run.path.name}"
+        success = shown(grid.success(cell, condition))
         latency = f"{cell.estimate(LATENCY, condition).value:.1f}{' ◆' * (cell.run.path in best)}"
-        report = place(cell.run)
-        rows.append(
-            (
-                pair(grid, cell),
-                shown(grid.success(cell, condition)),
-                latency,
-                PLAIN.number(cell.estimate("tokens", condition).value),
-                f"{cell.ego.name} + {cell.helper.name}",
-                linked(run, report),
-            )
-        )
+        tokens_of_decision = PLAIN.number(cell.estimate("tokens", condition).value)
+        agents = f"{cell.ego.name} + {cell.helper.name}"
+        run = linked(f"cells/{cell.run.path.name}", place(cell.run))
+        rows.append((pair(grid, cell), success, latency, tokens_of_decision, agents, run))
     heads = (
         "ego + helpers",
         f"{grid.counting.words} %, 95 % CI",
@@ -469,11 +456,10 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
 
 
 def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
-    known = [e for e in grid.effects if e.condition == condition and not np.isnan(e.estimate.value)]
-    rows = [
-        (e.what, shown(e.estimate), p_cell(e.p))
-        for e in sorted(known, key=lambda e: -abs(e.estimate.value))
-    ]
+    effects = [effect for effect in grid.effects if effect.condition == condition]
+    effects = [effect for effect in effects if not np.isnan(effect.estimate.value)]
+    effects.sort(key=lambda effect: -abs(effect.estimate.value))
+    rows = [(effect.what, shown(effect.estimate), p_cell(effect.p)) for effect in effects]
     return Table(
         f"Effect of each choice, {condition}",
         ("effect", "points, 95 % CI", "p"),
@@ -491,35 +477,22 @@ def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
     """Return `cells` and `effects` as data frames: an estimate with its interval a row."""
     import pandas as pd
 
-    def who(cell: Cell) -> Mapping[str, str]:
-        return {f"{half}_{field}": cell.level(half, field) for half in HALVES for field in FIELDS}
+    def row(cell: Cell, condition: str, metric: str, estimate: Estimate) -> dict[str, Any]:
+        levels = {f"{half}_{field}": cell.level(half, field) for half, field in factors}
+        place = {"run": cell.run.path.name, "condition": condition, "metric": metric}
+        return {**levels, **place, **ends(estimate)}
 
-    cells = [
-        {
-            **who(cell),
-            "run": cell.run.path.name,
-            "condition": c,
-            "metric": m,
-            **ends(cell.estimate(m, c)),
-        }
-        for cell in grid.cells
-        for c in grid.conditions
-        for m in cell.values
-    ]
-    if (lead := grid.counting.metric) != SUCCESS:
-        cells += [
-            {
-                **who(cell),
-                "run": cell.run.path.name,
-                "condition": c,
-                "metric": lead,
-                **ends(grid.success(cell, c)),
-            }
-            for cell in grid.cells
-            for c in grid.conditions
-        ]
-    effects = [
-        {"condition": e.condition, "effect": e.what, **ends(e.estimate), "p_holm": e.p}
-        for e in grid.effects
-    ]
+    factors = list(product(HALVES, FIELDS))
+    places = list(product(grid.cells, grid.conditions))
+    cells = list[dict[str, Any]]()
+    for cell, condition in places:
+        for metric in cell.values:
+            cells.append(row(cell, condition, metric, cell.estimate(metric, condition)))
+    if grid.counting.metric != SUCCESS:
+        for cell, condition in places:
+            cells.append(row(cell, condition, grid.counting.metric, grid.success(cell, condition)))
+    effects = []
+    for effect in grid.effects:
+        values = {"condition": effect.condition, "effect": effect.what, **ends(effect.estimate)}
+        effects.append({**values, "p_holm": effect.p})
     return {"cells": pd.DataFrame(cells), "effects": pd.DataFrame(effects)}
