@@ -256,11 +256,10 @@ def _left_out(
 
 def rows(result: Attribution) -> list[Row]:
     """Return a row for each kind of thing that was left out; intervals are over episodes."""
-    return [
-        _row(role, kind, some)
-        for role, kind in KINDS
-        if (some := [each for each in result.left_out if (each.role, each.kind) == (role, kind)])
-    ]
+    by_kind: dict[tuple[str, str], list[LeftOut]] = {}
+    for each in result.left_out:
+        by_kind.setdefault((each.role, each.kind), []).append(each)
+    return [_row(*kind, by_kind[kind]) for kind in KINDS if kind in by_kind]
 
 
 def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
@@ -286,7 +285,7 @@ def _what(row: Row) -> str:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """Say what moved most, or that nothing clearly did."""
+    """Say which kind of thing moved answers most, or that none clearly did."""
     known = [row for row in table if row.shift.n]
     if not known:
         return (
@@ -310,29 +309,22 @@ def headline(table: Sequence[Row]) -> str:
 
 def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
     """Declare the study of what was left out, of which `harness report` shows every decision."""
-    table, parts = rows(result), ("shift", "flips", "failed")
+    table, cells, plain_rows = rows(result), list[Sequence[str]](), list[dict[str, Any]]()
+    for row in table:
+        shift, flips = figure(row.shift, SHIFT), figure(row.flips)
+        failed, n = PERCENT.number(row.failed.value), str(row.shift.n)
+        cells.append((row.kind, row.role, shift, flips, failed, n))
+        estimates = {"shift": row.shift, "flips": row.flips, "failed": row.failed}
+        values = {name: as_mapping(estimate) for name, estimate in estimates.items()}
+        plain_rows.append({"role": row.role, "kind": row.kind, **values})
     answer = {
         "run": str(run.run.path),
         "condition": result.condition,
         "decision_points": result.decision_points,
         "of": result.of,
         "sample_seed": result.sample_seed,
-        "rows": [
-            {"role": row.role, "kind": row.kind, **{n: as_mapping(getattr(row, n)) for n in parts}}
-            for row in table
-        ],
+        "rows": plain_rows,
     }
-    cells = [
-        (
-            r.kind,
-            r.role,
-            figure(r.shift, SHIFT),
-            figure(r.flips),
-            PERCENT.number(r.failed.value),
-            str(r.shift.n),
-        )
-        for r in table
-    ]
     return Study(
         "attribution",
         f"{run.name} · {run.run.source}",

@@ -28,15 +28,14 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     markers = {model: MARKERS[n % len(MARKERS)] for n, model in enumerate(dict.fromkeys(models))}
     colours = conditions(table.condition)
     for model, (_, row) in zip(models, table.iterrows(), strict=True):
-        (x, *x_ends), (y, *y_ends) = (
-            100 * np.array([row[f"{world}{end}"] for end in ("", "_low", "_high")])
-            for world in ("frozen", "closed")
-        )
+        x, y = 100 * row["frozen"], 100 * row["closed"]
+        x_ends = 100 * np.array([[row["frozen_low"]], [row["frozen_high"]]])
+        y_ends = 100 * np.array([[row["closed_low"]], [row["closed_high"]]])
         axes.errorbar(
             x,
             y,
-            np.abs(np.array([y_ends]).T - y),
-            np.abs(np.array([x_ends]).T - x),
+            np.abs(y_ends - y),
+            np.abs(x_ends - x),
             color=colours[row["condition"]],
             marker=markers[model],
             markersize=4.5,

@@ -109,26 +109,25 @@ def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
     run = read(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
     rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
-    return run.world, pd.DataFrame(rows, columns=list(columns)).assign(
-        **asdict(run.manifest.variant)
-    )
+    table = pd.DataFrame(rows, columns=list(columns))
+    return run.world, table.assign(**asdict(run.manifest.variant))
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
-    for place, group in both.groupby([*WHO, "condition"], sort=False):
-        wide = group.pivot(
-            index="seed", columns="layout_seed", values=["success_frozen", "success_closed"]
-        )
-        frozen, closed = (
-            wide[f"success_{kind}"].to_numpy(dtype=float) for kind in ("frozen", "closed")
-        )
-        row = dict(zip((*WHO, "condition"), place, strict=True))
-        for name, e in compared(frozen, closed).items():
-            row |= {
-                f"{name}{end}": value
-                for end, value in zip(ENDS, (e.value, e.low, e.high), strict=True)
-            }
-        yield {**row, "n": group.layout_seed.nunique()}
+    """Yield a row of `Fidelity.table` for each model, prompt, answer mode and condition."""
+    columns = [*WHO, "condition"]
+    for place, group in both.groupby(columns, sort=False):
+        values = ["success_frozen", "success_closed"]
+        wide = group.pivot(index="seed", columns="layout_seed", values=values)
+        frozen = wide["success_frozen"].to_numpy(dtype=float)
+        closed = wide["success_closed"].to_numpy(dtype=float)
+        row = dict(zip(columns, place, strict=True))
+        for name, estimate in compared(frozen, closed).items():
+            row[name] = estimate.value
+            row[f"{name}_low"] = estimate.low
+            row[f"{name}_high"] = estimate.high
+        row["n"] = group.layout_seed.nunique()
+        yield row
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
@@ -149,8 +148,13 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
     """Declare the study of a comparison."""
     from harness.studies.study import Study, percent
 
-    rows: list[dict[Any, Any]] = result.table.to_dict("records")
-    differing = disagreements(result.episodes).head(SHOWN).to_dict("records")
+    rows, ends_rows = list[Sequence[str]](), list[Sequence[str]]()
+    for row in result.table.to_dict("records"):
+        cells = [percent(row, name, f"{name}_low", f"{name}_high") for name in COMPARED]
+        rows.append((_place(row), *cells, str(row["n"])))
+    for row in disagreements(result.episodes).head(SHOWN).to_dict("records"):
+        ends = (row["frozen_end"], row["closed_end"], str(row["count"]))
+        ends_rows.append((_place(row), *ends))
     heads = (PLACE, "frozen %", "closed loop %", "difference, points", "same %", "n")
     ends_heads = (PLACE, "end on frozen scenes", "end in closed loop", "episodes × seeds")
     return Study(
@@ -168,30 +172,8 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
             "figure's dashed line succeeds less often in closed loop.",
         ],
         [
-            Table(
-                "Side by side",
-                heads,
-                [
-                    (
-                        _place(row),
-                        *(percent(row, *(name + end for end in ENDS)) for name in COMPARED),
-                        str(row["n"]),
-                    )
-                    for row in rows
-                ],
-                terminal=(0, 1, 2, 3, 4),
-            ),
-            Table(
-                "Where they disagree",
-                ends_heads,
-                [
-                    (
-                        _place(row),
-                        *(str(row[name]) for name in ("frozen_end", "closed_end", "count")),
-                    )
-                    for row in differing
-                ],
-            ),
+            Table("Side by side", heads, rows, terminal=(0, 1, 2, 3, 4)),
+            Table("Where they disagree", ends_heads, ends_rows),
         ],
         {"fidelity": result.table, "episodes": result.episodes},
         {"sources": [{"name": str(run)} for run in runs], "versions": versions()},
