@@ -6,6 +6,7 @@ the same layout, condition and channel seed.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +109,7 @@ def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
 
     run = read(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
-    rows = [[getattr(episode, name) for name in columns] for episode in run.episodes]
+    rows = [attrgetter(*columns)(episode) for episode in run.episodes]
     table = pd.DataFrame(rows, columns=list(columns))
     return run.world, table.assign(**asdict(run.manifest.variant))
 

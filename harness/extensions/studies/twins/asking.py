@@ -67,17 +67,20 @@ class Questions:
 
     def points(self) -> dict[int, list[str]]:
         """Return decision points by episode: of each step one of those on the drivers' courses."""
-        forest, drawn = self.dataset.forest, dict[int, dict[int, str]]()
+        forest = self.dataset.forest
+        drawn: dict[int, dict[int, str]] = {}  # by episode and step
 
         def draw(scene: str) -> float:
             return float(noise.uniforms((1,), "twins", self.seed, scene)[0])
 
         for scene in sorted(self.dataset.courses(), key=draw):
-            at = forest.place[scene]
-            drawn.setdefault(int(forest.episodes[forest.tree[at]]), {}).setdefault(
-                int(forest.step[at]), scene
-            )
-        return {episode: [of[step] for step in sorted(of)] for episode, of in sorted(drawn.items())}
+            place = forest.place[scene]
+            episode, step = int(forest.episodes[forest.tree[place]]), int(forest.step[place])
+            drawn.setdefault(episode, {}).setdefault(step, scene)
+        points = {}
+        for episode, by_step in sorted(drawn.items()):
+            points[episode] = [by_step[step] for step in sorted(by_step)]
+        return points
 
     def count(self) -> int:
         """Return how many decision points were drawn."""
@@ -208,32 +211,32 @@ def _asked(
         return cached(opened(spec.ego.card, **spec.opening), spec.ego.card, cache)
 
     asker = Asker(spec, backend, PAPER, place and _answers_file(place, number), kept)
-    twins = [twin for twin in map(TWINS.__getitem__, questions.twins) if lack(spec, twin) is None]
-    asked_of = {scene.id: list(requests(spec, [scene])) for scene in scenes}
+    every_twin = [TWINS[name] for name in questions.twins]
+    twins = [twin for twin in every_twin if lack(spec, twin) is None]
+    of_scenes = {scene.id: list(requests(spec, [scene])) for scene in scenes}
+    first = list[Request]()
     # Fusion calls have the helpers' messages, which are there first.
-    fused = any(twin.senders for twin in twins)
-    first = [request for of in asked_of.values() for request in of] if fused else []
+    if any(twin.senders for twin in twins):
+        first = [request for of_scene in of_scenes.values() for request in of_scene]
     asker.ask(first)
-    asked = [
-        each
-        for scene in scenes
-        for twin in twins
-        for each in (
-            _fusion(spec, twin, scene, asker.answers)
-            if twin.senders
-            else _twins(spec, twin, scene, asked_of[scene.id])
-        )
-    ]
-    known = {request.id for request in first}
-    then = {
-        request.id: request for *_, a, b in asked for request in (a, b) if request.id not in known
-    }
+    asked = list[Asked]()
+    for scene in scenes:
+        for twin in twins:
+            if twin.senders:
+                asked += _fusion(spec, twin, scene, asker.answers)
+            else:
+                asked += _twins(spec, twin, scene, of_scenes[scene.id])
+    answered = {request.id for request in first}
+    then: dict[str, Request] = {}
+    for *_, question, copy in asked:
+        then |= {each.id: each for each in (question, copy) if each.id not in answered}
     asker.ask(list(then.values()))
-    pairs = [
-        _pair(spec, each, number, asker.answers)
-        for each in asked
-        if all(asker.answers[request.id].error is None for request in each[2:])
-    ]
+    pairs = []
+    for twin_of_question in asked:
+        *_, question, copy = twin_of_question
+        errors = (asker.answers[question.id].error, asker.answers[copy.id].error)
+        if errors == (None, None):
+            pairs.append(_pair(spec, twin_of_question, number, asker.answers))
     return pairs, list(asker.answers.values())
 
 

@@ -65,20 +65,22 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
     """Return a row a twin and role that was asked."""
-    return [
-        _row(twin, role, some)
-        for twin in twins
-        for role in ROLES
-        if (some := [pair for pair in pairs if (pair.twin, pair.role) == (twin.name, role)])
-    ]
+    by_place: dict[tuple[str, str], list[Pair]] = {}  # by twin and role
+    for pair in pairs:
+        by_place.setdefault((pair.twin, pair.role), []).append(pair)
+    rows = []
+    for twin in twins:
+        for role in ROLES:
+            if (twin.name, role) in by_place:
+                rows.append(_row(twin, role, by_place[twin.name, role]))
+    return rows
 
 
 def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
     episodes = np.array([pair.episode for pair in pairs])
     apart = np.array([np.nan if pair.distance is None else pair.distance for pair in pairs])
-    broken = sorted(
-        (pair for pair in pairs if not pair.holds), key=lambda pair: -(pair.distance or 0.0)
-    )
+    broken = [pair for pair in pairs if not pair.holds]
+    broken.sort(key=lambda pair: -(pair.distance or 0.0))
     return Row(
         twin,
         role,

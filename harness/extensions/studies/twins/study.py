@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from difflib import SequenceMatcher
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from markupsafe import Markup, escape
 
 from harness.core.figures import PERCENT, Unit, as_mapping, shown
 from harness.core.files import write_whole
+from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.extensions.studies.twins.asking import Questions, lack
 from harness.extensions.studies.twins.declared import TWINS, Twin
@@ -45,8 +45,12 @@ HEADS = (
 
 def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
     """Write every pair of answers as a line of `pairs.jsonl`."""
-    lines = [{k: v for k, v in asdict(pair).items() if k != "messages"} for pair in pairs]
-    write_whole(out / "pairs.jsonl", b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+    lines = []
+    for pair in pairs:
+        values = asdict(pair)
+        del values["messages"]
+        lines.append(msgspec.json.encode(values) + b"\n")
+    write_whole(out / "pairs.jsonl", b"".join(lines))
 
 
 def twins_study(
@@ -94,24 +98,19 @@ def _figure(rows: Sequence[Row]) -> "Figure":
     from harness.studies.figures.points import Rows, intervals
 
     names = list(dict.fromkeys(row.twin.name for row in rows))
-    by_place = {(row.twin.name, row.role): row for row in rows}
-    roles = [role for role in ROLES if any(row.role == role for row in rows)]
+    invariance: dict[str, list[Estimate | None]] = {}  # by role, of each name
+    distance: dict[str, list[Estimate | None]] = {}
+    for role in ROLES:
+        of_role = {row.twin.name: row for row in rows if row.role == role}
+        if of_role:
+            invariance[role], distance[role] = [], []
+            for name in names:
+                row = of_role.get(name)
+                invariance[role].append(None if row is None else row.invariance_rate)
+                distance[role].append(None if row is None else row.tv_distance)
     panels = [
-        Rows(
-            quantity,
-            names,
-            {
-                role: [
-                    estimate(row) if (row := by_place.get((name, role))) else None for name in names
-                ]
-                for role in roles
-            },
-            scale,
-        )
-        for quantity, scale, estimate in (
-            ("invariant, %", 100.0, attrgetter("invariance_rate")),
-            ("TV distance", 1.0, attrgetter("tv_distance")),
-        )
+        Rows("invariant, %", names, invariance, 100.0),
+        Rows("TV distance", names, distance, 1.0),
     ]
     return intervals(panels, COLOUR_OF_ROLE)
 
@@ -138,11 +137,10 @@ def _cells(questions: Questions, row: Row) -> list[str]:
 
 
 def _examples(actions: Sequence[str], rows: Sequence[Row]) -> Markup:
-    examples = [
-        (row, n, pair, list(difference(*pair.messages)))
-        for row in rows
-        for n, pair in enumerate(row.broken[:EXAMPLES], 1)
-    ]
+    examples = []
+    for row in rows:
+        for n, pair in enumerate(row.broken[:EXAMPLES], 1):
+            examples.append((row, n, pair, list(difference(*pair.messages))))
     template = environment(Path(__file__).parent).get_template("examples.html.j2")
     return Markup(template.render(actions=actions, examples=examples))
 
@@ -151,43 +149,38 @@ def mapping(
     questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
 ) -> dict[str, Any]:
     """Return the result as plain values; null where there is no number."""
-    table = [
-        {
-            "twin": row.twin.name,
-            "role": row.role,
-            "holds": row.twin.holds,
-            "episodes": row.episodes,
-            "holds_of_constant": constant_holds(questions, row.twin),
-            **{metric: as_mapping(getattr(row, metric)) for metric in METRICS},
-        }
-        for row in rows
-    ]
-    spec = questions.spec
-    plain: dict[str, Any] = msgspec.to_builtins(
-        {
-            **spec.ego.settings(),
-            "world": spec.source.record(),
-            "seed": questions.seed,
-            "decision_points": questions.count(),
-            "rows": table,
-            "left_out": missing(questions, rows),
-            **({"unanswered": unanswered} if unanswered else {}),
-            "gates": [
-                {"gate": v.gate, "passed": not v.failed, "failed": dict(v.failed)} for v in verdicts
-            ],
-        }
-    )
+    table, gates = list[dict[str, Any]](), list[dict[str, Any]]()
+    for row in rows:
+        place = {"twin": row.twin.name, "role": row.role, "holds": row.twin.holds}
+        of_constant = constant_holds(questions, row.twin)
+        counts = {"episodes": row.episodes, "holds_of_constant": of_constant}
+        estimates = {metric: as_mapping(getattr(row, metric)) for metric in METRICS}
+        table.append({**place, **counts, **estimates})
+    for verdict in verdicts:
+        failed = dict(verdict.failed)
+        gates.append({"gate": verdict.gate, "passed": not failed, "failed": failed})
+    result = {
+        **questions.spec.ego.settings(),
+        "world": questions.spec.source.record(),
+        "seed": questions.seed,
+        "decision_points": questions.count(),
+        "rows": table,
+        "left_out": missing(questions, rows),
+    }
+    if unanswered:
+        result["unanswered"] = unanswered
+    plain: dict[str, Any] = msgspec.to_builtins({**result, "gates": gates})
     return plain
 
 
 def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
     """Return the twins that no question has, and what they need."""
-    asked = {row.twin.name for row in rows}
-    return {
-        n: lack(questions.spec, TWINS[n]) or TWINS[n].needs
-        for n in questions.twins
-        if n not in asked
-    }
+    with_rows = {row.twin.name for row in rows}
+    needs = {}
+    for name in questions.twins:
+        if name not in with_rows:
+            needs[name] = lack(questions.spec, TWINS[name]) or TWINS[name].needs
+    return needs
 
 
 def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> list[str]:
@@ -195,13 +188,13 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
     by_need = dict[str, list[str]]()
     for name, need in missing(questions, rows).items():
         by_need.setdefault(need, []).append(name)
-    sentences = [same_answer(questions, rows)]
+    sentences = []
     if not questions.spec.ego.can.language_model:
-        who = questions.spec.ego.card.name
-        sentences.insert(
-            0,
-            f"{who} reads the scene graph and not the text, so this says nothing about the prompt.",
+        sentences.append(
+            f"{questions.spec.ego.card.name} reads the scene graph and not the text, so this says "
+            "nothing about the prompt."
         )
+    sentences.append(same_answer(questions, rows))
     for need, names in by_need.items():
         sentences.append(f"Left out, since no question has it: {', '.join(names)} (needs {need}).")
     if unanswered:
@@ -220,15 +213,14 @@ def constant_holds(questions: Questions, twin: Twin) -> bool:
 
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
     """Say what these twins would say of an ego that reads nothing."""
-    broken = list(
-        dict.fromkeys(row.twin.name for row in rows if not constant_holds(questions, row.twin))
+    broken = [row.twin.name for row in rows if not constant_holds(questions, row.twin)]
+    twins = "every twin"
+    if broken:
+        names = ", ".join(dict.fromkeys(broken))
+        twins = f"every twin but {names}, of which it holds 0 %"
+    return (
+        f"An ego that always gives the same answer holds 100 % of {twins}: to hold is not to read."
     )
-    but = (
-        f" of every twin but {', '.join(broken)}, of which it holds 0 %"
-        if broken
-        else " of every twin"
-    )
-    return f"An ego that always gives the same answer holds 100 %{but}: to hold is not to read."
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
@@ -240,16 +232,12 @@ def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
         if kind != "equal":
             before, after = "\n".join(old[i:j]).split(" "), "\n".join(new[k:n]).split(" ")
             changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
-            sides = (
-                ("-", before, [(kind, start, end) for kind, start, end, *_ in changes]),
-                ("+", after, [(kind, start, end) for kind, *_, start, end in changes]),
-            )
-            for sign, words, parts in sides:
-                if any(words):
-                    shown = (
-                        _word(words[start:end], kind) for kind, start, end in parts if start < end
-                    )
-                    yield sign, Markup(" ").join(shown)
+            removed = [(kind, before[start:end]) for kind, start, end, *_ in changes]
+            added = [(kind, after[start:end]) for kind, *_, start, end in changes]
+            for sign, line, parts in (("-", before, removed), ("+", after, added)):
+                if any(line):
+                    pieces = [_word(words, kind) for kind, words in parts if words]
+                    yield sign, Markup(" ").join(pieces)
 
 
 def _word(words: Sequence[str], kind: str) -> Markup:
