@@ -70,13 +70,15 @@ def unread(run: Run) -> Iterator[str]:
 def causes(run: Run) -> Iterator[str]:
     """Yield how many of each role's answers could not be read, and the commonest cause of it."""
     meanings = {str(status): status.meaning for status in Status}
-    rates = {role: run.score(ALL, f"failed_rate_{role}") for role in _FAILED}
-    for role in [role for role, rate in rates.items() if rate and rate.value]:
+    for role, (whose, _) in _FAILED.items():
+        rate = run.score(ALL, f"failed_rate_{role}")
+        if not rate or not rate.value:
+            continue
         failed, n = run.answered.failed.get(role, Counter()), run.answered.count[role]
         for status, count in failed.most_common(1):
             meaning = meanings.get(status, "it is not said").rstrip(".")
             yield (
-                f"{failed.total()} of {_FAILED[role][0]} {n} answers could not be read. The "
+                f"{failed.total()} of {whose} {n} answers could not be read. The "
                 f"commonest cause, {count} of {failed.total()}: {meaning[0].lower()}{meaning[1:]} "
                 f"({printable(status, 30)})."
             )
@@ -100,9 +102,8 @@ def saturated(run: Run) -> Iterator[str]:
     """Yield each half of balanced success that is 0 or 100 % under every condition,
     as it can say nothing.
     """
-    for name, where in zip(
-        entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True
-    ):
+    halves = zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True)
+    for name, where in halves:
         scores = [run.score(condition, name) for condition in run.conditions]
         values = {None if score is None else score.value for score in scores}
         if values in ({0.0}, {1.0}) and len(scores) > 1:
@@ -117,9 +118,8 @@ def saturated(run: Run) -> Iterator[str]:
 
 def earlier_gains(run: Run) -> Iterator[str]:
     """Yield that gains have the intervals of older rules."""
-    if any(
-        score.metric in GAINS.values() and score.interval == pinned.KIND for score in run.scores
-    ):
+    gains = [score for score in run.scores if score.metric in GAINS.values()]
+    if any(score.interval == pinned.KIND for score in gains):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
 
 
@@ -194,11 +194,11 @@ def unmeasured(run: Run) -> Iterator[str]:
 
 def doubted(*runs: Run) -> set[str]:
     """Return the conditions of these runs that a warning is about."""
-    return {
-        name
-        for run in runs
-        for name in doubts.doubted(run.manifest.conditions, _channels(run.manifest), _off_lag(run))
-    }
+    names = set[str]()
+    for run in runs:
+        manifest = run.manifest
+        names |= set(doubts.doubted(manifest.conditions, _channels(manifest), _off_lag(run)))
+    return names
 
 
 def _hits(share: Score) -> int:
@@ -228,9 +228,8 @@ def by_letter(run: Run) -> Iterator[str]:
     where they were read over cyclic orders.
     """
     for role, (whose, _) in _FAILED.items():
-        share, follows = (
-            run.score(ALL, f"{what}_{role}") for what in ("letter_share", "follows_letter")
-        )
+        share = run.score(ALL, f"letter_share_{role}")
+        follows = run.score(ALL, f"follows_letter_{role}")
         if share and follows and (share.value or 0.0) > MOST_SHARE:
             yield (
                 f"{100 * (share.value or 0.0):.0f} % of what {whose} read-outs say follows the "
@@ -245,7 +244,7 @@ def unheard(run: Run) -> Iterator[str]:
     and every one of them too late to be heard.
     """
     d = run.decisions
-    delivered, on_time = (d.of_messages(name) == 1.0 for name in ("delivered", "on_time"))
+    delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
     conditions = d.codes("condition", run.conditions)
     for place, name in enumerate(run.conditions):
         arrived = int(delivered[conditions == place].sum())
@@ -257,7 +256,7 @@ def unheard(run: Run) -> Iterator[str]:
 
 
 def lost_at_once(run: Run) -> Iterator[str]:
-    """That episodes are lost before the ego's first action,
+    """Yield how many episodes are lost before the ego's first action,
     so that no model could have saved them.
     """
     world = run.manifest.world
@@ -265,12 +264,11 @@ def lost_at_once(run: Run) -> Iterator[str]:
         lag_s = world.scenario["parameters"].get("decision_lag_s", Parameters.decision_lag_s)
     else:
         lag_s = world.decision_lag_s
-    ended = [
-        (e.episode, e.failure == "collision" and (e.time_s or math.inf) <= lag_s)
-        for e in run.episodes
-    ]
-    lost = {episode for episode, at_once in ended if at_once}
-    lost -= {episode for episode, at_once in ended if not at_once}
+    lost, others = set[int](), set[int]()
+    for episode in run.episodes:
+        at_once = episode.failure == "collision" and (episode.time_s or math.inf) <= lag_s
+        (lost if at_once else others).add(episode.episode)
+    lost -= others
     if lost:
         yield (
             f"{len(lost)} of {len(run.grid.episodes)} episodes are lost before the ego's first "
@@ -291,8 +289,8 @@ def moved_system(run: Run) -> Iterator[str]:
 
 
 def on_device(run: Run) -> Iterator[str]:
-    """Whose answers, and on what computer,
-    the times and the joules of a run with a device profile are of.
+    """Yield each agent of a run with a device profile whose times and joules are those of
+    another model.
     """
     manifest = run.manifest
     if (device := manifest.device_profile) is None:
@@ -317,24 +315,27 @@ def beyond_sources(run: Run) -> Iterator[str]:
 
 
 def no_prompt(runs: Mapping[str, Run]) -> list[str]:
-    """A sentence about the models that read no prompt,
+    """Return a sentence about the models that read no prompt,
     and one about those that look at nothing either.
     """
-    manifests = [run.manifest for run in runs.values()]
-    rules: dict[str, list[tuple[str, str]]] = {"by the scene graph": [], "without looking": []}
-    for agent in (
-        agent for manifest in manifests for agent in (manifest.agent(0), *manifest.helpers)
-    ):
-        name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))
-        if not reads_prompts(engine):
-            how = (
-                "without looking" if engine == "driver" and name in BLIND else "by the scene graph"
-            )
-            rules[how].append((printable(name, 30), printable(str(agent["prompt"]["version"]), 20)))
-    return [_no_prompt(how, *zip(*of, strict=True)) for how, of in rules.items() if of]
+    looking, blind = list[tuple[str, str]](), list[tuple[str, str]]()  # model and prompt version
+    for run in runs.values():
+        for agent in (run.manifest.agent(0), *run.manifest.helpers):
+            name, engine = str(agent["model"]["name"]), str(agent["model"].get("engine"))
+            if not reads_prompts(engine):
+                agents = blind if engine == "driver" and name in BLIND else looking
+                version = printable(str(agent["prompt"]["version"]), 20)
+                agents.append((printable(name, 30), version))
+    sentences = []
+    if looking:
+        sentences.append(_no_prompt("by the scene graph", looking))
+    if blind:
+        sentences.append(_no_prompt("without looking", blind))
+    return sentences
 
 
-def _no_prompt(how: str, models: Sequence[str], prompts: Sequence[str]) -> str:
+def _no_prompt(how: str, agents: Sequence[tuple[str, str]]) -> str:
+    models, prompts = zip(*agents, strict=True)
     *names, last = dict.fromkeys(models)
     versions = " or ".join(dict.fromkeys(prompts))
     if not names:

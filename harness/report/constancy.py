@@ -93,17 +93,16 @@ def in_a_line(run: Run) -> Iterator[str]:
 
 
 def tile(run: Run) -> list[dict[str, str]]:
-    """Return the same as a figure of a page's first screen; none without a language model."""
+    """Return what a language model's ego answers most often, as a figure of a page's first
+    screen; none without a language model.
+    """
     common = commonest(run)
-    return (
-        []
-        if common is None
-        else [
-            {
-                "what": f"ego's answers in which {common.likeliest}",
-                "value": f"{100 * common.count / common.n:.0f} %",
-                "interval": f"its probability moves by {common.moves:.2f}",
-                "n": f"n = {common.n} readable answers",
-            }
-        ]
-    )
+    if common is None:
+        return []
+    figure = {
+        "what": f"ego's answers in which {common.likeliest}",
+        "value": f"{100 * common.count / common.n:.0f} %",
+        "interval": f"its probability moves by {common.moves:.2f}",
+        "n": f"n = {common.n} readable answers",
+    }
+    return [figure]

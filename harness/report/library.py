@@ -67,7 +67,8 @@ def vega() -> str:
         UserError: the installed script is not the one whose digest stands here.
     """
     bundle = (files("js_lib_vega_embed") / BUNDLE).read_bytes()
-    if (actual := sha256_bytes(bundle)) != BUNDLE_SHA256:
+    actual = sha256_bytes(bundle)
+    if actual != BUNDLE_SHA256:
         raise UserError(
             f"the charting library of {PACKAGE} {version(PACKAGE)} has sha256 {actual}, not "
             f"{BUNDLE_SHA256}, and would run in every report; install the harness again, whose "
@@ -116,13 +117,15 @@ def on_dark_too(svg: bytes) -> bytes:
     """Return a figure's SVG for a page, whose dark look it takes on;
     the file stays as papers print it.
     """
-    rules = "".join(f"{what} {{{how}: {PAGE[name][1]} !important}} " for what, how, name in _DARK)
+    rules = ""
+    for elements, property_name, colour in _DARK:
+        rules += f"{elements} {{{property_name}: {PAGE[colour][1]} !important}} "
     style = f"<style>@media (prefers-color-scheme: dark) {{{rules}}}</style></defs>"
     return svg.replace(b"</defs>", style.encode(), 1)
 
 
 def policy(*scripts: str) -> str:
-    """Content security policy of a page that runs these scripts and nothing else,
+    """Return the content security policy of a page that runs these scripts and nothing else,
     and requests nothing.
     """
     allowed = " ".join(f"'sha256-{digest(script)}'" for script in scripts)

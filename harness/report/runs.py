@@ -110,15 +110,19 @@ def _shown(run: Run) -> str:
 
 
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:
-    variants = [run.manifest.variant for run in runs]
-    parts = [
-        (f"{v.model} · {v.prompt}", v.answer, run.path.name)
-        if not v.helpers
-        else (str(v), run.path.name)
-        for v, run in zip(variants, runs, strict=True)
-    ]
-    for many in (1, 2, 3):
-        names = [" · ".join(part[:many]) for part in parts]
+    """Return names that tell the runs apart, with no more than that takes: model and prompt,
+    then the answer mode, the folder, and a number.
+    """
+    parts = list[tuple[str, ...]]()
+    for run in runs:
+        variant = run.manifest.variant
+        if variant.helpers:
+            parts.append((str(variant), run.path.name))
+        else:
+            model = f"{variant.model} · {variant.prompt}"
+            parts.append((model, variant.answer, run.path.name))
+    for count in (1, 2, 3):
+        names = [" · ".join(of_run[:count]) for of_run in parts]
         if len(set(names)) == len(names):
             return tuple(names)
     total, turn = Counter(names), Counter[str]()

@@ -81,8 +81,8 @@ def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) ->
 def named(
     buildings: Iterable[Building], view: View, tall_m: float
 ) -> Iterator[tuple[str, float, float]]:
-    """The name of each building with room for one,
-    and the north-west corner of what is in view of it.
+    """Yield the name of each building with room for one,
+    and the north-west corner of what is in view of it, m to the east and north.
     """
     for building in buildings:
         corners = north_up(building.corners())

@@ -24,12 +24,12 @@ NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
-    """Points (..., 2) m of `harness.world.road`'s frame, with y to the north."""
+    """Return points (..., 2) m of `harness.world.road`'s frame with y to the north."""
     return points * [1.0, -1.0]
 
 
 def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict], Floats]:
-    """Conflicts of a viewer's graph, and where, (n, 2) m to the east and north.
+    """Return the conflicts of a viewer's graph, and where they are, (n, 2) m to the east and north.
 
     Not of who is ahead or behind: there the other vehicle itself is the place.
     """
@@ -47,15 +47,15 @@ def ground_of(scenario: Scenario) -> Ground:
 
 
 def shape_of(scenario: Scenario) -> float:
-    """Height by width of a picture of where it is decided:
-    a road from west to east needs no square.
+    """Return height by width of a picture of a scenario's road:
+    one from west to east needs no square.
     """
     outlines = scenario.road().ground_within(VIEW_M).outlines
     return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
 
 
 def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
-    """What lies behind walls and vehicles as seen from the middle of one:
+    """Return what lies behind walls and vehicles as seen from the middle of one:
     quadrangles (n, 4, 2) up to far_m.
 
     All go round the same way, so that together they are one shape by the nonzero rule.

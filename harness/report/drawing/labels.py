@@ -76,7 +76,7 @@ class Labels:
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def free(self, boxes: Sequence[Floats]) -> Floats:
-        """The first of some boxes (2, 2) that covers nothing so far, else the first;
+        """Return the first of some boxes (2, 2) that covers nothing so far, else the first;
         labels keep off it.
         """
         half = (boxes[0][1] - boxes[0][0]) / 2
@@ -93,7 +93,7 @@ class Labels:
         colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
-        """A label for what lies at (2,) m and reaches radius_m,
+        """Add a label for what lies at (2,) m and reaches radius_m,
         best on the side `toward` (2,) points to.
         """
         self._waiting.append((at, radius_m, text, bold, colour, toward))
