@@ -84,7 +84,7 @@ class ReplayedRun:
         dataset: Path | None = None,
         models: Sequence[Card] = (),
     ) -> None:
-        """A run.
+        """Read a run.
 
         Args:
             folder: its folder.
@@ -147,18 +147,14 @@ class ReplayedRun:
         if self._announced or not any(agent.can.language_model for agent in self.spec.agents):
             return
         self._announced = True
-        tokens = [
-            answer.prompt_tokens for answer in self.run.answers if answer.prompt_tokens is not None
-        ]
-        size = (
-            f" (about {float(f'{self._left * np.mean(tokens):.2g}'):.0f} prompt tokens)"
-            if tokens
-            else ""
-        )
+        size = ""
+        tokens = [a.prompt_tokens for a in self.run.answers if a.prompt_tokens is not None]
+        if tokens:
+            total = float(f"{self._left * np.mean(tokens):.2g}")
+            size = f" (about {total:.0f} prompt tokens)"
         reached = self.run.decisions.scenes
-        lacks = len(reached) * self.vehicles - sum(
-            answer.role in OWN for answer in self.run.answers
-        )
+        own_answers = sum(answer.role in OWN for answer in self.run.answers)
+        lacks = len(reached) * self.vehicles - own_answers
         questions = "1 question" if self._left == 1 else f"{self._left} questions"
         unasked = (
             f"; of helpers at the {len(reached)} decision points that it reached, it lacks {lacks} "
@@ -203,7 +199,7 @@ class ReplayedRun:
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int], read: Read
     ) -> Iterator[Sequence[WalkResult]]:
-        """Yield the same at points that are walked together."""
+        """Yield the walks at each of some points, which are walked together."""
         different = list(dict.fromkeys(points))
         world = FrozenWorld(self.dataset, different, seeds)
 
@@ -310,9 +306,8 @@ class ReplayedRun:
         if any(lacks):
             if self._asks:
                 return self(scenes)
-            self.left_out |= {
-                scene.id for scene, lacking in zip(scenes, lacks, strict=True) if lacking
-            }
+            pairs = zip(scenes, lacks, strict=True)
+            self.left_out |= {scene.id for scene, lacking in pairs if lacking}
             leave_out(np.array(lacks))
         return self._asker.laid_out(scenes)
 
@@ -410,5 +405,6 @@ class _Nearest:
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return how success counts in runs that are read together."""
-    return dict(zip(runs, alike([Success(run.dataset.dangerous) for run in runs]), strict=True))
+    """Return the success rule of each of some runs that are read together."""
+    rules = alike([Success(run.dataset.dangerous) for run in runs])
+    return dict(zip(runs, rules, strict=True))
