@@ -71,18 +71,18 @@ class Candidate:
 class Play:
     """The outcome of a candidate: success, (S, E), and `COSTS`, (S, E, C), of every episode.
 
-    Success counts as `counting` says; costs are means over all episodes.
+    Success counts as `success_rule` says; costs are means over all episodes.
     """
 
     candidate: Candidate
     success: Floats
     costs: Floats
-    counting: Success
+    success_rule: Success
 
     @property
     def rate(self) -> float:
         """Success, as it counts."""
-        return self.counting.mean(self.success)
+        return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
         """Return one of `COSTS` of every episode, (S, E)."""
@@ -105,14 +105,13 @@ class Play:
 
 
 def plays(
-    choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate], counting: Success
+    choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate], success_rule: Success
 ) -> list[Play]:
     """Play candidates of one schedule; what asking is worth by it is worked out once."""
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
-    return [
-        Play(c, *choices.played(rule), counting) for c, rule in zip(candidates, rules, strict=True)
-    ]
+    pairs = zip(candidates, rules, strict=True)
+    return [Play(candidate, *choices.played(rule), success_rule) for candidate, rule in pairs]
 
 
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
@@ -179,14 +178,14 @@ class Compared:
         return Candidate(schedule, threshold, self.point.ask.max_helpers)
 
     @property
-    def counting(self) -> Success:
+    def success_rule(self) -> Success:
         """How success counts."""
-        return self.oracle.counting
+        return self.oracle.success_rule
 
     @cached_property
     def counts(self) -> Ints:
         """How often each episode counts, as played and in each resample, (1 + RESAMPLES, E)."""
-        return self.counting.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
+        return self.success_rule.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
     def chosen(self, schedule: str) -> Play:
         """Return the play with the most success on tune layouts within the budget;
@@ -242,7 +241,7 @@ class Compared:
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
         costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
         return [
-            Play(bound.candidate, bound.success * of, spent, bound.counting)
+            Play(bound.candidate, bound.success * of, spent, bound.success_rule)
             for of, spent in zip(cheap, costs, strict=True)
         ]
 
@@ -268,33 +267,33 @@ class Compared:
 
     def _successes(self, plays: Sequence[Play]) -> Floats:
         """Return success of plays, as it counts, in each resample, (1 + RESAMPLES, P)."""
-        return _means(self.counting.weights(self.counts), [play.success for play in plays])
+        return _means(self.success_rule.weights(self.counts), [play.success for play in plays])
 
     @cached_property
     def regret(self) -> Estimate:
         """Success of the oracle less that of the paper's schedule."""
-        return self.counting.difference(self.oracle.success, self.paper.success)
+        return self.success_rule.difference(self.oracle.success, self.paper.success)
 
     @cached_property
     def rows(self) -> list[Chosen]:
         """The paper's schedule, the chosen candidate of every one, and last the oracle."""
         chosen = [self.chosen(name) for name in self.names]
-        raw = [self.counting.p_value(play.success, self.paper.success) for play in chosen]
+        raw = [self.success_rule.p_value(play.success, self.paper.success) for play in chosen]
         rows = [self._row(self.paper, None)]
         for play, p in zip(chosen, corrected(raw), strict=True):
             rows.append(self._row(play, p))
         return [*rows, self._row(self.oracle, None)]
 
     def _row(self, play: Play, p: float | None) -> Chosen:
-        counting, success = self.counting, self._successes([play, self.paper, self.oracle])
+        success_rule, success = self.success_rule, self._successes([play, self.paper, self.oracle])
         messages = self._resampled([play.messages, self.paper.messages])
         return Chosen(
             play,
-            counting.estimate(play.success),
-            counting.plain.estimate(play.success),
-            counting.difference(play.success, self.paper.success),
+            success_rule.estimate(play.success),
+            success_rule.plain.estimate(play.success),
+            success_rule.difference(play.success, self.paper.success),
             p,
-            counting.difference(play.success, self.random_like(play)),
+            success_rule.difference(play.success, self.random_like(play)),
             self._interval(_ratio(success[:, 0] - success[:, 1], success[:, 2] - success[:, 1])),
             self._interval(_ratio(messages[:, 0], messages[:, 1])),
             self.area(play.candidate.schedule),
@@ -324,11 +323,11 @@ def compare(
     names: Sequence[str],
     seeds: Sequence[int],
     budget: float,
-    counting: Mapping[ReplayedRun, Success],
+    success_rules: Mapping[ReplayedRun, Success],
     progress: Callable[[int], None],
 ) -> Compared:
     """Play every schedule on a run, and on one on tune layouts;
-    `counting` is how success counts in each.
+    `success_rules` has the success rule of each.
 
     What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates
     are chosen within `budget`, a share of the messages that the paper's schedule takes.
@@ -344,11 +343,12 @@ def compare(
     tune_plays: dict[str, list[Play]] = {}
     for name in dict.fromkeys((PAPER, NEVER, ALWAYS, RANDOM, *names)):
         tried = candidates(tune_run or run, point, name)
-        run_plays[name] = plays(run, point, tried, counting[stored])
+        run_plays[name] = plays(run, point, tried, success_rules[stored])
         if tune and tune_run:
-            tune_plays[name] = plays(tune_run, point, tried, counting[tune])
+            tune_plays[name] = plays(tune_run, point, tried, success_rules[tune])
         progress(1)
-    bound = Play(Candidate(ORACLE, None, point.ask.max_helpers), *run.oracle(), counting[stored])
+    oracle = Candidate(ORACLE, None, point.ask.max_helpers)
+    bound = Play(oracle, *run.oracle(), success_rules[stored])
     return Compared(stored.name, point, tuple(names), run_plays, tune_plays, bound, budget)
 
 
@@ -382,11 +382,12 @@ def run_schedules(
     refuse_other(out, "schedule", manifest)
     steps = sum(run.dataset.scenario.parameters.decisions for run in every)
     progress.more(steps + len(runs) * len(names))
-    counting = counted(every)
-    compared = [
-        compare(run, tune_run, point_of([run], condition), names, seeds, budget, counting, progress)
-        for run, tune_run in zip_longest(runs, tune)
-    ]
+    success_rules = counted(every)
+    compared = []
+    for run, tune_run in zip_longest(runs, tune):
+        point = point_of([run], condition)
+        result = compare(run, tune_run, point, names, seeds, budget, success_rules, progress)
+        compared.append(result)
     for run in every:
         run.settle()
     return compared
@@ -455,7 +456,7 @@ def schedule_study(
     `runs` are these and those on tune layouts.
     """
     first, data = compared[0], tables(compared)
-    words = first.counting.words
+    words = first.success_rule.words
     tuned = bool(first.tune)
     chosen = (
         f"Both were chosen for the most {words} on tune layouts, within "
@@ -510,7 +511,7 @@ def name_of(row: Chosen) -> str:
 
 def headline(compared: Compared) -> list[str]:
     """Say the paper's regret, and what the best schedule within half of its messages closes."""
-    regret, words = compared.regret, compared.counting.words
+    regret, words = compared.regret, compared.success_rule.words
     bound = compared.oracle.means["messages"]
     sentences = [
         f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points "
@@ -521,7 +522,7 @@ def headline(compared: Compared) -> list[str]:
     if compared.tune and within:
         by_name = {name_of(row): row for row in within}
         success = {name: row.play.success for name, row in by_name.items()}
-        first, *close = compared.counting.most(success)
+        first, *close = compared.success_rule.most(success)
         best = by_name[first]
         if close:
             outcome = (
@@ -548,7 +549,7 @@ def _fronts(compared: Sequence[Compared]) -> "Figure":
         for cost in BUDGETS
         if cost == "messages" or run.energy
     ]
-    return fronts(panels, compared[0].counting.words)
+    return fronts(panels, compared[0].success_rule.words)
 
 
 def _steps(run: Compared, cost: str) -> "Iterator[Steps]":
@@ -574,7 +575,7 @@ def _steps(run: Compared, cost: str) -> "Iterator[Steps]":
 
 
 def _table(run: Compared) -> Table:
-    words, balanced = run.counting.words, run.counting.metric == BALANCED
+    words, balanced = run.success_rule.words, run.success_rule.metric == BALANCED
     plain = "success %" if balanced else ""  # for which 80 columns have no room beside the other
     hidden = (*(() if run.energy else JOULES), *(() if balanced else IF_BALANCED))
     heads = [head for head in HEADS if head not in hidden]
@@ -633,9 +634,9 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
     schedules, settings = list[dict[str, Any]](), list[dict[str, Any]]()
     for run in compared:
         for row in run.rows:
-            values = {**place(run, row.play), "lead": run.counting.metric}
+            values = {**place(run, row.play), "lead": run.success_rule.metric}
             values |= ends("success", row.plain)
-            if run.counting.metric == BALANCED:
+            if run.success_rule.metric == BALANCED:
                 values |= ends("balanced_success", row.success)
             values |= {"n": row.success.n, **row.play.means}
             values |= ends("over_paper", row.over_paper)
@@ -656,7 +657,7 @@ def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
 
 
 def _rates(play: Play) -> dict[str, float]:
-    balanced = {"balanced_success": play.rate} if play.counting.metric == BALANCED else {}
+    balanced = {"balanced_success": play.rate} if play.success_rule.metric == BALANCED else {}
     return {"success": float(play.success.mean()), **balanced}
 
 

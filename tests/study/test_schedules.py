@@ -206,13 +206,19 @@ def balanced() -> Compared:
     Balanced, two helpers have 1/2 (1 + 0) and one has 1/2 (1/3 + 1).
     """
     counting, once = Success(np.array([True, False, False, False])), by_hand()
-    plays = {name: [replace(p, counting=counting) for p in of] for name, of in once.plays.items()}
+    plays = {
+        name: [replace(p, success_rule=counting) for p in of] for name, of in once.plays.items()
+    }
     plays["entropy"] = [
         play("entropy", 2, 0.7, [0, 1, 1, 1], [1] * 4, counting),
         play("entropy", 1, 0.7, [1, 1, 0, 0], [1] * 4, counting),
     ]
     return replace(
-        once, plays=plays, tune=plays, budget=1.0, oracle=replace(once.oracle, counting=counting)
+        once,
+        plays=plays,
+        tune=plays,
+        budget=1.0,
+        oracle=replace(once.oracle, success_rule=counting),
     )
 
 
@@ -232,7 +238,9 @@ def test_balanced_success_chooses_ranks_and_is_averaged_over_budgets():
     assert (bound.success.value, compared.regret.value) == (1.0, 0.5)
     plain = replace(
         compared,
-        tune={name: [replace(p, counting=PLAIN) for p in of] for name, of in compared.tune.items()},
+        tune={
+            name: [replace(p, success_rule=PLAIN) for p in of] for name, of in compared.tune.items()
+        },
     )
     assert plain.chosen("entropy").candidate.most == 2, "as plain success chooses"
 

@@ -135,7 +135,7 @@ def test_effects_halves_and_the_front_go_by_balanced_success_where_it_leads() ->
         for ego in ("v1", "v2") for helper in ("v1", "v2")
     }  # fmt: skip
     grid = made_up(of, [1] * 2 + [0] * 8)
-    assert grid.counting.metric == BALANCED
+    assert grid.success_rule.metric == BALANCED
     [effect] = [e for e in grid.effects if e.what == "helper prompt: v1 → v2"]
     assert (effect.estimate.value, effect.estimate.n) == (pytest.approx((1 - 1 / 8) / 2), 10)
     assert grid.success(front(grid, "6g")[-1], "6g").value == pytest.approx((1 + 7 / 8) / 2)

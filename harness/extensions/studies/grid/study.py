@@ -191,7 +191,7 @@ class Grid:
     cells: tuple[Cell, ...]
     rows: int
     columns: int
-    counting: Success  # of all cells
+    success_rule: Success  # of all cells
 
     def __post_init__(self) -> None:
         if len({(cell.run.conditions, cell.run.grid) for cell in self.cells}) > 1:
@@ -216,7 +216,7 @@ class Grid:
 
     def success(self, cell: Cell, condition: str) -> Estimate:
         """Return the headline metric of a cell under a condition."""
-        return self.counting.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
+        return self.success_rule.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
 
     def name(self, agent: Agent, half: str) -> str:
         """Return an agent by what is varied of its half; by its model where nothing is."""
@@ -229,9 +229,9 @@ class Grid:
         effects, p_values = list[Effect](), list[float | None]()
         for condition in self.conditions:
             for name, low, high in (*self._main(condition), *self._interactions(condition)):
-                estimate = self.counting.difference(high, low)
+                estimate = self.success_rule.difference(high, low)
                 effects.append(Effect(condition, name, estimate, None))
-                p_values.append(self.counting.p_value(high, low))
+                p_values.append(self.success_rule.p_value(high, low))
         pairs = zip(effects, corrected(p_values), strict=True)
         return tuple(replace(effect, p=p) for effect, p in pairs)
 
@@ -275,8 +275,8 @@ class Grid:
             return None
         each = np.array([np.mean(cell.values[SUCCESS][at], axis=0) for cell in self.cells])
         n = each.shape[1]
-        counts = self.counting.resampled(noise.generator("grid", "halves"), RESAMPLES)
-        weights = self.counting.weights(counts)
+        counts = self.success_rule.resampled(noise.generator("grid", "halves"), RESAMPLES)
+        weights = self.success_rule.weights(counts)
         squares = _squares((each @ weights.T).reshape(self.rows, self.columns, -1))
         # Episodes by chance add as much to the squares of what was played as resampling adds to
         # those.
@@ -371,7 +371,7 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
     helpers = [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]]
     return {
         "heat-map": heat_map(panels, egos, helpers, "ego", "helpers"),
-        "pareto": fronts([("", "latency of a decision, ms", steps)], grid.counting.words),
+        "pareto": fronts([("", "latency of a decision, ms", steps)], grid.success_rule.words),
     }
 
 
@@ -388,7 +388,7 @@ def _range(grid: Grid, condition: str) -> str:
     rates = [100 * grid.success(cell, condition).value for cell in grid.cells]
     effects = [effect for effect in grid.effects if effect.condition == condition]
     return (
-        f"Under {condition}, {grid.counting.words} of the {len(rates)} combinations is "
+        f"Under {condition}, {grid.success_rule.words} of the {len(rates)} combinations is "
         f"{min(rates):.1f} to {max(rates):.1f} %; {sum(e.clear for e in effects)} of "
         f"{len(effects)} effects are more than chance explains (n = "
         f"{grid.success(grid.cells[0], condition).n})."
@@ -403,7 +403,7 @@ def _halves(grid: Grid, h: Halves) -> str:
         verdict = "the choice of the helpers matters more"
     return (
         f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains "
-        f"{shown(h.ego)} % of the differences in {grid.counting.words} between the "
+        f"{shown(h.ego)} % of the differences in {grid.success_rule.words} between the "
         f"{len(grid.cells)} combinations, the choice among {grid.columns} helpers "
         f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
     )
@@ -442,7 +442,7 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
         rows.append((pair(grid, cell), success, latency, tokens_of_decision, agents, run))
     heads = (
         "ego + helpers",
-        f"{grid.counting.words} %, 95 % CI",
+        f"{grid.success_rule.words} %, 95 % CI",
         "latency, ms",
         "tokens a decision",
         "agents",
@@ -464,10 +464,10 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
         f"Effect of each choice, {condition}",
         ("effect", "points, 95 % CI", "p"),
         rows,
-        f"An effect is the difference in {grid.counting.words} when one factor changes, averaged "
-        "over all other factors. An interaction (×) is half the difference between the effects "
-        "of one factor at two levels of the other. p comes from the interval and is corrected by "
-        f"Holm's method for all {len(grid.effects)} effects; bold: 0.05 or less.",
+        f"An effect is the difference in {grid.success_rule.words} when one factor changes, "
+        "averaged over all other factors. An interaction (×) is half the difference between the "
+        "effects of one factor at two levels of the other. p comes from the interval and is "
+        f"corrected by Holm's method for all {len(grid.effects)} effects; bold: 0.05 or less.",
         terminal=range(3) if terminal else (),
         most=MOST_EFFECTS,
     )
@@ -488,9 +488,11 @@ def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
     for cell, condition in places:
         for metric in cell.values:
             cells.append(row(cell, condition, metric, cell.estimate(metric, condition)))
-    if grid.counting.metric != SUCCESS:
+    headline_metric = grid.success_rule.metric
+    if headline_metric != SUCCESS:
         for cell, condition in places:
-            cells.append(row(cell, condition, grid.counting.metric, grid.success(cell, condition)))
+            success = grid.success(cell, condition)
+            cells.append(row(cell, condition, headline_metric, success))
     effects = []
     for effect in grid.effects:
         values = {"condition": effect.condition, "effect": effect.what, **ends(effect.estimate)}
