@@ -176,12 +176,10 @@ def _completion(kept: dict[str, Any]) -> Completion:
         done.label_mass,
         done.letter_share,
     )
-    if not (
-        kept.keys() <= set(_KEPT)
-        and all(0 <= count <= _MOST for count in counts if count is not None)
-        and 0 <= done.slow_s <= LONGEST_S
-        and done.finish_reason != "error"
-    ):
+    known = kept.keys() <= set(_KEPT) and done.finish_reason != "error"
+    counted = all(0 <= count <= _MOST for count in counts if count is not None)
+    timed = 0 <= done.slow_s <= LONGEST_S
+    if not (known and counted and timed):
         raise ValueError("no engine gives such a one")
     return done
 

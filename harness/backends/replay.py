@@ -63,15 +63,14 @@ class Replay:
         for request, answer in zip(requests, stored, strict=True):
             if answer is None:
                 missing.setdefault(request.role, []).append(self._as_run(request))
-        new = {
-            completion.request_id: completion
-            for role, asked in missing.items()
-            for completion in self._model(role, asked).complete(asked)
-        }
-        return [
-            new[request.id] if answer is None else self._completion(request, answer)
-            for request, answer in zip(requests, stored, strict=True)
-        ]
+        new: dict[str, Completion] = {}
+        for role, of_role in missing.items():
+            for completion in self._model(role, of_role).complete(of_role):
+                new[completion.request_id] = completion
+        completions = []
+        for request, answer in zip(requests, stored, strict=True):
+            completions.append(self._completion(request, answer) if answer else new[request.id])
+        return completions
 
     def _stored(self, request: Request) -> Answer | None:
         """Return the run's answer to a request; for a repair turn, only if the answer had one."""

@@ -153,18 +153,16 @@ class Skeleton:
         """Return what may be chosen at a point that follows a fixed text."""
         if (point, before) not in self._legs:
             # Only the first option stands before a branch: those of one kind end alike.
-            ends = [
-                self._tokens(point.options[0] or before, branch.text) for branch in point.branches
-            ]
-            self._legs[point, before] = legs = [
-                Leg(option + branch.text, self._tokens(before, option) + end, branch)
-                for option in point.options
-                for branch, end in zip(point.branches, ends, strict=True)
-            ]
-            legs += [
-                Leg(branch.text, self._tokens(before, branch.text), branch)
-                for branch in point.instead
-            ]
+            first = point.options[0] or before
+            ends = [self._tokens(first, branch.text) for branch in point.branches]
+            legs: list[Leg] = []
+            for option in point.options:
+                for branch, end in zip(point.branches, ends, strict=True):
+                    tokens = self._tokens(before, option) + end
+                    legs.append(Leg(option + branch.text, tokens, branch))
+            for branch in point.instead:
+                legs.append(Leg(branch.text, self._tokens(before, branch.text), branch))
+            self._legs[point, before] = legs
             # One option may be a prefix of another (SLOW, SLOWER), so the tokens after it decide.
             by_tokens = sorted(leg.tokens for leg in legs)
             if any(longer[: len(tokens)] == tokens for tokens, longer in pairwise(by_tokens)):

@@ -112,13 +112,12 @@ class Projector:
         the `Image` must stay alive until they are read.
         """
         layout = self._layout(image.pixels.shape[:2])
-        tokens = self._pictures.add(image, sum(part for part in layout if isinstance(part, int)))
-        remaining = iter(tokens)
-        return [
-            t
-            for part in layout
-            for t in (islice(remaining, part) if isinstance(part, int) else part)
-        ]
+        count = sum(part for part in layout if isinstance(part, int))
+        of_picture = iter(self._pictures.add(image, count))
+        tokens: list[int] = []
+        for part in layout:
+            tokens += islice(of_picture, part) if isinstance(part, int) else part
+        return tokens
 
     def run(self, token: int) -> Run:
         """Return the part of a picture that begins with a token.
@@ -133,17 +132,15 @@ class Projector:
         and each picture part's token count.
         """
         if shape not in self._layouts:
+            layout: list[Sequence[int] | int] = []
             with self._chunks(shape, None) as chunks:
-                parts = [
-                    self._marker(chunk) or self._m.mtmd_input_chunk_get_n_tokens(chunk)
-                    for chunk in chunks
-                ]
-            self._layouts[shape] = [
-                part
-                for part in parts
-                if isinstance(part, int)
-                or "".join(self._model.pieces(part)) not in self._model.template
-            ]
+                for chunk in chunks:
+                    marker = self._marker(chunk)
+                    if not marker:
+                        layout.append(self._m.mtmd_input_chunk_get_n_tokens(chunk))
+                    elif "".join(self._model.pieces(marker)) not in self._model.template:
+                        layout.append(marker)
+            self._layouts[shape] = layout
         return self._layouts[shape]
 
     def _marker(self, chunk: int) -> list[int]:

@@ -89,11 +89,8 @@ def _pattern(schema: Mapping[str, Any], literal: Callable[[str], str]) -> str:
         case "number" | "integer":
             return f"({'|'.join(map(literal, number_texts(schema)))})"
         case "array":
-            item, least, most = (
-                _pattern(schema["items"], literal),
-                schema["minItems"],
-                schema["maxItems"],
-            )
+            item = _pattern(schema["items"], literal)
+            least, most = schema["minItems"], schema["maxItems"]
             items = f"({item}({literal(',')}{item}){{{max(least - 1, 0)},{most - 1}}})"
             return f"{literal('[')}{items}{'' if least else '?'}{literal(']')}"
     members = [

@@ -77,12 +77,8 @@ class ServerPool:
         One server gets `at_once` requests at most, from all workers together,
         each at the `path` behind its base URL.
         """
-        self._client, self._settings, self._name, self._weights = (
-            client,
-            settings,
-            printable(name),
-            weights,
-        )
+        self._client, self._settings = client, settings
+        self._name, self._weights = printable(name), weights
         self._at_once, self._path = at_once, path
         self._servers = [_ServerState(url) for url in settings.urls]
         self._pending: set[_Pending] = set()
@@ -156,11 +152,10 @@ class ServerPool:
             asyncio.get_running_loop().call_soon(self._hand_out)
 
     def _hand_out(self) -> None:
+        """Give every server that is not aside as many requests as it may have."""
         self._woken = False
-        available, at_once = (
-            [server for server in self._servers if not server.aside],
-            share(self._at_once),
-        )
+        available = [server for server in self._servers if not server.aside]
+        at_once = share(self._at_once)
         for take in (self._next, self._steal):  # first each server's own queue
             for server in available:
                 while server.busy < at_once and (pending := take(server)):

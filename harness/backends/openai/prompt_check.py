@@ -73,12 +73,11 @@ class PromptCheck:
             prompt = await self._field(base, "/apply-template", "prompt", asked)
             lacking = lost_message(messages, prompt) if isinstance(prompt, str) else None
         else:
-            counts = [
-                await self._field(base, "/tokenize", "count", {**asked, "messages": some})
-                for some in (messages, messages[1:])
-            ]
-            grows = not all(type(n) is int for n in counts) or counts[0] > counts[1]
-            lacking = None if grows else messages[0]
+            without_first = {**asked, "messages": messages[1:]}
+            count = await self._field(base, "/tokenize", "count", asked)
+            fewer = await self._field(base, "/tokenize", "count", without_first)
+            counted = type(count) is int and type(fewer) is int
+            lacking = messages[0] if counted and count <= fewer else None
         if lacking is not None:
             way = "" if self._card.system else f'; or give its card system = "{FIRST_USER}"'
             raise UserError(

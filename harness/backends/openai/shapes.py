@@ -59,13 +59,15 @@ def body(
     Raises UserError if it has a temperature, which the card leaves out.
     """
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
+    messages: list[Any] = []
+    for message in with_system(request.messages, card.system):
+        if picture and "image" in message:
+            messages += in_parts([message], picture)
+        else:  # text, not parts, since not every server and chat template takes them
+            messages.append(dict(message))
     json_body: dict[str, Any] = {
         "model": card.weights,
-        # Plain text is not sent as parts, since not every server and chat template takes them.
-        "messages": [
-            in_parts([message], picture)[0] if picture and "image" in message else dict(message)
-            for message in with_system(request.messages, card.system)
-        ],
+        "messages": messages,
         "max_tokens": request.max_tokens,
         "temperature": request.temperature or 0,
         "seed": request.sample,

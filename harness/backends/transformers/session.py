@@ -247,11 +247,8 @@ class Rows:
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
         # All chunks of a sequence stand side by side in its row, and a token sees those of its own
         # chunk alone: the sequence's keys and values are neither copied nor read again.
-        n, count, width = (
-            len(chunks),
-            len(chunks[0]),
-            max(len(chunk) for each in chunks for chunk in each),
-        )
+        n, count = len(chunks), len(chunks[0])
+        width = max(len(chunk) for each in chunks for chunk in each)
         ids = torch.zeros(n, count, width, dtype=torch.long)
         own = torch.zeros(n, count, width, dtype=torch.bool)
         for row, each in enumerate(chunks):
@@ -269,10 +266,8 @@ class Rows:
         places = (starts[:, None, None] + (own.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
         if self._places is not None:
             places = places.expand(3, -1, -1)
-        mask, last = (
-            torch.cat([before, among], dim=-1)[:, None],
-            torch.arange(1, count + 1) * width - 1,
-        )
+        mask = torch.cat([before, among], dim=-1)[:, None]
+        last = torch.arange(1, count + 1) * width - 1
         logits = self._reader.forward(self._cache, ids.reshape(n, -1), mask, last, places)
         return _log_probs(logits.flatten(0, 1), tokens).reshape(n, count, -1)
 
