@@ -32,11 +32,8 @@ class Selection:
     @property
     def given(self) -> dict[str, int | str]:
         """The conditions that are set, except `limit`, by name."""
-        conditions = {
-            key: value
-            for key, value in asdict(self).items()
-            if key != "limit" and value is not None
-        }
+        conditions = {key: value for key, value in asdict(self).items() if value is not None}
+        conditions.pop("limit", None)
         if self.sample is None:
             del conditions["sample_seed"]
         return conditions

@@ -24,12 +24,8 @@ from harness.runs.records import Decision, Message
 if TYPE_CHECKING:
     import pandas as pd
 
-LABEL, WHOLE, FLAG, NUMBER = (
-    pa.dictionary(pa.int32(), pa.string()),
-    pa.int64(),
-    pa.bool_(),
-    pa.float64(),
-)
+LABEL = pa.dictionary(pa.int32(), pa.string())
+WHOLE, FLAG, NUMBER = pa.int64(), pa.bool_(), pa.float64()
 # Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
 COLUMNS = {
     "scene": LABEL,
@@ -131,21 +127,12 @@ ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
     """Return the names and types of the columns, in the order of the file."""
-    return pa.schema(
-        [
-            *COLUMNS.items(),
-            *(
-                (f"{name}_{action}", kind)
-                for name, kind in OF_ACTIONS.items()
-                for action in actions
-            ),
-            *(
-                (f"{name}_{n}", kind)
-                for n in range(1, helpers + 1)
-                for name, kind in OF_MESSAGES.items()
-            ),
-        ]
-    )
+    columns = list(COLUMNS.items())
+    for name, kind in OF_ACTIONS.items():
+        columns += [(f"{name}_{action}", kind) for action in actions]
+    for n in range(1, helpers + 1):
+        columns += [(f"{name}_{n}", kind) for name, kind in OF_MESSAGES.items()]
+    return pa.schema(columns)
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:

@@ -204,11 +204,8 @@ class Run:
 
         Else it is the one over episodes.
         """
-        candidates = [
-            s
-            for s in self.scores
-            if (s.condition, s.metric) == (condition, metric) and s.value is not None
-        ]
+        of_metric = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
+        candidates = [score for score in of_metric if score.value is not None]
         order = {ANY_TIME: 0, PAIRED: 1, "episodes": 2}
         return min(candidates, key=lambda s: order.get(s.interval, 3), default=None)
 
@@ -218,14 +215,15 @@ class Run:
         world = self.manifest.world
         if len(numbers) != world.episodes:
             raise ValueError(f"it has {len(numbers)} episodes, and run.json says {world.episodes}")
-        if isinstance(world, ClosedLoop) and any(
-            e.episode not in range(world.selection.get("of", world.episodes))
-            or e.layout_seed != world.first_seed + e.episode
-            for e in episodes
-        ):
-            raise ValueError(
-                f"a layout that is none of run.json's, whose first seed is {world.first_seed}"
-            )
+        if isinstance(world, ClosedLoop):
+            drawn = range(world.selection.get("of", world.episodes))
+            for episode in episodes:
+                seed = world.first_seed + episode.episode
+                if episode.episode not in drawn or episode.layout_seed != seed:
+                    raise ValueError(
+                        "a layout that is none of run.json's, whose first seed is "
+                        f"{world.first_seed}"
+                    )
         grid = Grid(self.conditions, self.manifest.seeds, numbers)
         return grid, tuple(grid.ordered(episodes))
 

@@ -61,13 +61,8 @@ ADJUSTED = {name: f"adjusted_{name}" for name in (*GAINS, *GAINS.values())}
 ONE_OPTIMAL = "decisions_one_optimal"
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
-MS, SECONDS, METRES, JOULES, NATS = (
-    Unit("ms"),
-    Unit("s", 2),
-    Unit("m"),
-    Unit("J", 2),
-    Unit("nats", 3),
-)
+MS, SECONDS, METRES = Unit("ms"), Unit("s", 2), Unit("m")
+JOULES, NATS = Unit("J", 2), Unit("nats", 3)
 COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 

@@ -1,6 +1,6 @@
 """Define the typed records of a run's files; docs/files.md has the meaning of each name."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from typing import Annotated, Any, Literal
@@ -558,17 +558,16 @@ class Manifest(Struct, frozen=True, kw_only=True):
     versions: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for table_name, table, keys in (
-            ("model", self.model, ("name", "engine")),
-            ("prompt", self.prompt, ("version", "sha256")),
-            *(("conditions", point, ("name",)) for point in self.conditions),
-            *(("helpers", helper, ("answer",)) for helper in self.helpers),
-            *(("helpers", helper.get("model", {}), ("name", "engine")) for helper in self.helpers),
-            *(
-                ("helpers", helper.get("prompt", {}), ("version", "sha256"))
-                for helper in self.helpers
-            ),
-        ):
+        of_model, of_prompt = ("name", "engine"), ("version", "sha256")
+        tables: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+            ("model", self.model, of_model),
+            ("prompt", self.prompt, of_prompt),
+        ]
+        tables += [("conditions", point, ("name",)) for point in self.conditions]
+        tables += [("helpers", helper, ("answer",)) for helper in self.helpers]
+        tables += [("helpers", helper.get("model", {}), of_model) for helper in self.helpers]
+        tables += [("helpers", helper.get("prompt", {}), of_prompt) for helper in self.helpers]
+        for table_name, table, keys in tables:
             if missing := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{table_name}: {missing[0]} is no text")
             if table_name != "conditions" and not _is_name(table[keys[0]]):
@@ -582,23 +581,23 @@ class Manifest(Struct, frozen=True, kw_only=True):
             except UserError as mistake:
                 raise ValueError(str(mistake)) from None
         names = tuple(point["name"] for point in self.conditions)
-        for field_name, values in (
-            ("actions", self.actions),
-            ("conditions", names),
-            ("seeds", self.seeds),
-        ):
+        lists: dict[str, Sequence[Any]] = {
+            "actions": self.actions,
+            "conditions": names,
+            "seeds": self.seeds,
+        }
+        for field_name, values in lists.items():
             if not 0 < len(values) == len(set(values)):
                 raise ValueError(f"{field_name}: none, or one twice")
 
     @property
     def variant(self) -> Variant:
-        helpers = [(h["model"]["name"], h["prompt"]["version"], h["answer"]) for h in self.helpers]
-        return Variant(
-            self.model["name"],
-            self.prompt["version"],
-            self.answer,
-            " + ".join(map(BETWEEN_NAMES.join, helpers)),
-        )
+        helpers = []
+        for h in self.helpers:
+            names = h["model"]["name"], h["prompt"]["version"], h["answer"]
+            helpers.append(BETWEEN_NAMES.join(names))
+        model, version = self.model["name"], self.prompt["version"]
+        return Variant(model, version, self.answer, " + ".join(helpers))
 
     def agent(self, place: int) -> dict[str, Any]:
         """Return the agent of a scene's viewer at this place, in the form of `helpers`;

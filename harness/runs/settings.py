@@ -428,22 +428,11 @@ def options(world: type[Struct]) -> list[Option]:
     """Return the options of the command that walks a world, in the order of the fields;
     extensions' last.
     """
-    core = core_options(world)
-    added = [
-        Option(
-            (EXTENSIONS, name),
-            name,
-            its.kind,
-            its.default,
-            its.help,
-            "Extensions",
-            False,
-            ITSELF,
-            True,
-        )
-        for name, its in of_extensions().items()
-    ]
-    return core + added
+    declared = core_options(world)
+    for name, setting in of_extensions().items():
+        path, shape = (EXTENSIONS, name), (setting.kind, setting.default, setting.help)
+        declared.append(Option(path, name, *shape, "Extensions", False, ITSELF, True))
+    return declared
 
 
 def core_options(world: type[Struct]) -> list[Option]:

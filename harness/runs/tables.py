@@ -70,17 +70,18 @@ class Tables:
         """
         import pandas as pd
 
+        def read_rows(file: Path) -> list[tuple[Any, ...]]:
+            rows: list[tuple[Any, ...]] = []
+            for e in self.source.episodes:
+                if e.journeys is None:
+                    continue
+                key = e.condition, e.seed, e.episode
+                for end in msgspec.json.decode(e.journeys, type=tuple[End, ...]):
+                    rows.append((*key, *structs.astuple(end), end.agent == e.gave_way))
+            return rows
+
         columns = ["condition", "seed", "episode", *End.__struct_fields__, "gave_way"]
-        rows = whole(
-            self.path / "episodes.csv",
-            lambda file: [
-                (e.condition, e.seed, e.episode, *structs.astuple(end), end.agent == e.gave_way)
-                for e in self.source.episodes
-                if e.journeys is not None
-                for end in msgspec.json.decode(e.journeys, type=tuple[End, ...])
-            ],
-        )
-        return pd.DataFrame(rows, columns=columns)
+        return pd.DataFrame(whole(self.path / "episodes.csv", read_rows), columns=columns)
 
     @cached_property
     def decisions(self) -> "pd.DataFrame":
