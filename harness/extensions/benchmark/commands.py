@@ -235,16 +235,14 @@ def seeds(
     from harness.world import scenarios
 
     if names:
-        of = [scenarios.get(options.typed_scenario(name)) for name in names]
+        typed = [scenarios.get(options.typed_scenario(name)) for name in names]
     else:
-        of = [load.load(load.find(name), 1).scenario for name in editions.named(edition).datasets]
-    lines: list[dict[str, Any]] = [
-        {
-            "scenario": scenarios.argument(each),
-            "first_seed": sealed(commit, each.name.partition(":")[0]),
-        }
-        for each in of
-    ]
+        datasets = editions.named(edition).datasets
+        typed = [load.load(load.find(name), 1).scenario for name in datasets]
+    lines: list[dict[str, Any]] = []
+    for scenario in typed:
+        first_seed = sealed(commit, scenario.name.partition(":")[0])
+        lines.append({"scenario": scenarios.argument(scenario), "first_seed": first_seed})
     if as_json:
         echo_json(lines)
         return
@@ -286,19 +284,7 @@ def board(
         lines = boards.lines(entries)
         page = boards.write(lines, left_out, out)
         if as_json:
-            echo_json(
-                [
-                    {
-                        "rank": line.rank,
-                        "agents": line.name,
-                        "gain": line.gain,
-                        "made_by": line.entry.contents.made_by,
-                        "success": line.success,
-                        "equal": not any(line.entry.differences.values()),
-                    }
-                    for line in lines
-                ]
-            )
+            echo_json([_line_json(line) for line in lines])
         elif not quiet:
             _show_board(lines)
             typer.echo(f"wrote {printable(page)}")
@@ -306,7 +292,20 @@ def board(
         raise typer.Exit(1)
 
 
+def _line_json(line: "Line") -> dict[str, Any]:
+    """Return a line of a board as `--json` prints it."""
+    return {
+        "rank": line.rank,
+        "agents": line.name,
+        "gain": line.gain,
+        "made_by": line.entry.contents.made_by,
+        "success": line.success,
+        "equal": not any(line.entry.differences.values()),
+    }
+
+
 def _show_board(lines: "Sequence[Line]") -> None:
+    """Print the lines of a board as a table."""
     from harness.runs.metrics import BASELINE
 
     by = next(iter(lines[0].success))

@@ -158,7 +158,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.prompts.get(version) != sha256:
             yield f"its prompt is {printable(version, 40)}, none of its prompts"
         conditions = tuple(str(condition["name"]) for condition in m.conditions)
-        for what, own, wanted in (
+        settings: tuple[tuple[str, object, object], ...] = (
             ("conditions", conditions, self.condition),
             ("seeds", m.seeds, parse_seeds(self.seeds)),
             ("latency", m.settings.latency, self.latency),
@@ -169,9 +169,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ("flip", m.flip, False),
             ("temperature", m.settings.temperature, 0.0),
             ("sampling seed", m.settings.sampling_seed, 0),
-        ):
-            if own != wanted:
-                yield f"its {what}: {printable(own)}, not {printable(wanted)}"
+        )
+        for what, value, wanted in settings:
+            if value != wanted:
+                yield f"its {what}: {printable(value)}, not {printable(wanted)}"
 
     def spec(self, run: Run, source: FrozenSource) -> Spec:
         """Return the evaluation that a run of this edition is;
@@ -221,12 +222,11 @@ def of_file(file: Path) -> Edition:
     except (ValueError, TypeError) as error:  # a date, or a number without an end
         raise UserError(f"{where}: {printable(error)}; give texts and whole numbers") from None
     edition = convert(tables, Edition, where, name=file.stem, digest=sha256)
-    for what, stated, known in (
-        ("metric", edition.metrics, METRICS),
-        ("ranked_by", (edition.ranked_by,), edition.condition),
-    ):
-        if strange := [each for each in stated if each not in known]:
-            raise unknown(f"{what} of {where}", strange[0], known)
+    for metric in edition.metrics:
+        if metric not in METRICS:
+            raise unknown(f"metric of {where}", metric, METRICS)
+    if edition.ranked_by not in edition.condition:
+        raise unknown(f"ranked_by of {where}", edition.ranked_by, edition.condition)
     parse_seeds(edition.seeds)
     resolve.points(edition.condition)
     return edition

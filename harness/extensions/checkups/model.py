@@ -62,9 +62,9 @@ def check(
     if "readout" in can:  # which asks for letters, as a decision does
         can = tuple(mode for mode in can if mode != "decision")
     ego = Agent(card, versions.load(PROMPT), can[0], thinking=thinking)
-    sees = (
-        Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking) if card.vision else None
-    )
+    sees = None
+    if card.vision:
+        sees = Agent(card, versions.load(IMAGE_PROMPT), can[0], thinking=thinking)
     settings = Settings(batch_size=1, device=device, dtype=dtype)
     spec = Spec(ego, FrozenSource(data), (), (0,), settings=settings)
     modes = ("json",) if ego.thinking else can
@@ -74,25 +74,23 @@ def check(
         # the first of a scene's is the ego's
         return next(requests(replace(spec, ego=agent), scenes))
 
-    asked = [question(replace(ego, answer=mode)) for mode in modes]
-    shown = [
-        (
-            question(replace(sees, answer=mode)),
-            question(replace(sees, answer=mode, image="blank")),
-            question(replace(sees, answer=mode, image="none")),
-        )
-        for mode in modes
-        if sees
-    ]
+    questions = [question(replace(ego, answer=mode)) for mode in modes]
+    of_pictures = []
+    if sees:
+        for mode in modes:
+            picture = replace(sees, answer=mode)
+            blank, none = replace(picture, image="blank"), replace(picture, image="none")
+            of_pictures.append((question(picture), question(blank), question(none)))
     backend = open_backend(card, device=device, dtype=dtype, batch_size=1)
-    progress.more(len(asked) + 2 * len(shown))
-    seen = ask(cast("Rendering", backend), asked, shown, progress)
-    read_out = seen.answers.get("readout")
-    if read_out is None or read_out.error is not None or (seen.looks and seen.looks.fault):
-        return Check(spec, seen, None)
+    progress.more(len(questions) + 2 * len(of_pictures))
+    checkup = ask(cast("Rendering", backend), questions, of_pictures, progress)
+    read_out = checkup.answers.get("readout")
+    blind = checkup.looks and checkup.looks.fault
+    if read_out is None or read_out.error is not None or blind:
+        return Check(spec, checkup, None)
     progress.more(COUNT)
     result = examine(backend, ego, progress)
     if isinstance(result, str):
-        return Check(spec, seen, None, result)
-    keep_findings(seen.identity, result)
-    return Check(spec, seen, result)
+        return Check(spec, checkup, None, result)
+    keep_findings(checkup.identity, result)
+    return Check(spec, checkup, result)

@@ -264,11 +264,8 @@ class Calibrated:
         guess = np.where(reader == 0, right, wrong)
         know = np.where(reader <= 1, right, wrong)
 
-        link, jitter, unsure = (
-            np.empty((n, helpers, 2)),
-            np.empty((n, helpers)),
-            np.empty((n, helpers)),
-        )
+        link = np.empty((n, helpers, 2))
+        jitter, unsure = np.empty((n, helpers)), np.empty((n, helpers))
         for h in range(helpers):
             own = noise.generator("calibrated", seed, first, h)
             crossings = np.stack([stratified(own, kind), stratified(own, kind)], axis=1)

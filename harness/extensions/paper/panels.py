@@ -2,9 +2,9 @@
 by the proxy.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.coordination.operating_point import POINTS
 from harness.core.versions import versions
@@ -67,9 +67,11 @@ def run_paper(
     """
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
-    whole, (core, *sweeps, weights) = joined(results), (result.summary for result in results)
+    whole = joined(results)
+    core, *sweeps, weights = [result.summary for result in results]
     numbers = ledger(whole.summary)
-    theirs, proxy = marks(numbers), next(iter(sources.values())).manifest()
+    paper_marks = marks(numbers)
+    proxy = next(iter(sources.values())).manifest()
     episodes = {p.name: p.episodes for p in panels}
     return Study(
         "study",
@@ -93,15 +95,7 @@ def run_paper(
         ],
         [
             *tables(numbers),
-            Table(
-                "What was fitted",
-                ("parameter", "value", "rows of the paper"),
-                [
-                    (name, str(proxy["parameters"].get(name, "")), ", ".join(rows))
-                    for name, rows in proxy["fitted_on"].items()
-                ],
-                "Every parameter that was chosen on rows of the paper.",
-            ),
+            _fitted(proxy),
         ],
         {"conditions": whole.summary, "episodes": whole.episodes, "ledger": numbers},
         {
@@ -113,17 +107,34 @@ def run_paper(
             "versions": versions(),
         },
         numbers,
-        lambda: _figures(core, sweeps, theirs),
+        lambda: _figures(core, sweeps, paper_marks),
+    )
+
+
+def _fitted(proxy: Mapping[str, Any]) -> Table:
+    """Return the table of the proxy's parameters that were chosen on rows of the paper."""
+    rows = []
+    for name, paper_rows in proxy["fitted_on"].items():
+        rows.append((name, str(proxy["parameters"].get(name, "")), ", ".join(paper_rows)))
+    return Table(
+        "What was fitted",
+        ("parameter", "value", "rows of the paper"),
+        rows,
+        "Every parameter that was chosen on rows of the paper.",
     )
 
 
 def _figures(
-    core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]", theirs: "pd.DataFrame"
+    core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]", paper_marks: "pd.DataFrame"
 ) -> "dict[str, Figure]":
+    """Return both figures, with the paper's values as marks."""
     from harness.studies.figures.bars import operating_points
     from harness.studies.figures.lines import along
 
-    return {"figure-a": operating_points(core, theirs), "figure-b": along(sweeps, theirs)}
+    return {
+        "figure-a": operating_points(core, paper_marks),
+        "figure-b": along(sweeps, paper_marks),
+    }
 
 
 def equation_2(weights: "pd.DataFrame") -> str:
@@ -131,9 +142,8 @@ def equation_2(weights: "pd.DataFrame") -> str:
     from the summary of their panel.
     """
     success = weights[weights.metric == "success_rate"].set_index("value")
-    with_it, without = (
-        percent(success.loc[metres], "mean", "ci_low", "ci_high") for metres in (1.0, EQUAL_M)
-    )
+    with_it = percent(success.loc[1.0], "mean", "ci_low", "ci_high")
+    without = percent(success.loc[EQUAL_M], "mean", "ci_low", "ci_high")
     return (
         f"Equation 2 in the calibrated proxy: 6g succeeds in {with_it} % with weights by distance, "
         f"and in {without} % with equal ones. The distances are declared so that the witness "

@@ -9,7 +9,7 @@ worth, and worth decides between equals; of prompts with equal scores, the short
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import chain, repeat
+from itertools import chain, compress, repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -204,25 +204,19 @@ class Tuning:
                 if forest.value[node]:
                     values[scene.record.episode].append(float(policy @ forest.worth[node]))
                 if part.due.seed[row] == spec.seeds[0]:
-                    on_time = part.result.on_time[row]
-                    heard = [
-                        v for v, h in zip(scene.viewers[1:], on_time.tolist(), strict=False) if h
-                    ]
-                    own, *theirs = (
-                        asker.answers.get(f"{scene.id}/{v}") for v in (scene.viewers[0], *heard)
-                    )
-                    action, said = int(part.result.action[row]), tuple(filter(None, theirs))
-                    courses[scene.record.episode].append(
-                        Decision(dataset, scene, policy, action, said, own.raw if own else "")
-                    )
-        return {
-            episode: Played(
-                float(success[n]),
-                float(np.mean(values[episode])) if values[episode] else 0.0,
-                tuple(courses[episode]),
-            )
-            for n, episode in enumerate(dataset.episodes)
-        }
+                    ego, *helpers = scene.viewers
+                    heard = compress(helpers, part.result.on_time[row].tolist())
+                    answers = [asker.answers.get(f"{scene.id}/{helper}") for helper in heard]
+                    messages = tuple(answer for answer in answers if answer)
+                    own = asker.answers.get(f"{scene.id}/{ego}")
+                    action, text = int(part.result.action[row]), own.raw if own else ""
+                    decision = Decision(dataset, scene, policy, action, messages, text)
+                    courses[scene.record.episode].append(decision)
+        played = {}
+        for n, episode in enumerate(dataset.episodes):
+            worth = float(np.mean(values[episode])) if values[episode] else 0.0
+            played[episode] = Played(float(success[n]), worth, tuple(courses[episode]))
+        return played
 
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
         """Take new questions from the budget. Raises Spent, and takes none, if too few are left."""
@@ -251,14 +245,12 @@ class _Asker(Asker):
         question: Question = PLAIN,
     ) -> None:
         first = 0 if question == PLAIN else 1
-        viewers = (range(first, len(self.spec.viewers(scene))) for scene in scenes)
-        wanted = [
-            (scene.id, place, question.name)
-            for scene, there, asked in zip(scenes, viewers, places or repeat(None), strict=False)
-            for place in there
-            if asked is None or place in asked
-        ]
-        self._charge(wanted)
+        questions = []
+        for scene, selected in zip(scenes, places or repeat(None), strict=False):
+            for place in range(first, len(self.spec.viewers(scene))):
+                if selected is None or place in selected:
+                    questions.append((scene.id, place, question.name))
+        self._charge(questions)
         super()._ask_at(scenes, places, question)
 
     def fusion_call(

@@ -57,12 +57,10 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         reward: Reward = "regret",
         distributions: bool = False,
     ) -> None:
-        for name, given, allowed in (
-            ("observation", observation, Observation),
-            ("reward", reward, Reward),
-        ):
-            if given not in get_args(allowed):
-                raise unknown(name, str(given), get_args(allowed))
+        if observation not in get_args(Observation):
+            raise unknown("observation", str(observation), get_args(Observation))
+        if reward not in get_args(Reward):
+            raise unknown("reward", str(reward), get_args(Reward))
         if reward == "regret" and isinstance(source, Roads) and not source.then:
             raise UserError(
                 'reward="regret" needs values; give then="local-view", or reward="success"'

@@ -115,12 +115,10 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
     counts = np.maximum(1, np.round(per_level * len(dangerous) / kinds / alike)).astype(int)
     sizes = np.bincount(forest.tree).tolist()
     seeds = forest.seeds.tolist()
-    draws = np.concatenate(
-        [
-            noise.uniforms((size,), "rows", scenario, seed)
-            for size, seed in zip(sizes, seeds, strict=True)
-        ]
-    )
+    of_trees = []
+    for size, seed in zip(sizes, seeds, strict=True):
+        of_trees.append(noise.uniforms((size,), "rows", scenario, seed))
+    draws = np.concatenate(of_trees)
     levels = forest.tree * (int(forest.step.max()) + 1) + forest.step
     order = np.lexsort((draws, levels))
     order = order[of[order]]

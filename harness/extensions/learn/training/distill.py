@@ -168,17 +168,20 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"
     before = " The base may have learnt from these layouts, as its own card says." if base else ""
     kind = "Qwen3-VL" if facts["sees"] else "Qwen3"
-    losses = "\n".join(
-        f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} |"
-        for stage, curve in facts["curves"].items()
-        if curve
-    )
-    held_out = "\n".join(
-        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
-        f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
-        f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
-        for row in facts["held_out"]
-    )
+    loss_rows = []
+    for stage, curve in facts["curves"].items():
+        if curve:
+            first, last = f"{curve[0][1]:.3f}", f"{curve[-1][1]:.3f}"
+            loss_rows.append(f"| `{stage}` | {plan['samples'][stage]} | {first} | {last} |")
+    held_out_rows = []
+    for row in facts["held_out"]:
+        scenario = row["scenario"]
+        held_out_rows.append(
+            f"| `{scenario}` | {facts['scenes'][scenario]} | {row['layouts']} | "
+            f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
+            f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} |"
+        )
+    losses, held_out = "\n".join(loss_rows), "\n".join(held_out_rows)
     return f"""# {name}
 
 A {kind} of {facts["parameters"]:,} parameters and {facts["vocabulary"]} tokens, trained {begins}

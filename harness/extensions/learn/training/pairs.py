@@ -153,7 +153,9 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
     lessons = Lessons(dataset.scenario, tuple(prompts.values()), scenes, labels)
     for scene in scenes:
         answers = {stored.key: stored for stored in run.answers_by_scene.get(scene.id, ())}
-        for stored in (each for each in answers.values() if ASKED not in each.key):
+        for stored in answers.values():
+            if ASKED in stored.key:
+                continue
             if stored.viewer not in scene.graphs:
                 raise UserError(
                     f"{printable(run.path / 'answers.jsonl')} has an answer of "
@@ -163,11 +165,12 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
                 )
             agent = run.agent(stored)
             prompt = prompts[agent["prompt"]["version"]]
-            said, source = answers, scene
-            if (other := source_of(scene.id, stored.heard)) != scene.id:
-                said = {each.key: each for each in run.answers_by_scene.get(other, ())}
+            messages_by_key, source = answers, scene
+            other = source_of(scene.id, stored.heard)
+            if other != scene.id:
+                messages_by_key = {each.key: each for each in run.answers_by_scene.get(other, ())}
                 [source] = dataset.scenes([other])
-            messages = messages_of(said, stored.heard, run.actions)
+            messages = messages_of(messages_by_key, stored.heard, run.actions)
             asked_with = as_asked(dataset.scenario, scene, stored, source)
             q = question(lessons, asked_with, stored.viewer, prompt, messages)
             texts = shown(agent["image"], q.messages)

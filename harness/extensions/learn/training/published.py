@@ -107,11 +107,9 @@ class Published:
         with torch.no_grad():
             ids = torch.tensor([self.encode("Answer with one letter.")], device=self.model.device)
             states = self.model.base_model(ids).last_hidden_state
-            ours, theirs = (
-                states @ self.model.get_output_embeddings().weight.T,
-                self.model(ids).logits,
-            )
-        if (ours - theirs).abs().max() > _TELLING * max(1.0, float(theirs.abs().max())):
+            of_states = states @ self.model.get_output_embeddings().weight.T
+            logits = self.model(ids).logits
+        if (of_states - logits).abs().max() > _TELLING * max(1.0, float(logits.abs().max())):
             raise UserError(
                 f"--base {printable(self.card.name)} changes its logits, which is not taught here"
             )
@@ -138,19 +136,21 @@ def model_card(name: str, facts: Mapping[str, Any]) -> str:
     base, data and losses.
     """
     plan, adapt = facts["plan"], facts["plan"]["adapt"]
-    losses = "\n".join(
-        f"| `{stage}` | {plan['samples'][stage]} | {curve[0][1]:.3f} | {curve[-1][1]:.3f} | "
-        f"{curve[-1][2]:.3f} |"
-        for stage, curve in facts["curves"].items()
-        if curve
-    )
-    held_out = "\n".join(
-        f"| `{row['scenario']}` | {facts['scenes'][row['scenario']]} | {row['layouts']} | "
-        f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
-        f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} | "
-        f"{row['value_of_the_likeliest']:.3f} | {_shares(row['likeliest'])} |"
-        for row in facts["held_out"]
-    )
+    loss_rows = []
+    for stage, curve in facts["curves"].items():
+        if curve:
+            begins, ends = f"{curve[0][1]:.3f}", f"{curve[-1][1]:.3f} | {curve[-1][2]:.3f}"
+            loss_rows.append(f"| `{stage}` | {plan['samples'][stage]} | {begins} | {ends} |")
+    held_out_rows = []
+    for row in facts["held_out"]:
+        scenario = row["scenario"]
+        held_out_rows.append(
+            f"| `{scenario}` | {facts['scenes'][scenario]} | {row['layouts']} | "
+            f"{row['questions']} | {row['kl_nats']:.3f} | {row['kl_of_the_mean_nats']:.3f} | "
+            f"{row['value']:.3f} | {row['value_of_the_mean']:.3f} | "
+            f"{row['value_of_the_likeliest']:.3f} | {_shares(row['likeliest'])} |"
+        )
+    losses, held_out = "\n".join(loss_rows), "\n".join(held_out_rows)
     kind = (
         f"A LoRA adapter of rank {adapt['rank']} for"
         if adapt["rank"]

@@ -80,10 +80,8 @@ class Student:
         if isinstance(base, Card):
             assert plan.adapt
             self.published = Published(base, plan.adapt, plan.seed, device)
-            self.model, self.letters = (
-                self.published.model,
-                self.published.letters(readout.letters(most)),
-            )
+            self.model = self.published.model
+            self.letters = self.published.letters(readout.letters(most))
             return
         self.tokenizer = read_tokenizer(base, sees) if base else self._tokenizer(sees)
         self.letters = [self.tokenizer.token_to_id(x) for x in readout.letters(most)]
