@@ -23,17 +23,16 @@ def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
     bound_m = np.fmin(least_m, np.fmin.reduce(most_m, axis=(1, 2), initial=np.inf))
     close = centres_m - (farthest_m[..., :1] + farthest_m[..., 1:]) / 2 <= bound_m[:, None, None]
     worlds, frames, vehicles = np.nonzero(close)
-    mine, its = poses[worlds, frames, 0, :3], poses[worlds, frames, 1 + vehicles, :3]
-    sizes, its_sizes = sizes_m[worlds, 0], sizes_m[worlds, 1 + vehicles]
-    at_least_m = separation_m(mine, sizes, its, its_sizes)
+    egos, egos_m = poses[worlds, frames, 0, :3], sizes_m[worlds, 0]
+    others, others_m = poses[worlds, frames, 1 + vehicles, :3], sizes_m[worlds, 1 + vehicles]
+    at_least_m = separation_m(egos, egos_m, others, others_m)
     gaps_m = least_m.copy()
 
     def measure(pairs: Ints) -> None:
-        outlines = (
-            shapely.polygons(rectangle(*pose[pairs].T, *size[pairs].T))
-            for pose, size in ((mine, sizes), (its, its_sizes))
-        )
-        np.minimum.at(gaps_m, worlds[pairs], shapely.distance(*outlines))
+        """Lower the gap of each world to those of some pairs of vehicles."""
+        of_egos = shapely.polygons(rectangle(*egos[pairs].T, *egos_m[pairs].T))
+        of_others = shapely.polygons(rectangle(*others[pairs].T, *others_m[pairs].T))
+        np.minimum.at(gaps_m, worlds[pairs], shapely.distance(of_egos, of_others))
 
     # The pair with the smallest bound in each world is measured first; few others can then be
     # nearer.

@@ -116,9 +116,13 @@ def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = D
 def _witnessed(
     scenario: Scenario, draft: Callable[[Draws, Any], Draft], seed: int, parameters: Parameters
 ) -> Layout:
+    """Return the layout of a seed with exactly as many witnesses as its parameters declare.
+
+    Raises UserError if none of MOST_ATTEMPTS draws has blind seats and lookouts.
+    """
     for attempt in range(MOST_ATTEMPTS):
-        made = draft(Draws(scenario.name, seed, attempt, SEATS), parameters)
-        if all(_fits(scenario, made, phantom, seed, parameters) for phantom in made.phantoms):
+        start = draft(Draws(scenario.name, seed, attempt, SEATS), parameters)
+        if all(_fits(scenario, start, phantom, seed, parameters) for phantom in start.phantoms):
             break
     else:
         raise UserError(
@@ -129,27 +133,29 @@ def _witnessed(
     assert count is not None
     order = noise.generator(scenario.name, seed, "radios").permutation(len(LOOKOUTS)).tolist()
     silent = {LOOKOUTS[n] for n in order[count:]}
-    spawns = [replace(s, part="other") if s.id in silent else s for s in made.layout.spawns]
-    seats = [made.seats[n] for n in order[count:]]
-    danger, danger_id = made.layout.danger, made.phantoms[0].id
-    return Layout.arranged([*spawns, *seats], danger, danger_id, made.layout.buildings)
+    spawns = [replace(s, part="other") if s.id in silent else s for s in start.layout.spawns]
+    spawns += [start.seats[n] for n in order[count:]]
+    danger, danger_id = start.layout.danger, start.phantoms[0].id
+    return Layout.arranged(spawns, danger, danger_id, start.layout.buildings)
 
 
 def _fits(
-    scenario: Scenario, made: Draft, phantom: Spawn, seed: int, parameters: Parameters
+    scenario: Scenario, start: Draft, phantom: Spawn, seed: int, parameters: Parameters
 ) -> bool:
     """Return whether exactly the lookouts have a phantom of the danger in sight.
 
     They have it with all blind seats taken, and nobody else has it with no other one taken:
     so it holds whichever seats are.
     """
-    there = [*(s for s in made.layout.spawns if s.id != phantom.id), phantom]
-    full = _state(scenario, made.layout, [*there, *made.seats], seed)
-    if not all(_see(parameters, [(full, full.vehicle(id_)) for id_ in LOOKOUTS], phantom.id)):
+    spawns = [spawn for spawn in start.layout.spawns if spawn.id != phantom.id]
+    spawns.append(phantom)
+    full = _state(scenario, start.layout, [*spawns, *start.seats], seed)
+    lookouts = [(full, full.vehicle(id_)) for id_ in LOOKOUTS]
+    if not all(_see(parameters, lookouts, phantom.id)):
         return False
-    bare = _state(scenario, made.layout, there, seed)
-    blind = [bare.ego, *(full.vehicle(seat.id) for seat in made.seats)]
-    return not any(_see(parameters, [(bare, vehicle) for vehicle in blind], phantom.id))
+    empty = _state(scenario, start.layout, spawns, seed)  # nobody is in a blind seat
+    blind = [(empty, empty.ego)] + [(empty, full.vehicle(seat.id)) for seat in start.seats]
+    return not any(_see(parameters, blind, phantom.id))
 
 
 def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: int) -> WorldState:

@@ -65,6 +65,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     middle_m = ARM_M + JUNCTION_M
     chosen = SIDES[int(draws.share("side") * len(SIDES))]
     there = {side for side in SIDES if side == chosen or draws.share("both") < p.both_share}

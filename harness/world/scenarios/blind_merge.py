@@ -128,6 +128,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     (at,) = road().crossings.values()
 
     start = draws.between("ego_start", p.ego_start_m)

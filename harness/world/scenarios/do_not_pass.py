@@ -112,6 +112,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
 
     def own(id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps) -> Spawn:
         return Spawn(id_, kind, part, "own", OWN, arc_m, speed_mps)

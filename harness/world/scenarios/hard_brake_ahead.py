@@ -107,6 +107,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
 
     def spawn(id_: str, kind: Kind, part: Any, lane: str, arc_m: float, *brakes: float) -> Spawn:
         return Spawn(id_, kind, part, "own", lane, arc_m, p.speed_mps, *brakes)

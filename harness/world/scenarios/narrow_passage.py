@@ -144,6 +144,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     here = road()
 
     def agent(id_: str, part: Part, way: PathKey, after_s: float) -> Spawn:

@@ -81,6 +81,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     paths, crossings = road().paths, road().crossings
 
     danger = None

@@ -94,6 +94,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     (at,) = road().crossings.values()
     start, offset_s = draws.between("ego_start", p.ego_start_m), draws.between("offset", p.offset_s)
     count = 3 if draws.share("third") < p.third_share else 2

@@ -159,6 +159,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     paths, at = road().paths, road().crossings[SECTORS["oncoming"]]
     quarter_s = PLACE.ring_m * math.pi / 2 / p.speed_mps  # from one entry to the next
     arms = (

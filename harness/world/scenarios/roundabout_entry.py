@@ -120,6 +120,7 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 
 
 def _draft(draws: Draws, p: Parameters) -> Draft:
+    """Draw where everybody starts, with a danger or without."""
     paths, meetings = road().paths, road().crossings
 
     def arm(what: str) -> str:
