@@ -92,6 +92,11 @@ def _write(
     architecture: str,
     describe: Callable[[Any, int], None],
 ) -> None:
+    """Write a GGUF file of a checkpoint's tensors, whose names in it are those of `names`.
+
+    `describe` gets the writer and the file's type, and writes what else is in the file. Raises
+    UserError for a number past the range of `dtype`.
+    """
     from gguf import GGUFWriter, LlamaFileType
 
     writer = GGUFWriter(part, architecture)
@@ -118,6 +123,7 @@ def _write(
 
 
 def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) -> None:
+    """Write what llama.cpp must know of a language model besides the weights."""
     config, tokenizer = saved.config, saved.tokenizer
     writer.add_name(name)
     writer.add_file_type(file_type)
@@ -175,14 +181,13 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
 def _names(saved: Saved) -> dict[str, str]:
     """Return the name of each tensor of the text part in the GGUF, and in the checkpoint."""
     within = "model.language_model" if saved.vision else "model"
-    names = {ours: f"{within}.{theirs}" for theirs, ours in _ENDS.items()}
+    names = {gguf: f"{within}.{name}" for name, gguf in _ENDS.items()}
     if not saved.config["tie_word_embeddings"]:  # else llama.cpp takes the embedding for it
         names["output"] = "lm_head"
     for i in range(saved.config["num_hidden_layers"]):
-        names |= {
-            f"blk.{i}.{ours}": f"{within}.layers.{i}.{theirs}" for theirs, ours in _BLOCK.items()
-        }
-    return {f"{ours}.weight": f"{theirs}.weight" for ours, theirs in names.items()}
+        for name, gguf in _BLOCK.items():
+            names[f"blk.{i}.{gguf}"] = f"{within}.layers.{i}.{name}"
+    return {f"{gguf}.weight": f"{name}.weight" for gguf, name in names.items()}
 
 
 def _describe_projector(vision: Mapping[str, Any], name: str, writer: Any, file_type: int) -> None:
@@ -214,23 +219,24 @@ def _describe_projector(vision: Mapping[str, Any], name: str, writer: Any, file_
 
 def _projector_names(vision: Mapping[str, Any]) -> dict[str, str]:
     """Return each tensor's name in the projector, and in the checkpoint."""
-    pairs = {
-        f"v.blk.{i}.{ours}": f"blocks.{i}.{theirs}"
-        for i in range(vision["depth"])
-        for theirs, ours in _VISION_BLOCK.items()
-    }
-    pairs |= {ours: f"merger.{theirs}" for theirs, ours in _MERGER.items()}
+    layers: dict[str, str] = {}
+    for i in range(vision["depth"]):
+        for name, gguf in _VISION_BLOCK.items():
+            layers[f"v.blk.{i}.{gguf}"] = f"blocks.{i}.{name}"
+    for name, gguf in _MERGER.items():
+        layers[gguf] = f"merger.{name}"
     for place, layer in enumerate(vision["deepstack_visual_indexes"]):
-        pairs |= {
-            f"v.deepstack.{layer}.{ours}": f"deepstack_merger_list.{place}.{theirs}"
-            for theirs, ours in _DEEPSTACK.items()
-        }
-    pairs["v.patch_embd"] = "patch_embed.proj"
-    tensors = {f"{a}.{end}": f"{b}.{end}" for a, b in pairs.items() for end in ("weight", "bias")}
+        for name, gguf in _DEEPSTACK.items():
+            layers[f"v.deepstack.{layer}.{gguf}"] = f"deepstack_merger_list.{place}.{name}"
+    layers["v.patch_embd"] = "patch_embed.proj"
+    tensors: dict[str, str] = {}
+    for gguf, name in layers.items():
+        tensors[f"{gguf}.weight"] = f"{name}.weight"
+        tensors[f"{gguf}.bias"] = f"{name}.bias"
     # A picture is a video of two equal frames, whose weights llama.cpp has apart.
     tensors["v.patch_embd.weight.1"] = tensors["v.patch_embd.weight"]
     tensors["v.position_embd.weight"] = "pos_embed.weight"
-    return {ours: f"model.visual.{theirs}" for ours, theirs in tensors.items()}
+    return {gguf: f"model.visual.{name}" for gguf, name in tensors.items()}
 
 
 def _tensors(
@@ -240,12 +246,12 @@ def _tensors(
     from gguf.utility import SafetensorsLocal
 
     tensors = SafetensorsLocal(checkpoint / "model.safetensors").tensors
-    for ours, theirs in names.items():
-        tensor = tensors.get(theirs)
+    for gguf, name in names.items():
+        tensor = tensors.get(name)
         if tensor is None:
-            raise UserError(f"{shown} lacks {theirs}; save or copy it again")
-        full = dtype == "F32" or len(tensor.shape) == 1 or ours == _FULL
-        yield ours, tensor, np.dtype(np.float32 if full else np.float16)
+            raise UserError(f"{shown} lacks {name}; save or copy it again")
+        full = dtype == "F32" or len(tensor.shape) == 1 or gguf == _FULL
+        yield gguf, tensor, np.dtype(np.float32 if full else np.float16)
 
 
 def _frame(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:

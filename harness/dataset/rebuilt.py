@@ -47,11 +47,12 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
     """Raise UserError if a dataset has a first scene of others, that numbers are reported of."""
     starts = _starts(dataset)
     for other in others:
-        theirs = _starts(other)
-        for start in starts.keys() & theirs.keys():
+        other_starts = _starts(other)
+        for start in starts.keys() & other_starts.keys():
             raise UserError(
                 f"dataset {printable(dataset.path)} has scene {starts[start]}, which is "
-                f"{theirs[start]} of {printable(other.name)}, and numbers are reported of that; "
+                f"{other_starts[start]} of {printable(other.name)}, and numbers are reported of "
+                "that; "
                 "build one of other seeds"
             )
 
