@@ -61,9 +61,10 @@ class Here:
             )
         with TemporaryDirectory(prefix="harness-") as folder:
             done = rescored(file, Path(folder), lambda count: None, self)
-        if wrong := [
-            f"{name}: {figure}" for name, found in done.differences.items() for figure in found
-        ]:
+        wrong = []
+        for name, differences in done.differences.items():
+            wrong += [f"{name}: {figure}" for figure in differences]
+        if wrong:
             raise UserError(
                 f"this installation computes {len(wrong)} figures of {edition.name} otherwise than "
                 f"it pins, such as {printable(wrong[0])}; install a release that has that edition "
@@ -108,12 +109,14 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
         for name, run in edition.entry(stated_runs, limit).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
-            ours, otherwise = computed(run, edition.spec(run, source), place, progress)
-            runs[source.scenario.name] = ours
-            differences[name] = [*differing(run, ours, edition)]
-            if otherwise:
-                differences[name].append(f"{amount(otherwise, 'answer')} of a rule that is here")
-            compared += len(edition.figures(ours))
+            spec = edition.spec(run, source)
+            computed_run, other_answers = computed(run, spec, place, progress)
+            runs[source.scenario.name] = computed_run
+            differences[name] = list(differing(run, computed_run, edition))
+            if other_answers:
+                answers = amount(other_answers, "answer")
+                differences[name].append(f"{answers} of a rule that is here")
+            compared += len(edition.figures(computed_run))
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
     return Rescored(contents, edition, suite, differences, compared, golden=limit is not None)
 

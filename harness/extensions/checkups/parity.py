@@ -147,17 +147,19 @@ def _outputs(
     letters: Sequence[Request],
     rows: int,
 ) -> Outputs:
-    tokens = [
-        backend.chat.encode(backend.chat.render(r.messages, thinking=r.thinking))
-        for r in (*asked, *letters)
-    ]
-    logits = [backend.next_log_probs([r], rows) for r in asked]
-    readouts = [
-        parse(text, role="ego", actions=r.actions).intent or [np.nan] * len(r.actions)
-        for r, text in zip(letters, _texts(backend, letters), strict=True)
-    ]
-    together = np.concatenate(logits) if logits else np.empty((0, rows))
-    return Outputs(tokens, together, _texts(backend, asked), np.array(readouts))
+    """Return what an engine makes of some questions: tokens, logits, texts and read-outs."""
+    tokens = []
+    for request in (*asked, *letters):
+        prompt = backend.chat.render(request.messages, thinking=request.thinking)
+        tokens.append(backend.chat.encode(prompt))
+    logits = np.empty((0, rows))
+    if asked:
+        logits = np.concatenate([backend.next_log_probs([request], rows) for request in asked])
+    readouts = []
+    for request, text in zip(letters, _texts(backend, letters), strict=True):
+        intent = parse(text, role="ego", actions=request.actions).intent
+        readouts.append(intent or [np.nan] * len(request.actions))
+    return Outputs(tokens, logits, _texts(backend, asked), np.array(readouts))
 
 
 def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:

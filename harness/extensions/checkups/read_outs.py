@@ -96,10 +96,12 @@ class Findings(Struct, frozen=True):
 
 
 def _of_scene(pairs: Sequence[Moved]) -> list[Moved]:
+    """Return the pairs whose scenes differ in what is on the road."""
     return [pair for pair in pairs if pair.fact in ("conflict", "gap")]
 
 
 def _moved_of(pairs: Sequence[Moved]) -> str:
+    """Return in how many pairs the answer moved, as `3 of 8`."""
     return f"{sum(pair.moved for pair in pairs)} of {sum(pair.n for pair in pairs)}"
 
 
@@ -113,15 +115,13 @@ def examine(
     reads them. If no scene moved these, the pairs are asked the other way as well: weights may have
     learnt one order alone.
     """
-    reader = replace(
-        agent, answer="readout", letters=agent.letters if agent.answer in BARE else None
-    )
+    letters = agent.letters if agent.answer in BARE else None
+    reader = replace(agent, answer="readout", letters=letters)
     pairs = [*questions.scene_pairs(reader), *questions.plain_pairs(reader)]
-    asked = [
-        *questions.requests(replace(reader, letters="cyclic")),
-        *(half for pair in pairs for half in (pair.present, pair.absent)),
-    ]
-    done = _answers(backend, asked, progress)
+    requests = list(questions.requests(replace(reader, letters="cyclic")))
+    for pair in pairs:
+        requests += [pair.present, pair.absent]
+    done = _answers(backend, requests, progress)
     if isinstance(done, str):
         return done
     of_letters, rest = done[: -2 * len(pairs)], iter(done[-2 * len(pairs) :])

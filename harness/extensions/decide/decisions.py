@@ -131,6 +131,7 @@ def _read(content: str | list[Part]) -> tuple[str, list[str]]:
 
 
 def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
+    """Return a question of a request with its options. Raises Refusal if it has a picture."""
     instructions, images = _read(question.instructions)
     if images:
         raise Refusal("a question's instructions hold a picture; put it into the input")
@@ -139,13 +140,12 @@ def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
             options = [(option.value, option.description) for option in choices]
             return asked(question.name, Question(state, instructions, {}), options)
         case Score(levels=levels):
-            meant = [
-                f"{each.label}: {each.description}" if each.description else each.label
-                for each in levels
-            ]
-            options = [(str(level), meaning) for level, meaning in enumerate(meant)]
+            options = []
+            for number, level in enumerate(levels):
+                description = f": {level.description}" if level.description else ""
+                options.append((str(number), f"{level.label}{description}"))
             whole = asked(question.name, Question(state, instructions, {}, "score"), options)
-            return Asked(whole.name, whole.question, tuple(each.label for each in levels))
+            return Asked(whole.name, whole.question, tuple(level.label for level in levels))
         case Predicate():
             outcomes = [(option, None) for option in ("true", "false")]
             return asked(question.name, Question(state, instructions, {}, "noul"), outcomes)

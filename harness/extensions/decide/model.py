@@ -82,6 +82,10 @@ class ServedModel:
         return [self._request(each, image) for each in enquiry.questions]
 
     def _request(self, asked: Asked, image: Image | None) -> Request:
+        """Return a question as a request, with a picture if there is one.
+
+        Raises Refusal if it has too many options, or is too long.
+        """
         if self._reads_letters and len(asked.options) > len(LETTERS):
             raise Refusal(
                 f"question {printable(asked.name, 40)!r} has {len(asked.options)} options; "

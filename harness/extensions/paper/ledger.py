@@ -63,23 +63,22 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
             continue
         metric, scale, allowed = METRICS[row["metric"]]
         allowed *= low if row["metric"] == "latency" else 1.0
-        for ours in _ours(summary, row, metric):
-            mean, ci_low, ci_high = (float(ours[k]) * scale for k in ("mean", "ci_low", "ci_high"))
-            difference = mean - min(max(mean, low), high)
-            rows.append(
-                {
-                    **place,
-                    "value": "" if ours["value"] is None else ours["value"],
-                    "ours": mean,
-                    "ci_low": ci_low,
-                    "ci_high": ci_high,
-                    "difference": difference,
-                    "allowed": allowed,
-                    "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
-                    "kind": "fitted" if row["id"] in fitted else "predicted",
-                    "assumed": assumed,
-                }
-            )
+        for our_row in _our_rows(summary, row, metric):
+            mean = float(our_row["mean"]) * scale
+            ci_low, ci_high = float(our_row["ci_low"]) * scale, float(our_row["ci_high"]) * scale
+            compared = {
+                **place,
+                "value": "" if our_row["value"] is None else our_row["value"],
+                "ours": mean,
+                "ci_low": ci_low,
+                "ci_high": ci_high,
+                "difference": mean - min(max(mean, low), high),
+                "allowed": allowed,
+                "verdict": verdict(mean, ci_low, ci_high, low - allowed, high + allowed),
+                "kind": "fitted" if row["id"] in fitted else "predicted",
+                "assumed": assumed,
+            }
+            rows.append(compared)
     return pd.DataFrame(rows)
 
 
@@ -91,7 +90,7 @@ def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: floa
     return "misses" if ci_low > most or ci_high < least else "unclear"
 
 
-def _ours(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
+def _our_rows(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
     """Return our rows for one of the paper's: one,
     or those of the grid points that it speaks of.
     """
@@ -121,7 +120,7 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
     `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
     """
     ran = ledger[ledger.kind != "cited"]
-    our_metrics = {theirs: ours for theirs, (ours, *_) in METRICS.items()}
+    our_metrics = {paper_name: our_name for paper_name, (our_name, *_) in METRICS.items()}
     ran = ran.assign(condition=ran.condition.map(CONDITIONS), metric=ran.metric.map(our_metrics))
     ran = ran.rename(columns={"paper_low": "low", "paper_high": "high"})
     return ran[["panel", "condition", "value", "metric", "low", "high"]]
