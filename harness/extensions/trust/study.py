@@ -196,7 +196,7 @@ class Bench:
     seeds: tuple[int, ...]  # of the channel
     cells: Mapping[Key, Cell]
     alone: Floats  # success of an ego that never asks, (S, E)
-    counting: Success  # of all cells
+    success_rule: Success  # of all cells
     caveats: tuple[str, ...] = ()  # what the run lacks
     # why no rule fuses here, where the only one is the linear pool in name
     unfused: str | None = None
@@ -222,19 +222,21 @@ class Bench:
 
     def success(self, *key: Any) -> Estimate:
         """Return what leads in a cell, over episodes."""
-        return self.counting.estimate(self.at(*key).success)
+        return self.success_rule.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
         """Return what a rule costs while nobody attacks:
         its success less the linear pool's, paired.
         """
-        return self.counting.difference(self.at(rule).success, self.at(BASE).success)
+        return self.success_rule.difference(self.at(rule).success, self.at(BASE).success)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
         """Return what an attack takes from a rule:
         success under it less success in peace, paired.
         """
-        return self.counting.difference(self.at(rule, attack, share).success, self.at(rule).success)
+        return self.success_rule.difference(
+            self.at(rule, attack, share).success, self.at(rule).success
+        )
 
     @cached_property
     def holm(self) -> Mapping[Key, float | None]:
@@ -244,7 +246,7 @@ class Bench:
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
         pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
         return dict(
-            zip(keys, corrected([self.counting.p_value(*pair) for pair in pairs]), strict=True)
+            zip(keys, corrected([self.success_rule.p_value(*pair) for pair in pairs]), strict=True)
         )
 
     def clear(self, *key: Any) -> bool:
@@ -259,7 +261,7 @@ class Bench:
 
     def mean(self, rule: str, share: float) -> Estimate:
         """Return the same as a mean over all attacks."""
-        return self.counting.estimate(self.over_attacks(rule, share))
+        return self.success_rule.estimate(self.over_attacks(rule, share))
 
     def over_attacks(self, rule: str, share: float) -> Floats:
         """Return success of every seed and episode, (S, E), as a mean over all attacks."""
@@ -394,8 +396,8 @@ def trust_study(bench: Bench) -> Study:
             f"n = {crossed(n, len(bench.seeds))} under {bench.condition}. All cells have the same "
             "episodes, channel draws and attackers, so differences are paired by episode; 95 % "
             "intervals are over episodes. Price in peace: the difference in "
-            f"{bench.counting.words} from linear while nobody attacks, in points. All figures are "
-            "in figures.csv."
+            f"{bench.success_rule.words} from linear while nobody attacks, in points. All figures "
+            "are in figures.csv."
         ],
         [table for share in bench.shares for table in _tables(bench, share)]
         + [*_detections(bench)],
@@ -415,7 +417,7 @@ def trust_study(bench: Bench) -> Study:
             "dataset": bench.source,
             "condition": bench.condition,
             "cells": cells,
-            "alone": as_mapping(bench.counting.estimate(bench.alone)),
+            "alone": as_mapping(bench.success_rule.estimate(bench.alone)),
             "means": means,
         },
         lambda: {"heat-map": _heat_map(bench)},
@@ -431,7 +433,7 @@ def _cell(bench: Bench, cell: Cell) -> dict[str, Any]:
         "attack": cell.attack or None,
         "share": cell.share,
         "success": as_mapping(over_episodes(SUCCESS, cell.success)),
-        bench.counting.metric: as_mapping(bench.counting.estimate(cell.success)),
+        bench.success_rule.metric: as_mapping(bench.success_rule.estimate(cell.success)),
         "detection": detection or None,
     }
 
@@ -456,8 +458,8 @@ def headline(bench: Bench) -> list[str]:
     and who withstands it.
     """
     share, peace = bench.shares[0], bench.success(BASE)
-    alone, worst = bench.counting.estimate(bench.alone), bench.worst(BASE, share)
-    words = bench.counting.words
+    alone, worst = bench.success_rule.estimate(bench.alone), bench.worst(BASE, share)
+    words = bench.success_rule.words
     if bench.unfused:
         return [
             f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego "
@@ -489,8 +491,8 @@ def headline(bench: Bench) -> list[str]:
 def _worst(bench: Bench, share: float) -> str:
     """Say which attack harms the linear pool most, or that none clearly does."""
     harm = {attack: 1.0 - bench.at(BASE, attack, share).success for attack in bench.attacks}
-    worst, *close = bench.counting.most(harm)
-    left = f"{bench.counting.words} is {shown(bench.success(BASE, worst, share))} %"
+    worst, *close = bench.success_rule.most(harm)
+    left = f"{bench.success_rule.words} is {shown(bench.success(BASE, worst, share))} %"
     if not close:
         return f"{worst} harms the linear pool most: {left}."
     return (
@@ -501,7 +503,7 @@ def _worst(bench: Bench, share: float) -> str:
 
 def _best(bench: Bench, share: float) -> str:
     """Say which rule has the most over all attacks, or that none clearly does."""
-    best, *close = bench.counting.most(
+    best, *close = bench.success_rule.most(
         {rule: bench.over_attacks(rule, share) for rule in bench.rules}
     )
     most, linear = (shown(bench.mean(rule, share)) for rule in (best, BASE))
@@ -542,7 +544,7 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
             cells.append(strong(success, bench.clear(rule, attack, share)))
         rows.append((attack, *cells))
     yield Table(
-        f"{_title(share)}: {bench.counting.words}, %",
+        f"{_title(share)}: {bench.success_rule.words}, %",
         ("attack", *bench.rules),
         rows,
         "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 "
@@ -587,7 +589,7 @@ def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
     place = {"rule": cell.rule, "attack": cell.attack or "none", "share": cell.share}
     estimates = {
         SUCCESS: over_episodes(SUCCESS, cell.success),
-        bench.counting.metric: bench.counting.estimate(cell.success),
+        bench.success_rule.metric: bench.success_rule.estimate(cell.success),
         "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe),
         "nats": over_episodes("nats", cell.nats),
         **{f"detection_{name}": e for name, e in cell.detection().items()},
@@ -597,7 +599,7 @@ def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
     elif cell.attack != EXCLUDED:
         estimates["loss_to_attack"] = bench.loss(*key)
     for name, e in estimates.items():
-        p = bench.holm.get(key) if name == bench.counting.metric else None
+        p = bench.holm.get(key) if name == bench.success_rule.metric else None
         yield {**place, "metric": name, **ends(e), "p_holm_against_linear": p}
     if cell.flagged is not None:
         found = {"value": cell.time_to_detection, "n": len(cell.caught)}
