@@ -116,15 +116,22 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
 
 def test_what_plug_ins_build_on_is_pinned() -> None:
     names = """
-    Attack Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
+    Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
     Formula Fused Ground Hook Intents Ints Kept Lane Layout LayoutDraws Links Messages Metric PERCENT
     Parameters Part Path PathKey Physical Plugins Pool Registration Request Road Rule Run RunFacts
-    Scenario ScheduleInputs Section Spawn Study Table Turn Unit UserError
+    Scenario ScheduleInputs Section Spawn Study Table Unit UserError
     crossings finish_study ground linear_pool link_up read_run straights to_the_left
     """
     # A name that goes stays here for a release, with a warning: docs/extend.md.
     assert sorted(extend.__all__, key=str.lower) == sorted(names.split(), key=str.lower)
     assert all(getattr(extend, name) for name in extend.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'Absent'"):
+        _ = extend.Absent
+
+
+def test_what_an_extension_gives_to_plug_ins_is_there_as_before() -> None:
+    attacks = pytest.importorskip("harness.extensions.trust.attacks")
+    assert (extend.Attack, extend.Turn) == (attacks.Attack, attacks.Turn)
 
 
 def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:

@@ -116,8 +116,8 @@ def test_no_page_of_runs_names_a_folder(typed: Callable[..., str]) -> None:
     typed("run", "export", two, "--csv", "--out", here / "text")
     typed("run", "export", two, "--jsonl", "--out", here / "text")
     typed("run", "export", two, "--junit", here / "episodes.xml")
-    typed("run", "export", two, "--sft", here / "lessons.jsonl", "--report-seeds-too")
-    typed("run", "export", two, "--dpo", here / "pairs.jsonl", "--report-seeds-too")
+    typed("run", "export", one, "--sft", here / "lessons.jsonl", "--report-seeds-too")
+    typed("run", "export", one, "--dpo", here / "pairs.jsonl", "--report-seeds-too")
     if find_spec("inspect_ai"):
         typed("run", "export", two, "--inspect", here / "log.json")
     assert [str(path) for path in found(here.parent.parent)] == []
