@@ -16,6 +16,7 @@ from harness.coordination.consensus import Fused, Messages, capped, inverse_dist
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.parts_of_packages import after_call
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import (
     Bools,
@@ -115,7 +116,7 @@ def fuse(
             raise ValueError(f"operating point {point.name} needs a fusion call")
         fused, seconds = fusion.call(heard.on_time)
         for part in point.more:
-            fused = part.after_call(fused, p, heard.on_time)
+            fused = after_call(part, fused, p, heard.on_time)
         failed = heard_any & np.any(np.isnan(fused), axis=-1)
         latency_s = latency_s + np.where(heard_any, seconds, 0.0)
         fused = np.where((heard_any & ~failed)[..., None], fused, heard.own)

@@ -29,6 +29,7 @@ from harness.coordination.parts import (
     Radio,
     wrong,
 )
+from harness.coordination.parts_of_packages import prepared
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
@@ -427,7 +428,7 @@ class OperatingPoint:
         as its parts have it before anything is made of it.
         """
         for part in self.more:
-            intents = part.before(intents)
+            intents = prepared(part, intents)
         return intents
 
     @property

@@ -19,6 +19,7 @@ from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.parts import PLAIN, Question
+from harness.coordination.parts_of_packages import sources, spoken
 from harness.coordination.plans import NO_PLANS, Plans
 from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents
@@ -228,9 +229,10 @@ def _steps(
         fusions: dict[OperatingPoint, FusionInputs] = {}
         for point, due_here in due.items():
             own = heard(point, answers, due_here)
-            said[point] = speakers[point].said(own, due_here.draws, due_here.episode, due_here.seed)
+            speaker, draws = speakers[point], due_here.draws
+            said[point] = spoken(speaker, own, draws, due_here.episode, due_here.seed)
             sent[point] = exchange(point, said[point].intents, said[point].draws)
-            ties_here = tie_draws(due_here.draws, ties)
+            ties_here = tie_draws(draws, ties)
             fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
         for point, due_here in due.items():
             if point.fusion.rounds > 1:
@@ -395,7 +397,7 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
     its own, unless messages come from elsewhere.
     """
     if point.elsewhere:
-        return point.elsewhere.sources(due.episode, due.seed)
+        return sources(point.elsewhere, due.episode, due.seed)
     return np.arange(len(due.at))
 
 

@@ -1,0 +1,94 @@
+"""The door to a package's parts:
+none writes to what it gets, and what it returns is checked and copied.
+
+So a part moves no condition but its own, in it nothing but what its hook is for, and fails in one
+line, a UserError.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from harness.coordination.intents import Intents
+from harness.coordination.parts import Part
+from harness.coordination.sent import SentIntents, Speaker
+from harness.core.arrays import (
+    Bools,
+    Floats,
+    Ints,
+    check_distributions,
+    check_shape,
+    numbers,
+    read_only,
+)
+from harness.core.strangers import worded
+from harness.radio.channel import Draws
+
+
+def _is_ours(each: object) -> bool:
+    return type(each).__module__.startswith("harness.")
+
+
+def prepared(part: Part, intents: Intents) -> Intents:
+    """Return what vehicles intend as a part has it; it changes distributions alone."""
+    if _is_ours(part):
+        return part.before(intents)
+    with worded(f"part {type(part).__name__}"):
+        after, before = part.before(read_only(intents)).arrays(), intents.arrays()
+        for name in before.keys() - {"own", "helpers"}:
+            if not np.array_equal(before[name], after[name], equal_nan=True):
+                raise ValueError(f"it changes {name}, which nobody intends")
+        own = _distributions("the ego's intents", after["own"], intents.own)
+        helpers = _distributions("helpers' intents", after["helpers"], intents.helpers)
+        return replace(intents, own=own, helpers=helpers)
+
+
+def spoken(
+    speaker: Speaker, truth: Intents, draws: Draws, episode: Ints, seed: Ints
+) -> SentIntents:
+    """Return what a part's speaker says; nothing of the ego's is another's to say."""
+    if _is_ours(speaker):
+        return speaker.said(truth, draws, episode, seed)
+    with worded(f"speaker {type(speaker).__name__}"):
+        sent = speaker.said(read_only(truth), read_only(draws), read_only(episode), read_only(seed))
+        now = sent.intents
+        for name, before, after in (
+            ("intent", truth.own, now.own),
+            ("place", truth.distance_m[:, 0], now.distance_m[:, 0]),
+            ("time", truth.inference_s[:, 0], now.inference_s[:, 0]),
+        ):
+            if not np.array_equal(before, after, equal_nan=True):
+                raise ValueError(f"it changes the ego's {name}")
+        check_shape("attackers", sent.attackers, now.valid.shape)
+        answered = now.valid if now.unasked is None else now.valid & ~now.unasked
+        check_distributions("intents", now.helpers, answered)
+    return sent
+
+
+def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
+    """Return the decision whose helpers each hears, one of those that there are."""
+    if _is_ours(part):
+        return part.sources(episode, seed)
+    with worded(f"part {type(part).__name__}"):
+        places = part.sources(read_only(episode), read_only(seed))
+        check_shape("sources", places, episode.shape)
+        if places.dtype.kind not in "iu" or np.any((places < 0) | (places >= len(episode))):
+            raise ValueError("sources that are no decisions")
+        return places.astype(np.int64)
+
+
+def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floats:
+    """Return the policies of a fusion call as a part has them."""
+    if _is_ours(part):
+        return part.after_call(fused, intents, heard)
+    with worded(f"part {type(part).__name__}"):
+        after = part.after_call(read_only(fused), read_only(intents), read_only(heard))
+        return _distributions("policies", after, fused)
+
+
+def _distributions(name: str, after: object, before: Floats) -> Floats:
+    """Return a part's rows (..., A), copied; those that held an answer hold a distribution."""
+    values = numbers(name, after, before.shape)
+    answered: Bools = ~np.any(np.isnan(before), axis=-1)
+    check_distributions(name, values, answered)
+    return values

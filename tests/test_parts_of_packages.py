@@ -1,0 +1,128 @@
+"""What a package's part may do: it moves its own condition alone, and fails in one line."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.coordination.intents import Intents
+from harness.coordination.parts import Part
+from harness.coordination.parts_of_packages import after_call, prepared, said, sources
+from harness.coordination.sent import SentIntents
+from harness.core.errors import UserError
+from harness.radio.channel import Draws
+
+P = np.full((2, 2), 0.5)
+PLACES = np.arange(2)
+NOBODY = np.zeros((2, 2), dtype=bool)
+DRAWS = Draws(P, np.full((2, 1), 0.5))
+
+
+def intents() -> Intents:
+    own = np.array([[0.2, 0.8], [np.nan, np.nan]])
+    return Intents(own, np.full((2, 2, 2), 0.5), ~NOBODY, np.ones((2, 3)), 2 * P, 2 * P,
+                   np.ones((2, 3)))  # fmt: skip
+
+
+def written(given: Any) -> Any:
+    given[:] = 0
+    return given
+
+
+def of_part(hook: str, act: Callable[..., Any]) -> Part:
+    kind: Any = type("Mine", (Part,), {hook: lambda self, *given: act(*given)}, frozen=True)
+    made: Part = kind()
+    return made
+
+
+@dataclass
+class Speaks:
+    act: Callable[[Intents], Any]
+
+    def said(self, truth: Intents, *given: Any) -> Any:
+        return self.act(truth)
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda i: replace(i, own=written(i.own)), "read-only"),
+        (lambda i: replace(i, inference_s=0 * i.inference_s), "it changes inference_s"),
+        (lambda i: replace(i, range_m=0 * i.range_m), "it changes range_m"),
+        (lambda i: replace(i, own=2 * i.own), "the ego's intents that are no distributions"),
+        (lambda i: replace(i, helpers=np.nan * i.helpers), "helpers' intents that are no distr"),
+        (lambda i: replace(i, helpers=i.helpers[:, :1]), "helpers' intents of shape (2, 1, 2)"),
+        (lambda i: None, "no attribute 'arrays'"),
+    ],
+)
+def test_a_part_prepares_intents_and_nothing_else(act: Callable[..., Any], says: str) -> None:
+    before = intents()
+    with pytest.raises(UserError) as error:
+        prepared(of_part("before", act), before)
+    assert str(error.value).startswith("part Mine fails (")
+    assert says in str(error.value)
+    assert np.array_equal(before.own, intents().own, equal_nan=True)
+
+
+def test_a_part_may_turn_intents_round_and_an_answer_that_failed_stays_so() -> None:
+    turned = of_part("before", lambda i: replace(i, own=i.own[:, ::-1]))
+    own = prepared(turned, intents()).own
+    assert own.tolist()[0] == [0.8, 0.2]
+    assert np.isnan(own[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda t: SentIntents(t, DRAWS, written(t.valid)), "read-only"),
+        (lambda t: SentIntents(replace(t, own=0 * t.own), DRAWS, NOBODY), "it changes the ego's i"),
+        (
+            lambda t: SentIntents(replace(t, inference_s=0 * t.inference_s), DRAWS, NOBODY),
+            "it changes the ego's time",
+        ),
+        (
+            lambda t: SentIntents(replace(t, helpers=9 * t.helpers), DRAWS, NOBODY),
+            "intents that are no distributions",
+        ),
+        (lambda t: SentIntents(t, DRAWS, NOBODY[0]), "attackers of shape (2,)"),
+        (lambda t: (t, DRAWS, NOBODY), "no attribute 'intents'"),
+    ],
+)
+def test_a_speaker_says_nothing_of_the_egos(act: Callable[..., Any], says: str) -> None:
+    with pytest.raises(UserError) as error:
+        said(Speaks(act), intents(), DRAWS, PLACES, PLACES)
+    assert str(error.value).startswith("speaker Speaks fails (")
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ([0, 1], "sources of type list"),
+        (np.array([0]), "sources of shape (1,)"),
+        (np.array([0.0, 1.0]), "sources that are no decisions"),
+        (np.array([-1, 0]), "sources that are no decisions"),
+        (np.array([0, 2]), "sources that are no decisions"),
+    ],
+)
+def test_messages_come_from_decisions_that_there_are(given: Any, says: str) -> None:
+    with pytest.raises(UserError) as error:
+        sources(of_part("sources", lambda *_: given), PLACES, PLACES)
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda fused, p, heard: written(p)[:, 0], "read-only"),
+        (lambda fused, p, heard: 5 * fused, "policies that are no distributions"),
+        (lambda fused, p, heard: np.nan * fused, "policies that are no distributions"),
+        (lambda fused, p, heard: None, "policies of type NoneType"),
+    ],
+)
+def test_the_last_word_on_a_call_is_a_policy(act: Callable[..., Any], says: str) -> None:
+    with pytest.raises(UserError) as error:
+        after_call(of_part("after_call", act), P, np.full((2, 3, 2), 0.5), ~NOBODY)
+    assert says in str(error.value)
