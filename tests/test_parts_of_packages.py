@@ -9,7 +9,7 @@ import pytest
 
 from harness.coordination.intents import Intents
 from harness.coordination.parts import Part
-from harness.coordination.parts_of_packages import after_call, prepared, said, sources
+from harness.coordination.parts_of_packages import after_call, prepared, sources, spoken
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
 from harness.radio.channel import Draws
@@ -92,7 +92,7 @@ def test_a_part_may_turn_intents_round_and_an_answer_that_failed_stays_so() -> N
 )
 def test_a_speaker_says_nothing_of_the_egos(act: Callable[..., Any], says: str) -> None:
     with pytest.raises(UserError) as error:
-        said(Speaks(act), intents(), DRAWS, PLACES, PLACES)
+        spoken(Speaks(act), intents(), DRAWS, PLACES, PLACES)
     assert str(error.value).startswith("speaker Speaks fails (")
     assert says in str(error.value)
 
