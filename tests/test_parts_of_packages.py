@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Part
+from harness.coordination.operating_point import OperatingPoint, kept_of
+from harness.coordination.parts import Kept, Part
 from harness.coordination.parts_of_packages import after_call, prepared, sources, spoken
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
@@ -125,4 +127,21 @@ def test_messages_come_from_decisions_that_there_are(given: Any, says: str) -> N
 def test_the_last_word_on_a_call_is_a_policy(act: Callable[..., Any], says: str) -> None:
     with pytest.raises(UserError) as error:
         after_call(of_part("after_call", act), P, np.full((2, 3, 2), 0.5), ~NOBODY)
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("hook", "act", "says"),
+    [
+        ("check", lambda: next(iter(())), "part Mine fails (StopIteration at"),
+        ("kept", lambda: {"x": {"../y": Kept(1)}}, "../y to keep is no plain name"),
+        ("kept", lambda: {"..": {"y": Kept(1)}}, ".. to keep is no plain name"),
+        ("kept", lambda: {"x": {"y": Kept(object())}}, "Encoding objects of type object"),
+    ],
+)
+def test_a_part_that_fails_as_a_run_begins_is_one_line(
+    hook: str, act: Callable[[], Any], says: str
+) -> None:
+    with pytest.raises(UserError) as error:
+        kept_of([cast(OperatingPoint, SimpleNamespace(more=[of_part(hook, act)]))])
     assert says in str(error.value)

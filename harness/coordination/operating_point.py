@@ -6,8 +6,10 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from itertools import chain
+from pathlib import PurePath
 from typing import Any, Literal, NamedTuple, get_type_hints
 
+import msgspec
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
@@ -27,6 +29,8 @@ from harness.coordination.parts import (
     Part,
     Question,
     Radio,
+    telling,
+    worded_part,
     wrong,
 )
 from harness.coordination.parts_of_packages import prepared
@@ -173,7 +177,8 @@ class OperatingPoint:
             allowed = f"left out where {self.asks_twice}, which asks twice"
             raise wrong("round_trip", self.cloud.round_trip, allowed)
         for part in self.more:
-            part.check_with(self)
+            with telling(part):
+                part.check_with(self)
         if self.content.asks_again and self.radio.edge == FUSION:
             raise wrong(
                 "edge",
@@ -521,8 +526,13 @@ def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
     kept: dict[str, dict[str, Kept]] = {}
     for point in points:
         for part in point.more:
-            for folder, by_name in part.kept().items():
-                kept.setdefault(folder, {}).update(by_name)
+            with worded_part(part):
+                for folder, by_name in part.kept().items():
+                    for name in (folder, *by_name):
+                        if name == ".." or name != PurePath(name).name:
+                            raise ValueError(f"{name} to keep is no plain name")
+                    msgspec.json.encode([each.record for each in by_name.values()])
+                    kept.setdefault(folder, {}).update(by_name)
     return kept
 
 

@@ -4,7 +4,8 @@ Each part checks itself and raises ValueError with the setting, its value and wh
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
@@ -18,6 +19,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import printable, unknown
+from harness.core.strangers import worded
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 
@@ -139,7 +141,8 @@ class Part(Struct, frozen=True, kw_only=True):
             except (ValidationError, OverflowError):
                 raise wrong(key, value, str(description(hint))) from None
             structs.force_setattr(self, key, converted)
-        self.check()
+        with telling(self):
+            self.check()
 
     def check(self) -> None:
         """Raise ValueError or UserError for what no single setting's type says."""
@@ -204,6 +207,31 @@ class Part(Struct, frozen=True, kw_only=True):
         NaN may be there.
         """
         return intents
+
+
+def is_ours(part: object) -> bool:
+    """Return whether a part is the harness's own, and no package's."""
+    return type(part).__module__.startswith("harness.")
+
+
+def worded_part(part: Part) -> AbstractContextManager[None]:
+    """Let a part act: what fails in a package's is one line, a UserError."""
+    return worded(f"part {type(part).__name__}", built_in=is_ours(part))
+
+
+@contextmanager
+def telling(part: Part) -> Iterator[None]:
+    """Let a part say what does not go, by ValueError;
+    what else fails in a package's is one line, a UserError.
+    """
+    refused = None
+    with worded_part(part):
+        try:
+            yield
+        except ValueError as error:
+            refused = error
+    if refused:
+        raise refused
 
 
 def wrong(key: str, value: object, allowed: str) -> ValueError:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Part
+from harness.coordination.parts import Part, is_ours, worded_part
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.arrays import (
     Bools,
@@ -25,15 +25,11 @@ from harness.core.strangers import worded
 from harness.radio.channel import Draws
 
 
-def _is_ours(each: object) -> bool:
-    return type(each).__module__.startswith("harness.")
-
-
 def prepared(part: Part, intents: Intents) -> Intents:
     """Return what vehicles intend as a part has it; it changes distributions alone."""
-    if _is_ours(part):
+    if is_ours(part):
         return part.before(intents)
-    with worded(f"part {type(part).__name__}"):
+    with worded_part(part):
         after, before = part.before(read_only(intents)).arrays(), intents.arrays()
         for name in before.keys() - {"own", "helpers"}:
             if not np.array_equal(before[name], after[name], equal_nan=True):
@@ -47,7 +43,7 @@ def spoken(
     speaker: Speaker, truth: Intents, draws: Draws, episode: Ints, seed: Ints
 ) -> SentIntents:
     """Return what a part's speaker says; nothing of the ego's is another's to say."""
-    if _is_ours(speaker):
+    if is_ours(speaker):
         return speaker.said(truth, draws, episode, seed)
     with worded(f"speaker {type(speaker).__name__}"):
         sent = speaker.said(read_only(truth), read_only(draws), read_only(episode), read_only(seed))
@@ -67,9 +63,9 @@ def spoken(
 
 def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
     """Return the decision whose helpers each hears, one of those that there are."""
-    if _is_ours(part):
+    if is_ours(part):
         return part.sources(episode, seed)
-    with worded(f"part {type(part).__name__}"):
+    with worded_part(part):
         places = part.sources(read_only(episode), read_only(seed))
         check_shape("sources", places, episode.shape)
         if places.dtype.kind not in "iu" or np.any((places < 0) | (places >= len(episode))):
@@ -79,9 +75,9 @@ def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
 
 def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floats:
     """Return the policies of a fusion call as a part has them."""
-    if _is_ours(part):
+    if is_ours(part):
         return part.after_call(fused, intents, heard)
-    with worded(f"part {type(part).__name__}"):
+    with worded_part(part):
         after = part.after_call(read_only(fused), read_only(intents), read_only(heard))
         return _distributions("policies", after, fused)
 

@@ -15,6 +15,7 @@ from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
+from harness.coordination.parts import worded_part
 from harness.coordination.plans import NO_PLANS
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
@@ -294,7 +295,9 @@ class Spec:
         if point.content.plan and not self.several_decide:
             raise UserError(NO_PLANS.format(printable(point.name)))
         for part in point.more:
-            if obstacle := part.obstacle(point, self):
+            with worded_part(part):
+                obstacle = part.obstacle(point, self)
+            if obstacle:
                 raise UserError(f"{shown}: {obstacle}")
         if point.has_fusion_call and point.content.graph and ego.can.language_model:
             self._check_shows_objects(shown)
