@@ -426,6 +426,20 @@ def test_an_answer_to_messages_that_is_no_fusion_calls_is_named(run: Path) -> No
     assert "heard messages, and is no fusion call's" in refused(run, "answers.jsonl")
 
 
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [
+        ({"viewer": "v1~blind!liar"}, "is of a viewer that no vehicle is"),
+        ({"role": "zork"}, "has role zork; known: ego, helper, merge"),
+    ],
+)
+def test_an_answer_of_nobody_or_of_no_role_is_named(
+    stated: dict[str, str], says: str, run: Path
+) -> None:
+    damage(run, answer=lambda row: row.update(stated))
+    assert says in refused(run, "answers.jsonl")
+
+
 def test_a_run_saved_with_a_byte_order_mark_is_the_same_run(run: Path) -> None:
     before = folder.read(run).manifest
     (run / "run.json").write_bytes(b"\xef\xbb\xbf" + (run / "run.json").read_bytes())

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, kept_of
-from harness.coordination.parts import Kept, Part
+from harness.coordination.operating_point import OperatingPoint, kept_of, named_point
+from harness.coordination.parts import Kept, Part, Question
 from harness.coordination.parts_of_packages import after_call, prepared, sources, spoken
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
@@ -145,3 +145,26 @@ def test_a_part_that_fails_as_a_run_begins_is_one_line(
     with pytest.raises(UserError) as error:
         kept_of([cast(OperatingPoint, SimpleNamespace(more=[of_part(hook, act)]))])
     assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("hook", "value", "ask"),
+    [
+        ("needs", property(lambda part: 1 / 0), lambda point: point.needs("claims")),
+        ("needs", None, lambda point: point.needs("claims")),
+        ("needs_all", property(lambda part: 1 / 0), lambda point: point.needs_all),
+        ("question", Question("zork"), lambda point: point.question),
+        ("question", None, lambda point: point.question),
+        ("elsewhere", np.zeros(2), lambda point: point.elsewhere),
+        ("changes", lambda part, words, objects: None, lambda point: point.rewrites),
+        ("speaker", lambda part: 1 / 0, lambda point: point.speaker()),
+    ],
+)
+def test_what_a_part_says_of_itself_is_asked_behind_the_door(
+    hook: str, value: Any, ask: Callable[[OperatingPoint], Any]
+) -> None:
+    kind = type("Mine", (Part,), {hook: value}, frozen=True)
+    point = named_point("6g:tau=0.5")
+    object.__setattr__(point, "more", (kind(),))
+    with pytest.raises(UserError, match=r"^part Mine fails \("):
+        ask(point)

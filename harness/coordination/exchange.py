@@ -171,7 +171,7 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
         return nobody
-    if any(part.needs_all for part in point.more):
+    if point.needs_all:
         return nobody | np.isfinite(intents.range_m)
     known = _base_knowledge(point, intents)[1]
     if getattr(SCHEDULES[point.ask.schedule], "by_presence", True):

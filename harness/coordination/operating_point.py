@@ -456,8 +456,21 @@ class OperatingPoint:
         if self.radio.profile is None:
             return frozenset()
         rule = RULES.get(self.fusion.consensus)
-        parts = (SCHEDULES[self.ask.schedule], rule, *self.more)
-        return frozenset(need for part in parts for need in getattr(part, "needs", ()))
+        plug_ins = (SCHEDULES[self.ask.schedule], rule)
+        needs = {need for plug_in in plug_ins for need in getattr(plug_in, "needs", ())}
+        for part in self.more:
+            with worded_part(part):
+                needs.update(part.needs)
+        return frozenset(needs)
+
+    @cached_property
+    def needs_all(self) -> bool:
+        """Whether a part of it needs what every helper intends that is present."""
+        needing = []
+        for part in self.more:
+            with worded_part(part):
+                needing.append(bool(part.needs_all))
+        return any(needing)
 
     @property
     def content(self) -> Content:
@@ -488,12 +501,24 @@ class OperatingPoint:
         """What helpers are asked."""
         if self.radio.profile is None:
             return PLAIN
-        return next((part.question for part in self.more if part.question != PLAIN), PLAIN)
+        for part in self.more:
+            with worded_part(part):
+                question = part.question
+                if question not in (PLAIN, *part.questions):
+                    raise ValueError("it asks what is none of its questions")
+            if question != PLAIN:
+                return question
+        return PLAIN
 
     @cached_property
     def elsewhere(self) -> Part | None:
         """The part by which messages come from other scenes; None if they are helpers' own."""
-        return next((part for part in self.more if part.elsewhere), None)
+        for part in self.more:
+            with worded_part(part):
+                elsewhere = bool(part.elsewhere)
+            if elsewhere:
+                return part
+        return None
 
     @property
     def rewrites(self) -> "Rewrites":
@@ -506,14 +531,19 @@ class OperatingPoint:
 
     def _changes(self, shows: str, graph: str) -> Changes:
         """Return what parts change of messages whose words or objects a fusion call shows."""
-        each = [part.changes(bool(shows), bool(graph)) for part in self.more]
+        each = []
+        for part in self.more:
+            with worded_part(part):
+                each.append(Changes(*part.changes(bool(shows), bool(graph))))
         of_attackers = "&".join(filter(None, (changes.of_attackers for changes in each)))
         return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
 
     def speaker(self) -> Speaker:
         """Return what says to the channel what vehicles intend, in one walk."""
         for part in self.more:
-            if speaker := part.speaker():
+            with worded_part(part):
+                speaker = part.speaker()
+            if speaker:
                 return speaker
         return Honest()
 

@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 
 from harness.core.arrays import ROUNDING, Floats
-from harness.runs.records import Answer, roles
+from harness.runs.records import ASKED, REWRITTEN, Answer, roles
 
 _ANSWER = msgspec.json.Decoder(Answer)
+MARKS = f"{ASKED}{REWRITTEN}/+"  # in keys, beside who answered
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class Answers:
                     raise ValueError(
                         f"answer {answer.id} has role {answer.role}; known: {', '.join(known)}"
                     )
+                if any(mark in answer.viewer for mark in MARKS):
+                    raise ValueError(f"answer {answer.id} is of a viewer that no vehicle is")
                 if answer.heard and answer.role != "merge":
                     raise ValueError(f"answer {answer.id} heard messages, and is no fusion call's")
                 if answer.scene != scene:
