@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from itertools import chain
-from pathlib import PurePath
 from typing import Any, Literal, NamedTuple, get_type_hints
 
 import msgspec
@@ -559,7 +558,7 @@ def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
             with worded_part(part):
                 for folder, by_name in part.kept().items():
                     for name in (folder, *by_name):
-                        if name == ".." or name != PurePath(name).name:
+                        if name in ("", ".", "..") or {"/", "\\"} & set(name):
                             raise ValueError(f"{name} to keep is no plain name")
                     msgspec.json.encode([each.record for each in by_name.values()])
                     kept.setdefault(folder, {}).update(by_name)
