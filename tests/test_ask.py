@@ -31,6 +31,8 @@ from harness.studies import replayed_run
 from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 
+pytest.importorskip("harness.extensions")  # whose conditions are asked under, too
+
 # Some ask nobody, few, those who are there, by who is there, again where an answer fails, or what
 # helpers intended before; and some hear other helpers, or blind ones.
 POINTS = (
