@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from harness.core.files import canonical_json
 from harness.evaluate.asking import payload_bits
-from harness.runs.answers import Answers
+from harness.runs.answers import MARKS, Answers
 from harness.runs.records import Answer
 
 ANSWER = Answer(
@@ -17,7 +17,8 @@ ANSWER = Answer(
     prompt_sha256="", status="strict", verdict="strict", repairs=(), intent=(0.2, 0.3, 0.5), mass=1.0,
     message=None, detail="",
 )  # fmt: skip
-NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=3)
+# Without the marks that stand beside names in keys.
+NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters=MARKS), max_size=3)
 MADE = st.lists(
     st.builds(
         lambda scene, viewer, raw: msgspec.structs.replace(ANSWER, scene=scene, viewer=viewer, raw=raw),
