@@ -22,7 +22,7 @@ def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
     for name, entry in added(GROUP).items():
         what = f"part {printable(name)} of an extension"
         try:
-            with worded(what), aside(what):
+            with worded(what, door=aside):
                 kind = entry.load()
                 _check(what, kind, settings)
                 kind()  # its defaults are allowed

@@ -19,7 +19,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import printable, unknown
-from harness.core.strangers import worded
+from harness.core.strangers import is_ours, worded
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 
@@ -207,11 +207,6 @@ class Part(Struct, frozen=True, kw_only=True):
         NaN may be there.
         """
         return intents
-
-
-def is_ours(part: object) -> bool:
-    """Return whether a part is the harness's own, and no package's."""
-    return type(part).__module__.startswith("harness.")
 
 
 def worded_part(part: Part) -> AbstractContextManager[None]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Part, is_ours, worded_part
+from harness.coordination.parts import Part, worded_part
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.arrays import (
     Bools,
@@ -21,7 +21,7 @@ from harness.core.arrays import (
     numbers,
     read_only,
 )
-from harness.core.strangers import worded
+from harness.core.strangers import is_ours, worded
 from harness.radio.channel import Draws
 
 

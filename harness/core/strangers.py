@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 
 from harness.core.errors import UserError, printable
 from harness.core.process import Stop
@@ -48,17 +48,27 @@ def aside(what: str) -> Iterator[None]:
         yield
 
 
+def is_ours(thing: object) -> bool:
+    """Return whether a thing's class is the harness's own, and no package's."""
+    return type(thing).__module__.startswith("harness.")
+
+
 @contextmanager
-def worded(what: str, built_in: bool = False) -> Iterator[None]:
+def worded(
+    what: str,
+    built_in: bool = False,
+    door: Callable[[str], AbstractContextManager[None]] = strangers,
+) -> Iterator[None]:
     """Run a package's code whose errors end a run; code that is `built_in` runs as it is.
 
-    Raises UserError, in one line that names the package's thing, `what`, and where it failed.
+    The `door` is `strangers` or `aside`. Raises UserError, in one line that names the package's
+    thing, `what`, and where it failed.
     """
     if built_in:
         yield
         return
     try:
-        with strangers(what):
+        with door(what):
             yield
     except UserError:
         raise

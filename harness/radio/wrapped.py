@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from harness.core import strangers
 from harness.core.arrays import Floats, Ints, check_shape, numbers, read_only
 from harness.radio.channel import (
     REQUEST,
@@ -51,7 +52,7 @@ def innermost(channel: Channel) -> Channel:
 
 def is_ours(channel: Channel) -> bool:
     """Return whether a channel's model is the harness's own, and no package's."""
-    return type(innermost(channel)).__module__.startswith("harness.")
+    return strangers.is_ours(innermost(channel))
 
 
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:

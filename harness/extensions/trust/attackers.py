@@ -18,7 +18,7 @@ from harness.coordination.sent import SentIntents
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, check_distributions, check_shape, read_only
 from harness.core.errors import UserError, printable
-from harness.core.strangers import worded
+from harness.core.strangers import is_ours, worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
 from harness.extensions.trust.attacks import Attack, Turn, attackers
 from harness.radio.channel import Draws
@@ -89,7 +89,7 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
     or lets a voice say no distribution.
     """
     kind = type(attack)
-    if kind.__module__.startswith("harness."):
+    if is_ours(attack):
         return attack.act(said, turn)
     with worded(f"attack {kind.__name__} of {printable(kind.__module__)}"):
         after = attack.act(read_only(said), read_only(turn))
