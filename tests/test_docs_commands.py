@@ -363,10 +363,10 @@ class Followed:
             else:
                 path, _ = parsed(args)
                 cut = "" if shown.strip() else CUT.get(command, CUT.get(path, ""))
-                code, out, _ = self.reader(*args, *cut.split())
-            if lacks := re.search(r"needs (\S+), which is not installed", out):
+                code, out, problem = self.reader(*args, *cut.split())
+            if lacks := re.search(r"needs (\S+), which is not installed", out + problem):
                 pytest.skip(f"followed up to here: {line} needs {lacks[1]}")
-            assert code == CUT_ENDS.get(command, says), f"{line}\n{out}"
+            assert code == CUT_ENDS.get(command, says), f"{line}\n{out}\n{problem}"
             self.compare(line, shown, out)
         elif program in ("cp", "echo", "sed"):
             subprocess.run(line, shell=True, check=True)

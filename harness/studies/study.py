@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from harness.report.drawing.pictures import Format
+
+DRAWN: "tuple[Format, ...]" = ("svg", "pdf", "png")  # the kinds of picture in a study's folder
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency")  # of a source, what makes a study another one
 
@@ -111,11 +114,11 @@ def undrawn(study: Study) -> UserError | None:
 
 def _pictures(study: Study, out: Path) -> dict[str, tuple[str, int]]:
     """Draw the figures into a folder; return each as an address, with its width in rem."""
-    from harness.report.drawing.pictures import FORMATS, save
+    from harness.report.drawing.pictures import save
 
     pictures = {}
     for stem, figure in study.figures().items():
-        for kind in FORMATS:
+        for kind in DRAWN:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
         width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
         pictures[stem] = picture(on_dark_too(bytes_of(out / f"{stem}.svg", "picture"))), width_rem
