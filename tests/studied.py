@@ -33,7 +33,6 @@ from harness.core.files import sha256_file
 from harness.dataset import rebuilt
 from harness.evaluate import lifecycle
 from harness.evaluate import run as evaluation
-from harness.report.drawing import pictures
 from harness.studies import repeats
 
 BOTH = "--condition single-local --condition 6g"
@@ -267,7 +266,7 @@ def stands_still() -> Iterator[None]:
         patch.setattr(rebuilt, "differences", lambda dataset: iter(()))
         patch.setattr(rebuilt, "_reported", lambda scenario: iter(()))
         # the pictures of a study take longer than all else
-        patch.setattr(pictures, "FORMATS", ("svg",))
+        patch.setattr("harness.studies.study.DRAWN", ("svg",))
         yield
 
 

@@ -56,8 +56,8 @@ NAMES: dict[Words, str] = {
 TYPES = """
 import contextlib, io, json, sys
 from harness import cli
-from harness.report.drawing import pictures
-pictures.FORMATS = ("svg",)  # of which others take longest
+from harness.studies import study
+study.DRAWN = ("svg",)  # of which others take longest
 told = []
 for words in json.load(sys.stdin):
     sys.argv = ["harness", *words]

@@ -22,7 +22,6 @@ from msgspec import structs
 
 from harness.cli import main
 from harness.coordination.operating_point import more_parts
-from harness.report.drawing import pictures
 
 Row = dict[str, str]
 Table = list[Row]
@@ -44,7 +43,7 @@ def typed(*arguments: str | Path) -> str:
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as printed:
         patch.setattr(sys, "argv", command)
         # pictures take longer than all else, and none is golden
-        patch.setattr(pictures, "FORMATS", ("svg",))
+        patch.setattr("harness.studies.study.DRAWN", ("svg",))
         with pytest.raises(SystemExit) as ended:
             main()
     assert not ended.value.code, f"`{' '.join(command)}` ended with {ended.value.code}"

@@ -127,7 +127,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
 
     with pytest.MonkeyPatch.context() as patch, playing.project(COMPLETIONS, folder) as missing:
         patch.chdir(folder)
-        patch.setattr("harness.report.drawing.pictures.FORMATS", ("svg",))  # tables are looked at
+        patch.setattr("harness.studies.study.DRAWN", ("svg",))  # tables are looked at
         patch.setenv("NO_PROXY", "127.0.0.1")
         yield run
 
