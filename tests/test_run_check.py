@@ -15,6 +15,8 @@ from run_on_disk import Row, change, configure, damage
 
 from harness.coordination.operating_point import POINTS
 from harness.core import extras
+from harness.core.errors import UserError
+from harness.runs.contradictions import refuse
 from harness.runs.folder import read
 
 Harness = Callable[..., tuple[int, str, str]]
@@ -200,6 +202,18 @@ def renamed(run: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"), [("loss", 0.0), ("messages", "zork"), ("content", "objects")]
+)
+def test_a_condition_with_settings_that_its_name_does_not_say_is_not_shown(
+    setting: str, value: object, run: Path
+) -> None:
+    conditions = json.loads((run / "run.json").read_text())["conditions"]
+    configure(run, conditions=[{**each, setting: value} for each in conditions])
+    with pytest.raises(UserError, match=f"run.json has {setting} {value} in .*, whose name says"):
+        refuse(read(run))
+
+
 def picked(run: Path) -> None:
     """State that some layouts were taken in their order."""
     stated = json.loads((run / "run.json").read_text())["world"]
@@ -249,7 +263,7 @@ OF_THE_RUN = {
     "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
     "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
-    "a radio's name": (renamed, "run.json has other settings of v2x than that name says"),
+    "a radio's name": (renamed, "run.json has loss 0.0 in v2x, whose name says otherwise"),
     "which layouts": (picked, 
         "episodes.csv has other episodes than "
         "run.json says that were selected"),

@@ -682,6 +682,21 @@ def named_point(text: str) -> OperatingPoint:
     return point.changed(name=text, **settings) if settings or radio else point
 
 
+def misnamed(settings: Mapping[str, Any]) -> list[str]:
+    """Return the settings of a recorded condition that differ from what its name says.
+
+    None where a name says nothing: it is a program's own, or its radio is not here.
+    """
+    name = str(settings["name"])
+    try:
+        named = as_here(named_point(name).record())
+    except UserError:
+        return []
+    here = as_here(settings)
+    keys = dict.fromkeys((*named, *here))
+    return [key for key in keys if key not in named or key not in here or named[key] != here[key]]
+
+
 # Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's
 # unit.
 SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}

@@ -1,7 +1,6 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,9 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.backends.replay import Kept
-from harness.coordination.operating_point import named_point
 from harness.core import work
 from harness.core.config import convert
-from harness.core.errors import UserError, printable
+from harness.core.errors import printable
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.dataset.load import Dataset
@@ -210,10 +208,6 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
     for name in here.keys() - {"path", "looks"}:
         if world.get(name) != here[name]:
             yield f"run.json has another {name} of its scenes than the dataset"
-    for point in points_of(stated).values():
-        with suppress(UserError):  # of a radio that is not here by that name
-            if named_point(point.name) != point:
-                yield f"run.json has other settings of {printable(point.name)} than that name says"
     latency = stated.manifest.latency
     if latency.source == "card" and card.latency.inference_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"

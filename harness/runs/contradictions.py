@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from harness.coordination.operating_point import misnamed
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.formats import SUITE
@@ -63,6 +64,7 @@ def contradictions(run: Run) -> Iterator[str]:
         yield (
             f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
         )
+    yield from _of_conditions(run)
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
@@ -197,6 +199,15 @@ def _figure(score: Score, what: str = "value") -> str:
     condition, metric, interval = map(printable, score.key)
     of = "" if what == "value" else f", {what},"
     return f"{metric}{of} {getattr(score, what)} in {condition} ({interval})"
+
+
+def _of_conditions(run: Run) -> Iterator[str]:
+    """Yield which settings of conditions are others than the conditions' names say."""
+    for condition in run.manifest.conditions:
+        name = printable(str(condition["name"]))
+        for key in misnamed(condition):
+            value = printable(str(condition.get(key)), 60)
+            yield f"run.json has {key} {value} in {name}, whose name says otherwise"
 
 
 def _of_episodes(run: Run) -> Iterator[str]:
