@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,9 @@ from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.progress import Progress
 from harness.dataset.load import load
+from harness.evaluate.asking import Asker
+from harness.evaluate.kept_answers import KeptAnswers
+from harness.evaluate.latency import PAPER
 from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.texts import refuse_others
 from harness.runs.folder import read
@@ -72,3 +76,16 @@ def test_nor_is_a_finished_run_of_a_study_read_back_so(two_path: Path, run: Path
     damage(run, answer=surer)
     with pytest.raises(UserError, match="another intent than its text says"):
         read_or_evaluate(spec_of(load(two_path)), run, Progress(), None, open_backend)
+
+
+def test_nor_does_a_run_go_on_from_one_that_was_kept(
+    two_path: Path, run: Path, tmp_path: Path
+) -> None:
+    spec, file = spec_of(load(two_path)), tmp_path / "answers.jsonl"
+    KeptAnswers(file).append(answers_of(run))
+    going_on = partial(Asker, spec, lambda: open_backend(spec.ego.card), PAPER, kept=file)
+    assert going_on().answers.keys() == {answer.id for answer in answers_of(run)}
+    forged = msgspec.structs.replace(answers_of(run)[0], intent=(1.0, 0.0, 0.0))
+    KeptAnswers(file).append([forged])
+    with pytest.raises(UserError, match=f"{file}: answer {forged.id} states another intent than"):
+        going_on()

@@ -44,6 +44,7 @@ from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
 from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
+from harness.evaluate.texts import refuse_other_kept
 from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
 from harness.runs.records import (
@@ -260,8 +261,7 @@ class Asker:
         self._kept = KeptAnswers(kept) if kept else None
         self._progress, self._more = progress, more
         self._given, self.served = frozenset(answers or {}), list[Served]()
-        recalled = self._kept.recall() if self._kept else {}
-        self.answers = {**recalled, **(answers or {})}
+        self.answers = {**self._recalled(), **(answers or {})}
         self.tally, self._in_a_row = Tally(), 0
         # How many there are while none could be read; None once one could, or it was said.
         self._unread: int | None = None if self.answers else 0
@@ -274,7 +274,7 @@ class Asker:
         `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
-            self.answers = self._kept.recall(cut=True) | self.answers
+            self.answers = self._recalled(cut=True) | self.answers
         missing = [request for request in asked if request.id not in self.answers]
         if len(missing) < len(asked):
             self._progress(len(asked) - len(missing))
@@ -309,6 +309,14 @@ class Asker:
         tally = Tally(new_answers.values())
         if not all(map(is_helper, tally.missing)):
             raise Unanswered(str(tally))
+
+    def _recalled(self, cut: bool = False) -> dict[str, Answer]:
+        """Return the answers kept since they were last recalled, each as its text says."""
+        if not self._kept:
+            return {}
+        recalled = self._kept.recall(cut)
+        refuse_other_kept(self._kept.file, recalled.values(), self.spec.agents, self.spec.actions)
+        return recalled
 
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""

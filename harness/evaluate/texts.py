@@ -1,18 +1,20 @@
-"""Read the texts of a finished run's answers again, as its agents' answers are read.
+"""Read the texts of answers again, as their agents' answers are read.
 
 A file can state any intent beside a text, so whoever makes something of intents reads the texts.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import msgspec
 
 from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
 from harness.core.versions import PARSER
+from harness.evaluate.agent import Agent
 from harness.parsing.parse import Parsed, parse
 from harness.prompts.answer_schema import Shape
+from harness.prompts.versions import Prompt
 from harness.runs.contradictions import close
 from harness.runs.folder import Run
 from harness.runs.records import Answer, is_helper
@@ -31,8 +33,13 @@ def refuse_others(run: Run, more: Iterable[Answer] = ()) -> None:
             f"{printable(run.path)}: {gone}, so no answer can be read again; restore it, or run "
             "again"
         )
-    agents = (run.manifest.agent(0), *run.manifest.helpers)
-    readers = {msgspec.json.encode(agent): _Reader(run, agent) for agent in agents}
+    readers = dict[bytes, _Reader]()
+    for agent in (run.manifest.agent(0), *run.manifest.helpers):
+        prompt = prompt_of(run, agent["prompt"])
+        assert prompt is not None  # or it would be lacking
+        thinking, divides = agent.get("thinking", False), agent.get("sums") == "divide"
+        reader = _Reader(prompt, run.actions, agent["answer"], thinking, divides)
+        readers[msgspec.json.encode(agent)] = reader
     for answer in run.answers:
         reader = readers[msgspec.json.encode(run.agent(answer))]
         if other := _other(answer, reader.read(answer)):
@@ -41,6 +48,26 @@ def refuse_others(run: Run, more: Iterable[Answer] = ()) -> None:
         others = [_other(answer, reader.read(answer)) for reader in readers.values()]
         if all(others) and others[0]:
             raise _contradicts(run, answer, others[0])
+
+
+def refuse_other_kept(
+    file: Path, answers: Iterable[Answer], agents: Sequence[Agent], actions: tuple[str, ...]
+) -> None:
+    """Raise UserError if an answer that a file keeps states what its text says to none of `agents`.
+
+    So a run that somebody else began goes on from what its answers say.
+    """
+    readers = []
+    for agent in agents:
+        divides = agent.sums == "divide"
+        readers.append(_Reader(agent.prompt, actions, agent.answer, agent.thinking, divides))
+    for answer in answers:
+        others = [_other(answer, reader.read(answer)) for reader in readers]
+        if all(others):
+            raise UserError(
+                f"{printable(file)}: answer {printable(answer.id)} states another {others[0]} than "
+                "its text says; delete its folder and start again"
+            )
 
 
 def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:
@@ -54,15 +81,13 @@ def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:
 class _Reader:
     """Reads texts as those of one agent."""
 
-    def __init__(self, run: Run, agent: Mapping[str, Any]) -> None:
-        prompt = prompt_of(run, agent["prompt"])
-        assert prompt is not None  # or it would be lacking
-        self._prompt, self._actions = prompt, run.actions
-        self._bare = agent["answer"] in BARE
-        self._options = {
-            "thinking": agent.get("thinking", False),
-            "divides": agent["answer"] == "constrained" or agent.get("sums") == "divide",
-        }
+    def __init__(
+        self, prompt: Prompt, actions: tuple[str, ...], answer: str, thinking: bool, divides: bool
+    ) -> None:
+        self._prompt, self._actions = prompt, actions
+        self._bare = answer in BARE
+        self._thinking = thinking
+        self._divides = divides or answer == "constrained"
 
     def read(self, answer: Answer) -> Parsed:
         """Return what an answer's text says."""
@@ -73,7 +98,8 @@ class _Reader:
         return parse(
             answer.raw,
             **shape._asdict(),
-            **self._options,
+            thinking=self._thinking,
+            divides=self._divides,
             reasons_first=role in self._prompt.reasons_first,
             finish_reason=answer.finish_reason,
             error=answer.error,
