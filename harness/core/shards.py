@@ -115,8 +115,8 @@ def _read(folder: Path, kind: type[Start]) -> Start:
         config = None
     if config is None or not config.shard:
         raise UserError(
-            f"{printable(folder)} is no shard; give folders made with --shard, which were not "
-            "merged yet"
+            f"{printable(folder)} is no shard; give folders made with --shard, by `harness drive` "
+            "or `harness dataset build`, which were not merged yet"
         )
     shard_of(config.shard, {})
     if work.held(folder):
