@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct, defstruct
 
 from harness.core.config import convert, toml
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 
 Share = Annotated[float, Meta(ge=0, le=1, description="a share, 0 to 1")]
 
@@ -88,6 +88,11 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
         ({"link": {}}, "r [link] has no model; add it"),
         ({"link": 3}, "r: link = 3; allowed: a table"),
         ({"hops": 3}, "r: hops = 3; allowed: a list"),
+        ({"by_name": {"a\n": 3}}, "r [by_name]: a\\n = 3; allowed: a table"),
+        (
+            {"by_name": {"a\n": {"los": 1}}},
+            "unknown key in r [by_name.a\\n] 'los'; did you mean 'loss'? known: loss, model",
+        ),
         ({"link": {"model": "wires"}}, "unknown model in r [link] 'wires'; known: ideal, radio"),
         ({"link": {"model": "radio", "loss": "x\n"}}, "r [link]: loss = 'x\\n'; allowed: a number"),
         (
@@ -116,7 +121,7 @@ def test_a_mistake_is_one_line_with_place_value_and_what_is_allowed(
     assert str(caught.value) == said
 
 
-@pytest.mark.parametrize("size", [10**30, -sys.maxsize * 4])
+@pytest.mark.parametrize("size", [10**30, -sys.maxsize * 4, 10**400, -(10**400)])
 def test_a_number_beyond_all_bounds_is_one_too(size: int) -> None:
     with pytest.raises(UserError, match=r"^r.*size"):
         convert({**GOOD, "size": size}, Route, "r", name="r")
@@ -215,12 +220,18 @@ def test_a_wrong_leaf_anywhere_in_any_record_is_one_line_that_names_it(data: st.
     )
 
 
-@pytest.mark.parametrize("number", ["nan", "inf"])
-def test_a_number_is_finite_also_where_it_has_no_bounds(number: str) -> None:
-    with pytest.raises(
-        UserError, match=rf"r \[hops\.0\]: delay_s = {number}; allowed: a finite number"
-    ):
-        convert({**GOOD, "hops": [{"delay_s": float(number)}]}, Route, "r", name="r")
+@pytest.mark.parametrize(
+    "number", [float("nan"), float("inf"), 1e300, 2**63, 10**30, pytest.param(10**400, id="huge")]
+)
+def test_a_number_is_no_larger_than_computers_count_also_where_it_has_no_bounds(
+    number: float,
+) -> None:
+    with pytest.raises(UserError) as caught:
+        convert({**GOOD, "hops": [{"delay_s": number}]}, Route, "r", name="r")
+    assert str(caught.value) == (
+        f"r [hops.0]: delay_s = {printable(number)}; allowed: a finite number, of a size of at "
+        "most 9.2e+18"
+    )
 
 
 def test_the_tags_of_a_union_are_named() -> None:

@@ -40,6 +40,7 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
         with pytest.raises(UserError, match=REFUSED) as error:
             refused()
         assert name not in str(error.value)
+    assert name not in str(unknown("model", "a", [name, f"{name}b"]))
     assert {path.name for path in tmp_path.iterdir()} == {"swarmdrive.toml", "models", name}
 
 

@@ -6,7 +6,8 @@ A record is a frozen dataclass or a `msgspec.Struct`, nested as the file's table
 annotations are the rules: `Literal[...]` lists choices; `Annotated[float, Meta(ge=0,
 description="seconds, 0 or more")]` bounds a value and describes the bound; a ValueError from
 `__post_init__` says what is wrong with a table as a whole. Integers are converted to floats, and
-nothing else is. An unknown key is refused, and the message suggests the nearest known one.
+nothing else is. An unknown key is refused, and the message suggests the nearest known one. So is a
+number beyond `LARGEST`, also where a record has no bounds.
 
     @dataclass(frozen=True)
     class Channel:
@@ -17,7 +18,6 @@ nothing else is. An unknown key is refused, and the message suggests the nearest
 """
 
 import dataclasses
-import math
 import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -43,6 +43,8 @@ from harness.core.files import text_of
 
 Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
+LARGEST = 2**63 - 1  # of a number in a file, which is what NumPy's and Parquet's integers hold
+_ANY_NUMBER = f"a finite number, of a size of at most {LARGEST:.2g}"
 LONGEST_S = 3600.0  # the longest time that a model may be declared to take for an answer
 Seconds = Annotated[
     float,
@@ -121,9 +123,11 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
         record = msgspec.convert(whole, kind)
     except msgspec.ValidationError:
         raise _mistake(whole, kind, where) from None
-    for path, value in _endless(table, ()):  # last, since a bound has better words
+    for path, value in _beyond(table, ()):  # last, since a bound has better words
         *tables, key = path
-        raise UserError(f"{_place(where, tables)}: {key} = {value}; allowed: a finite number")
+        raise UserError(
+            f"{_place(where, tables)}: {key} = {printable(value)}; allowed: {_ANY_NUMBER}"
+        )
     return record
 
 
@@ -198,16 +202,18 @@ def _unknown_keys(
         if fields and (key in exempt or key not in fields):
             yield path, key, [name for name in fields if name not in exempt]
         elif len(hints) == 1:
-            yield from _unknown_keys(inner, hints[0], (*path, str(key)))
+            yield from _unknown_keys(inner, hints[0], (*path, printable(key)))
 
 
-def _endless(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Yield each number that is infinite or none, which TOML can write: its path and itself."""
-    if isinstance(value, float) and not math.isfinite(value):
+def _beyond(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Yield each number that is none or beyond `LARGEST`, which TOML can write: its path and
+    itself.
+    """
+    if isinstance(value, int | float) and not abs(value) <= LARGEST:
         yield path, value
     elif isinstance(value, Mapping | list):
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from _endless(inner, (*path, str(key)))
+            yield from _beyond(inner, (*path, printable(key)))
 
 
 def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
@@ -233,7 +239,7 @@ def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
     kinds = " or ".join(_in_words(name) for name in expected.split(" | ") if name != "null")
     allowed = (" or ".join(_choices(hint)) or kinds) if got else description(hint) or kinds
     if not problem.startswith("Expected"):
-        allowed = description(hint) or "a number that a computer holds"
+        allowed = description(hint) or _ANY_NUMBER
     return UserError(
         f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}"
     )
@@ -250,7 +256,9 @@ def _wrong(value: Any, hint: Any, path: tuple[str, ...] = ()) -> tuple[tuple[str
     for key, inner, hints in _entries(value, hint):
         if hints and all(_problem(inner, each) for each in hints):
             tags = [tag for each in hints if get_origin(each) is Literal for tag in get_args(each)]
-            return _wrong(inner, Literal[tuple(tags)] if tags else hints[0], (*path, str(key)))
+            return _wrong(
+                inner, Literal[tuple(tags)] if tags else hints[0], (*path, printable(key))
+            )
     return path, value, hint
 
 

@@ -94,13 +94,13 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
     suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
     # Of several names that begin so, the nearest is only the shortest.
     if len(begin := [known for known in names if name and known.startswith(name)]) > 1:
-        suggestion = f"; did you mean one of {', '.join(begin[:MOST_LISTED])}?"
+        suggestion = f"; did you mean one of {', '.join(map(printable, begin[:MOST_LISTED]))}?"
     shown = (
         names
         if len(names) <= (FEW if kind in LISTS else MOST_LISTED)
         else get_close_matches(name, names, NEAR, cutoff=0)
     )
-    listed = ", ".join(shown) or "(none)"
+    listed = ", ".join(map(printable, shown)) or "(none)"
     if len(shown) < len(names):
         all_of = f"; `{LISTS[kind]}` lists all" if kind in LISTS else ""
         listed += f" and {len(names) - len(shown)} more{all_of}"
