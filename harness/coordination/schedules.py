@@ -7,14 +7,14 @@ schedule by an entry point in the group `swarmdrive.schedules`.
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from harness.coordination.scheduling import FORMULAS, Schedule, ScheduleInputs
 from harness.core.arrays import Floats
-from harness.core.config import convert, toml
+from harness.core.config import between, convert, toml
 from harness.core.errors import UserError, printable
 from harness.core.files import read_once, sha256_file
 from harness.core.plugins import FilesAndPlugins
@@ -78,7 +78,7 @@ class Weights:
     """A `Network` as a file states it."""
 
     centre: tuple[float, ...]
-    scale: tuple[float, ...]
+    scale: tuple[Annotated[float, between(1e-6, 1e6)], ...]
     into: tuple[tuple[float, ...], ...]
     bias: tuple[float, ...]
     out: tuple[float, ...]
@@ -102,9 +102,6 @@ class Stated:
         """Return the schedule. Raises UserError for other inputs than `INPUTS`,
         or weights of other sizes.
         """
-        arrays: dict[str, Any] = {
-            name: np.array(value) for name, value in asdict(self.network).items()
-        }
         f, j = len(INPUTS), len(self.network.bias)
         shapes = {
             "centre": (f,),
@@ -114,10 +111,16 @@ class Stated:
             "out": (j,),
             "base": (),
         }
-        if self.inputs != INPUTS or any(
-            arrays[name].shape != shape for name, shape in shapes.items()
-        ):
-            raise UserError(f"{where} has other inputs or sizes than the program; learn it again")
+        arrays: dict[str, Any] = {}
+        for name, shape in shapes.items():
+            try:
+                arrays[name] = np.array(getattr(self.network, name), dtype=float)
+            except ValueError:  # rows of several lengths
+                arrays[name] = np.empty(0)
+            if self.inputs != INPUTS or arrays[name].shape != shape:
+                raise UserError(
+                    f"{where} has other inputs or sizes than the program; learn it again"
+                )
         return Learnt(Network(**arrays), self.threshold)
 
 

@@ -426,15 +426,25 @@ def test_a_network_learns_what_there_is_to_learn():
     assert network(x[7]) == pytest.approx(network(x)[7])
 
 
-def test_a_file_that_does_not_fit_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"entropy", ', "", "has other inputs or sizes than the program; learn it again"),
+        ("into = [[", "into = [[1.0, ", "has other inputs or sizes than the program"),
+        ("bias = [", "bias = [1.0, ", "has other inputs or sizes than the program"),
+        ("scale = [", "scale = [0.0, ", "allowed: a number from 1e-06 to 1e"),
+        ("base = ", "base = 1e300 # ", "base = 1e.300; allowed: a finite number, of a size"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_one_line(
+    old: str, new: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / MARKER).touch()
     shipped = find("schedules", "learnt.toml").read_text()
     (tmp_path / "schedules").mkdir()
-    (tmp_path / "schedules/odd.toml").write_text(shipped.replace('"entropy", ', ""))
-    with pytest.raises(
-        UserError, match="has other inputs or sizes than the program; learn it again"
-    ):
+    (tmp_path / "schedules/odd.toml").write_text(shipped.replace(old, new))
+    with pytest.raises(UserError, match=said):
         named_point("6g:schedule=odd")
 
 
