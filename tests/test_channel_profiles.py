@@ -66,6 +66,10 @@ def test_a_projects_profile_is_a_condition_and_changes_with_its_file(project: Pa
         (('status = "measured"', 'status = "sure"'), "known: assumed, cited, measured, modelled"),
         (('source = "my desk"', ""), "has no source; add it"),
         (("[parameters]", "[parameters"), "is no TOML"),
+        (
+            ("[parameters]", "[limits]\nloss = [0.3, 0.1]\n[parameters]"),
+            "[limits]: loss = [0.3, 0.1]; allowed: the least value, then the largest",
+        ),
     ],
 )
 def test_a_mistake_in_a_file_is_one_line(project: Path, change: tuple[str, str], says: str):

@@ -104,11 +104,18 @@ def test_a_network_that_is_not_allowed_is_one_line(text: str, says: str):
 
 
 @pytest.mark.parametrize(
-    "change", [("100 = 60", "90 = 60"), ("50 = 20", "50 = 5"), ("0 = 10", '"all" = 10')]
+    ("old", "new", "said"),
+    [
+        ("100 = 60", "90 = 60", "mine.toml: quantiles_ms must go from 0 to 100"),
+        ("50 = 20", "50 = 5", "mine.toml: quantiles_ms must go from 0 to 100"),
+        ("0 = 10", '"all" = 10', "mine.toml: quantiles_ms must go from 0 to 100"),
+        ("100 = 60", "100 = 1e10", r"100 = 1.+; allowed: a number from 0 to 3.6e\+06"),
+        ("0 = 10", "0 = -10", r"0 = -10; allowed: a number from 0 to 3.6e\+06"),
+    ],
 )
-def test_quantiles_that_are_none_are_refused(mine: Path, change: tuple[str, str]):
-    mine.write_text(MINE.replace(*change))
-    with pytest.raises(UserError, match=r"mine.toml: quantiles_ms must go from 0 to 100"):
+def test_quantiles_that_are_none_are_refused(mine: Path, old: str, new: str, said: str):
+    mine.write_text(MINE.replace(old, new))
+    with pytest.raises(UserError, match=said):
         named_point("cloud:round_trip=mine")
 
 

@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from harness.core import resources
 from harness.core.arrays import Floats
-from harness.core.config import convert, toml
+from harness.core.config import LONGEST_S, between, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import read_once
+
+Milliseconds = Annotated[float, between(0, 1000 * LONGEST_S)]
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,8 @@ class Network:
     source: str  # who measured the round trips, where and how many
     # `cited` from a publication or its data, `measured` by oneself, or `assumed`
     status: Literal["cited", "measured", "assumed"]
-    quantiles_ms: dict[str, float]  # quantiles of the round trips by percentage, from 0 to 100
+    # quantiles of the round trips by percentage, from 0 to 100
+    quantiles_ms: dict[str, Milliseconds]
 
     def round_trip_s(self, uniforms: Floats) -> Floats:
         shares = [float(percent) / 100 for percent in self.quantiles_ms]
@@ -49,7 +52,7 @@ def _read(path: Path) -> Network:
     except ValueError:
         percents = []
     times_ms = list(network.quantiles_ms.values())
-    ends = percents[:1] == [0.0] and percents[-1:] == [100.0] and min(times_ms) >= 0
+    ends = percents[:1] == [0.0] and percents[-1:] == [100.0]
     if not (ends and np.all(np.diff(percents) > 0) and np.all(np.diff(times_ms) >= 0)):
         raise UserError(
             f"{where}: quantiles_ms must go from 0 to 100, percentages and milliseconds growing"

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from harness.core.config import convert, settable, toml
-from harness.core.errors import printable, unknown
+from harness.core.errors import UserError, printable, unknown
 from harness.core.files import read_once
 from harness.core.plugins import FilesAndPlugins
 from harness.core.strangers import worded
@@ -109,9 +109,14 @@ def _read(path: Path) -> tuple[Profile, Channel]:
         channel: Channel = convert(profile.parameters, model, parameters)
     else:
         channel = model(profile.parameters, path.parent, parameters)
-    for name in profile.limits:
+    for name, (least, most) in profile.limits.items():
         if name not in settable(channel):
             raise unknown(f"key in {where} [limits]", name, settable(channel))
+        if least > most:
+            raise UserError(
+                f"{where} [limits]: {name} = [{least:g}, {most:g}]; allowed: the least value, then "
+                "the largest"
+            )
     return profile, channel
 
 
