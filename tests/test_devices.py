@@ -488,7 +488,7 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("value = 4000", "value = 0"), "value = 0; allowed: a number above 0"),
+        (("value = 4000", "value = 0"), "value = 0; allowed: a number from 1e-09 to 1e+09"),
         (('status = "measured"', 'status = "felt"'), "unknown status in"),
         (("billions", "bilions"), "did you mean 'billions'?"),
         (('source = "me" }\ndecode', 'source = "" }\ndecode'), 
@@ -497,6 +497,11 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
         (('me = "my desk, today"', "me = 3"), "[sources]: give each source a name and a text"),
         (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: a text"),
         (("batch_size = 1", "batch_size = 0"), "batch_size = 0; allowed: 1 or more"),
+        (
+            ("[[rows]]",
+             '[amplifier_efficiency]\nvalue = 2\nstatus = "cited"\nsource = "me"\n[[rows]]'),
+            "mine.toml: amplifier_efficiency is 2; give 1 at most",
+        ),
     ],
 )  # fmt: skip
 def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, project: Path) -> None:

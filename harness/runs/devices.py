@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from harness.core import resources
-from harness.core.config import Count, convert, toml
+from harness.core.config import Count, between, convert, toml
 from harness.core.errors import UserError, printable, unknown
 
 Rate = Annotated[float, Meta(gt=0, description="a number above 0")]
@@ -22,6 +22,7 @@ RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
 # Joules that a row lacks are derived from the power that the device draws, and the rate.
 JOULES = {"joules_per_prompt_token": RATES[0], "joules_per_output_token": RATES[1]}
 APART = ("answer_ms", "memory_gb")  # numbers of a row from which nothing is derived
+MOST = {"amplifier_efficiency": 1.0, "transmit_dbm": 100.0}  # of a device
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
@@ -40,9 +41,9 @@ class Speed(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """A number of a device profile, above 0, and where it comes from."""
+    """A number of a device profile, and where it comes from."""
 
-    value: Annotated[float, Meta(gt=0, description="a number above 0")]
+    value: Annotated[float, between(1e-9, 1e9)]
     status: Status
     source: Annotated[str, Meta(min_length=1, description="where the number comes from")]
 
@@ -52,7 +53,7 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
     model: str  # the model's name; that of a card, if there is one
     # billions of weights
-    billions: Annotated[float, Meta(gt=0, description="billions of weights, above 0")]
+    billions: Annotated[float, between(1e-9, 1e6)]
     precision: str  # number format of the weights
     batch_size: Count  # requests that went through the device together when it was timed
     prefill_tokens_per_s: Constant | None = None  # prompt tokens read in a second
@@ -93,6 +94,10 @@ class Device(Struct, frozen=True, kw_only=True):
         names = [row.model for row in self.rows]
         if not names or len(set(names)) < len(names):
             raise ValueError("rows: give one or more, of different models")
+        for name, most in MOST.items():
+            constant: Constant | None = getattr(self, name)
+            if constant and constant.value > most:
+                raise ValueError(f"{name} is {constant.value:g}; give {most:g} at most")
         for row in self.rows:
             if row.answer_ms and (row.prefill_tokens_per_s or row.decode_tokens_per_s):
                 raise ValueError(
