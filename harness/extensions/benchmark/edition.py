@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, structs
 
 from harness.backends.card import Card
-from harness.core.config import convert, toml
+from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.files import digest
@@ -44,7 +44,7 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     sha256: str  # of the file
-    layouts: int  # how many of each dataset it has, from the first
+    layouts: Count  # how many of each dataset it has, from the first
 
 
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -18,10 +18,11 @@ from msgspec import Meta
 from harness.coordination.intents import Intents
 from harness.core import resources
 from harness.core.arrays import Floats
-from harness.core.config import convert, toml
+from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import read_once
 from harness.core.seeds import purposes, stated
+from harness.world.scenario import Scenario
 
 FOLDER = "calibrations"
 COOLEST, HOTTEST = 0.05, 20.0  # temperatures
@@ -36,7 +37,7 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 class Correction:
     """What is done to the answers of one role."""
 
-    answers: int  # how many it was fitted on
+    answers: Count  # how many it was fitted on
     # the exponent is 1 / temperature; 1 changes nothing
     temperature: Annotated[float, Meta(ge=COOLEST, le=HOTTEST)] = 1.0
     # the mean answer, a probability an action; empty where none is divided out
@@ -64,12 +65,13 @@ class Calibration:
     ego: Correction
     helper: Correction | None = None  # None where no helper answered
 
-    def obstacle(self, agent: Mapping[str, Any], scenario: str) -> str | None:
+    def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
         """Return why it does not fit an agent's settings (`question_of`) in a scenario;
         None if it does.
         """
-        now = {**question_of(agent), "scenario": scenario}
-        then = {**self.question, "scenario": self.scenario}
+        of_scenario = {"scenario": scenario.name, "actions": " ".join(scenario.actions)}
+        now = {**question_of(agent), **of_scenario}
+        then = {**self.question, "scenario": self.scenario, "actions": " ".join(self.actions)}
         # the model may have an adapter, or a pinned file, that it had not then
         for name in then | now:
             value, other = then.get(name), now.get(name)

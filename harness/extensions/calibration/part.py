@@ -40,7 +40,7 @@ class Calibrated(Part, frozen=True, kw_only=True):
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
         fitted, what = calibration(self.calibration), f"calibration {printable(self.calibration)}"
         for agent in run.agents:
-            if reason := fitted.obstacle(agent.settings(), run.scenario.name):
+            if reason := fitted.obstacle(agent.settings(), run.scenario):
                 return f"{what} {reason}; fit one with `harness model calibrate`"
         if point.asks and fitted.helper is None and not run.ego_alone:
             return f"{what} was fitted on no helper's answer; fit one on a run with --ask all"

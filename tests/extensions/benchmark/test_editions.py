@@ -426,6 +426,11 @@ def test_an_edition_is_its_tables_and_not_their_layout(project: Harness) -> None
         ('seeds = "0:2"', 'seeds = "none"', "--seeds none"),
         ('ties = "drawn"', "ties = 2020-01-01", "editions/mine-1.toml"),
         ('ties = "drawn"', "", "ties"),
+        (
+            "[datasets]",
+            '[golden]\nsha256 = ""\nlayouts = -1\n[datasets]',
+            "mine-1.toml [golden]: layouts = -1; allowed: 1 or more",
+        ),
     ],
 )
 def test_a_wrong_edition_is_one_line(project: Harness, old: str, new: str, message: str) -> None:

@@ -168,6 +168,8 @@ def test_what_a_calibration_does_not_fit_is_refused(
         ("prior = [", "prior = [1e-320, ", "0.0001"),
         ('"temperature" = 1', '"temperature" = 99', "temperature"),
         ('level = "L0"', 'level = "L7"', "level"),
+        ('"answers" = ', '"answers" = -', "allowed: 1 or more"),
+        ('"SLOWER", "IDLE"', '"IDLE", "SLOWER"', "was fitted with actions IDLE SLOWER"),
     ],
 )
 def test_a_file_that_is_wrong_is_refused_in_one_line(
@@ -256,8 +258,10 @@ def test_a_calibration_of_a_model_without_an_adapter_does_not_fit_one_with() -> 
     model = {"name": "m", "engine": "e"}
     agent: dict[str, Any] = {"model": model, "prompt": {"version": "v", "sha256": "s"}}
     agent |= dict.fromkeys(OF_QUESTION, "x")
-    found = Calibration("L1", "c", "r", 0, 3, "here", ("a", "b"), question_of(agent), Correction(4))
-    assert found.obstacle(agent, "here") is None
+    here = scenarios.get("occluded-intersection")
+    of, who = (here.name, here.actions), question_of(agent)
+    found = Calibration("L1", "c", "r", 0, 3, *of, who, Correction(4))
+    assert found.obstacle(agent, here) is None
     for key in ("adapter", "sha256"):
         other = {**agent, "model": {**model, key: "new"}}
-        assert found.obstacle(other, "here") == f"was fitted with model.{key} None, not new"
+        assert found.obstacle(other, here) == f"was fitted with model.{key} None, not new"
