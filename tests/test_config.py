@@ -43,6 +43,7 @@ class Route:
     name: str
     link: Link
     size: Annotated[int, Meta(ge=1, le=9)] = 1
+    text: str = ""
     hops: tuple[Hop, ...] = ()
     by_name: dict[str, Link] | None = None
 
@@ -64,14 +65,14 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"nmae": "x"}, "unknown key in r 'nmae'; known: by_name, hops, link, size"),
+        ({"nmae": "x"}, "unknown key in r 'nmae'; known: by_name, hops, link, size, text"),
         (
             {"name": "x"},
-            "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, size",
+            "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, size, text",
         ),
         (
             {"sise": 1},
-            "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, size",
+            "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, size, text",
         ),
         (
             {"link": {"los": 1}},
@@ -88,6 +89,7 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
         ({"link": {}}, "r [link] has no model; add it"),
         ({"link": 3}, "r: link = 3; allowed: a table"),
         ({"hops": 3}, "r: hops = 3; allowed: a list"),
+        ({"text": "a\0"}, "r: text = a\\x00; allowed: a text without NUL"),
         ({"by_name": {"a\n": 3}}, "r [by_name]: a\\n = 3; allowed: a table"),
         (
             {"by_name": {"a\n": {"los": 1}}},

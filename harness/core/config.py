@@ -7,7 +7,8 @@ annotations are the rules: `Literal[...]` lists choices; `Annotated[float, Meta(
 description="seconds, 0 or more")]` bounds a value and describes the bound; a ValueError from
 `__post_init__` says what is wrong with a table as a whole. Integers are converted to floats, and
 nothing else is. An unknown key is refused, and the message suggests the nearest known one. So is a
-number beyond `LARGEST`, also where a record has no bounds.
+number beyond `LARGEST`, also where a record has no bounds, and a text with the character NUL, which
+no path, name or process can hold.
 
     @dataclass(frozen=True)
     class Channel:
@@ -125,9 +126,8 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
         raise _mistake(whole, kind, where) from None
     for path, value in _beyond(table, ()):  # last, since a bound has better words
         *tables, key = path
-        raise UserError(
-            f"{_place(where, tables)}: {key} = {printable(value)}; allowed: {_ANY_NUMBER}"
-        )
+        allowed = "a text without NUL" if isinstance(value, str) else _ANY_NUMBER
+        raise UserError(f"{_place(where, tables)}: {key} = {printable(value)}; allowed: {allowed}")
     return record
 
 
@@ -205,11 +205,12 @@ def _unknown_keys(
             yield from _unknown_keys(inner, hints[0], (*path, printable(key)))
 
 
-def _beyond(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Yield each number that is none or beyond `LARGEST`, which TOML can write: its path and
-    itself.
+def _beyond(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], object]]:
+    """Yield each number that is none or beyond `LARGEST`, and each text with NUL, both of which
+    TOML can write: its path and itself.
     """
-    if isinstance(value, int | float) and not abs(value) <= LARGEST:
+    too_large = isinstance(value, int | float) and not abs(value) <= LARGEST
+    if too_large or (isinstance(value, str) and "\0" in value):
         yield path, value
     elif isinstance(value, Mapping | list):
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
