@@ -17,9 +17,10 @@ BeaconRule = Literal["fixed", "cam"]
 MOST_DECISIONS, MOST_SPEEDS = 10, 20
 MOST_FRAMES = 20_000  # in an episode; each takes time and memory
 # What a parameter may be at least and at most, by the unit at the end of its name. Places, and
-# times that are offsets, may lie before their origin.
+# times that are offsets, may lie before their origin; who stands still arrives nowhere.
 BOUNDS = {
     "noise_m": (0.0, 100.0), "noise_mps": (0.0, 100.0), "offset_s": (-100.0, 100.0),
+    "speed_mps": (0.1, 200.0),
     "_s": (0.0, MOST_FRAMES), "_m": (-1000.0, 1000.0), "_mps": (0.0, 200.0), "_mps2": (0.0, 200.0),
     "_hz": (0.0, 1000.0), "_share": (0.0, 1.0), "_shares": (0.0, 1.0),
 }  # fmt: skip

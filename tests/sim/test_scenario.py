@@ -187,6 +187,7 @@ def test_buildings_leave_the_road_free_and_stand_one_a_corner(layouts):
             {"ego_start_m": [1, 1e9]},
             "ego_start_m is (1.0, 1000000000.0); it must be from -1000 to 1000",
         ),
+        ({"ego_speed_mps": 0.0}, "ego_speed_mps is 0.0; it must be from 0.1 to 200"),
         ({"target_speeds_mps": []}, "target_speeds_mps is (); it must be 1 to 20 speeds"),
         ({"target_speeds_mps": [1] * 10_000}, "it must be 1 to 20 speeds"),
         ({"ambient": ["day"]}, "ambient = ['day']; allowed: a text"),
