@@ -17,7 +17,7 @@ from harness.core.arrays import Floats
 from harness.core.config import between, convert, toml
 from harness.core.errors import UserError, printable
 from harness.core.files import read_once, sha256_file
-from harness.core.plugins import FilesAndPlugins
+from harness.core.plugins import FilesAndPlugins, one_of, tuple_of
 
 NEEDS = ("in_time", "outlook", "lot")  # what a schedule may need to know
 FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
@@ -165,32 +165,23 @@ def inputs(known: ScheduleInputs) -> Floats:
     return np.stack(columns, axis=-1)
 
 
+def _is_threshold(value: Any) -> bool:
+    number = type(value) in (int, float) and math.isfinite(value)
+    return value is None or number
+
+
 class Schedules(FilesAndPlugins[Schedule]):
     """All schedules, by name."""
 
     folder = "schedules"
+    stated: ClassVar = {
+        "threshold": (_is_threshold, "a finite number, or None"),
+        "needs": tuple_of(one_of(*NEEDS)),
+    }
 
     def read(self, file: Any) -> Schedule:
         """Return the learnt schedule in a file."""
         return _read(file)
-
-    def _load(self, name: str) -> Schedule:
-        schedule = super()._load(name)
-        threshold, needs = schedule.threshold, schedule.needs
-        what = f"plug-in {printable(name)!r} ({self.group}) has"
-        repair = "repair or uninstall the package that registers it"
-        number = type(threshold) in (int, float) and math.isfinite(threshold or 0.0)
-        if threshold is not None and not number:
-            raise UserError(
-                f"{what} threshold {printable(repr(threshold))}; allowed: a finite number, or "
-                f"None; {repair}"
-            )
-        if not isinstance(needs, tuple) or not set(needs) <= set(NEEDS):
-            raise UserError(
-                f"{what} needs {printable(repr(needs))}; allowed: a tuple of {', '.join(NEEDS)}; "
-                f"{repair}"
-            )
-        return schedule
 
     def file_sha256(self, name: str) -> str | None:
         """Return the digest of the file that holds a schedule; None if it is not in a file."""

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from threading import Timer
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from harness.core import resources
 from harness.core.errors import UserError, one_line, printable
@@ -16,6 +16,8 @@ from harness.core.strangers import aside
 
 T = TypeVar("T")
 Said = TypeVar("Said")
+# whether a value is one that a plug-in may state, and which are, in words
+Allowed = tuple[Callable[[Any], bool], str]
 SAID_S = 3.0  # after which a line says which package a command waits for
 
 
@@ -101,13 +103,32 @@ class Failed(UserError):
     """
 
 
+def of_type(kind: type) -> Allowed:
+    """Return the rule of a value of one type."""
+    return lambda value: isinstance(value, kind), kind.__name__
+
+
+def one_of(*values: object) -> Allowed:
+    """Return the rule of a value that is one of these."""
+    return values.__contains__, ", ".join(map(str, values))
+
+
+def tuple_of(each: Allowed) -> Allowed:
+    """Return the rule of a tuple whose values follow another rule."""
+    fits, words = each
+    return lambda value: isinstance(value, tuple) and all(map(fits, value)), f"a tuple of {words}"
+
+
 class Plugins(Mapping[str, T], Generic[T]):
     """Plug-ins by name. A package adds one by an entry point,
     which is loaded when its name is looked up.
 
-    Each must be an instance of `kind`, a class or runtime-checkable protocol.
-    Those that are `built_in` cannot be replaced.
+    Each must be an instance of `kind`, a class or runtime-checkable protocol, and have what is
+    `stated`: by name, whether a value is allowed, and which are. Those that are `built_in` cannot
+    be replaced.
     """
+
+    stated: ClassVar[Mapping[str, Allowed]] = {}
 
     def __init__(self, group: str, kind: Any, built_in: Mapping[str, T]) -> None:
         self.group, self.kind, self.built_in = group, kind, built_in
@@ -175,6 +196,11 @@ class Plugins(Mapping[str, T], Generic[T]):
             raise UserError(
                 f"{what} is of type {type(plugin).__name__} and no {self.kind.__name__}; {repair}"
             )
+        for field, (is_allowed, allowed) in self.stated.items():
+            if hasattr(plugin, field) and not is_allowed(value := getattr(plugin, field)):
+                raise UserError(
+                    f"{what} has {field} {printable(repr(value))}; allowed: {allowed}; {repair}"
+                )
         return plugin
 
 

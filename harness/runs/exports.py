@@ -8,10 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from harness.core.errors import UserError, printable
-from harness.core.plugins import Plugins
+from harness.core.plugins import Plugins, of_type, tuple_of
 from harness.runs.folder import Run
 
 
@@ -42,27 +41,20 @@ class Export(Protocol):
         ...
 
 
+def _are_options(value: Any) -> bool:
+    options = value.values() if isinstance(value, Mapping) else [value]
+    return all(isinstance(option, Option) for option in options)
+
+
 class Exports(Plugins[Export]):
     """Formats by name."""
 
-    def _load(self, name: str) -> Export:
-        format = super()._load(name)
-        options: object = getattr(format, "options", MappingProxyType({}))
-        texts = (
-            format.help,
-            format.doing,
-            *(format.needs if isinstance(format.needs, tuple) else (None,)),
-        )
-        named = isinstance(options, Mapping) and all(
-            isinstance(each, Option) for each in options.values()
-        )
-        if not (named and all(isinstance(text, str) for text in texts)):
-            raise UserError(
-                f"plug-in {printable(name)!r} ({self.group}) has a help, doing or needs that is no "
-                "text, or options that are no table of Option; repair or uninstall the package "
-                "that registers it"
-            )
-        return format
+    stated: ClassVar = {
+        "help": of_type(str),
+        "doing": of_type(str),
+        "needs": tuple_of(of_type(str)),
+        "options": (_are_options, "a table of Option"),
+    }
 
 
 EXPORTS = Exports("swarmdrive.exports", Export, {})

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product, takewhile
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy as np
 from msgspec import UNSET
@@ -18,7 +18,7 @@ from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, one_line, printable
 from harness.core.figures import PERCENT, POINTS, Unit, shown
-from harness.core.plugins import Plugins, say_once
+from harness.core.plugins import Plugins, of_type, one_of, say_once
 from harness.core.statistics import (
     LEVEL,
     Estimate,
@@ -131,6 +131,16 @@ class Metric:
 class Metrics(Plugins[Metric]):
     """Metrics by name: built-in ones, those of answers to questions of extensions, packages'."""
 
+    stated: ClassVar = {
+        "meaning": of_type(str),
+        "label": of_type(str),
+        "unit": of_type(Unit),
+        "better": one_of(*get_args(Better)),
+        "interval": one_of("rate", "mean"),
+        "most": of_type(float),
+        "world": one_of(None, *get_args(World)),
+    }
+
     @cached_property
     def own(self) -> Mapping[str, Metric]:
         """Those that are computed here, by name and in the order of rows: all but packages'."""
@@ -155,32 +165,7 @@ class Metrics(Plugins[Metric]):
                 "point, of letters, digits and _, and one function, of decisions or of episodes; "
                 "a package's metric is not primary"
             )
-        for field, allowed in _STATED.items():
-            stated = getattr(metric, field)
-            if not (
-                isinstance(stated, allowed) if isinstance(allowed, type) else stated in allowed
-            ):
-                words = (
-                    allowed.__name__ if isinstance(allowed, type) else ", ".join(map(str, allowed))
-                )
-                raise UserError(
-                    f"plug-in {printable(name)!r} ({self.group}) has {field} "
-                    f"{printable(repr(stated))}; "
-                    f"allowed: {words}; repair or uninstall the package that registers it"
-                )
         return metric
-
-
-# What a metric states beside its functions: each one's type, or the values that are allowed.
-_STATED: Mapping[str, Any] = {
-    "meaning": str,
-    "label": str,
-    "unit": Unit,
-    "better": get_args(Better),
-    "interval": ("rate", "mean"),
-    "most": float,
-    "world": (None, *get_args(World)),
-}
 
 
 def _rate(
