@@ -4,6 +4,7 @@ import asyncio
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from harness.coordination.rules import RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Formula
 from harness.core import parallel
+from harness.core import strangers as doors
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.strangers import strangers
@@ -50,6 +52,17 @@ def test_what_would_end_the_program_is_bad_input_and_says_where(
     assert str(error.value).startswith(f"rule mine ends the program ({words}")
     assert f" at {__file__}:" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_does_not_come_back_is_named_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doors, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(doors, "_watchers", set())
+    for _ in range(2):
+        with doors.worded("rule slow of mine"):
+            time.sleep(0.3)
+    assert capsys.readouterr().err.count("harness: rule slow of mine has not come back") == 1
 
 
 @pytest.mark.parametrize("raised", [ValueError("x"), Stop(2), KeyboardInterrupt()])

@@ -6,8 +6,11 @@ the rest of the program does not depend on it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
+from msgspec import Meta
+
+from harness.core.config import Count, Seconds, between
 from harness.core.files import canonical_json
 from harness.core.image import Image
 from harness.prompts.answer_schema import Shape
@@ -25,6 +28,12 @@ BARE: tuple[AnswerMode, ...] = ("readout", "decision")  # whose answer is a bare
 Letters = Literal["raw", "cyclic"]
 Sums = Literal["refuse", "divide"]
 FinishReason = Literal["stop", "length", "refusal", "error"]
+Whole = Annotated[int, Meta(ge=0, description="a whole number, 0 or more")]
+MOST_CHARS = 4 * 2**20  # of an answer, which has a few thousand
+Text = Annotated[
+    str, Meta(max_length=MOST_CHARS, description=f"a text of at most {MOST_CHARS} characters")
+]
+Share = Annotated[float, between(0.0, 1.0 + 1e-6)]  # up to rounding
 AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 
@@ -128,32 +137,32 @@ class Completion:
     request_id: str
     # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file
     # can hold; empty on an error
-    text: str
+    text: Text
     # None if the engine has no tokenizer. Of several orders, what they begin with counts once in
     # process, and as often as a server counts it.
-    prompt_tokens: int | None
+    prompt_tokens: Whole | None
     # tokens of the answer, 0 if none is written; None if nobody counts them
-    completion_tokens: int | None
+    completion_tokens: Whole | None
     # `stop`, `length` (cut off by max_tokens), `refusal` (of a question that was read) or `error`
     finish_reason: FinishReason
     # Time of this answer if its request ran alone (batch_size 1), else None: the wall time of a
     # batch is not the latency of an answer.
-    seconds: float | None
-    batch_size: int  # number of requests that went through the engine together
+    seconds: Seconds | None
+    batch_size: Count  # number of requests that went through the engine together
     error: str | None = None  # the engine's message if finish_reason is `error`
     # total probability of the letters of a read-out; None otherwise
-    label_mass: float | None = None
-    retries: int = 0  # failed attempts before this one; their time is in `seconds`
+    label_mass: Share | None = None
+    retries: Whole = 0  # failed attempts before this one; their time is in `seconds`
     cached: bool = False  # whether it comes from the cache, in which case it has no seconds
-    slow_s: float = 0.0  # declared seconds beyond its card's latency (the slow tail of a proxy)
+    slow_s: Seconds = 0.0  # declared seconds beyond its card's latency (the slow tail of a proxy)
     # time to first token (TTFT), prefill included; None if not known
-    first_token_s: float | None = None
+    first_token_s: Seconds | None = None
     # time per output token (TPOT, see `per_token_s`); None of only one token
-    token_s: float | None = None
+    token_s: Seconds | None = None
     # How much of a read-out over several orders follows the letter, 0 to 1
     # (`harness.backends.orders`), and whether one letter is the likeliest in every order; None
     # otherwise.
-    letter_share: float | None = None
+    letter_share: Share | None = None
     follows_letter: bool | None = None
     # address of the server that gave it; None in process, or of several servers
     server: str | None = None

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from harness.backends.base import AnswerMode, Backend
+from harness.backends.engine_of_package import EngineOfPackage
 from harness.core import extras
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
-from harness.core.strangers import strangers
+from harness.core.strangers import strangers, worded
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -174,9 +175,13 @@ def open_backend(
     if batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     options = {"device": device, "dtype": dtype, "batch_size": batch_size}
-    with strangers(f"engine {printable(card.engine)}"):
-        backend: Backend = import_object(engine.opens)(card, **options)
-    return backend
+    what = f"engine {printable(card.engine)}"
+    if card.engine in BUILT_IN:
+        with strangers(what):
+            backend: Backend = import_object(engine.opens)(card, **options)
+        return backend
+    with worded(what):
+        return EngineOfPackage(import_object(engine.opens)(card, **options), card.engine)
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:

@@ -3,19 +3,50 @@ program past.
 
 An error of a package is raised as it is, for the caller to word. Two things are no errors, and not
 a package's to do: to end the program, as `sys.exit` does, and to leave it in another working
-folder, from which relative paths lead elsewhere.
+folder, from which relative paths lead elsewhere. Code that does not come back nothing can stop: a
+line says what the command waits for.
 """
 
 import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 
 from harness.core.errors import UserError, printable
 from harness.core.process import Stop
+
+PATIENCE_S = 20.0  # after which a line says what a command waits for
+_calls: dict[object, tuple[str, float]] = {}  # what runs now, and since when
+_said: set[str] = set()
+_watchers: set[int] = set()  # processes with a thread that watches
+
+
+@contextmanager
+def watched(what: str) -> Iterator[None]:
+    """Run code; a line on stderr says it, once, if that takes longer than `PATIENCE_S`."""
+    call = object()
+    _calls[call] = what, time.monotonic()
+    if os.getpid() not in _watchers:
+        _watchers.add(os.getpid())
+        threading.Thread(target=_watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        del _calls[call]
+
+
+def _watch() -> None:
+    while True:
+        time.sleep(PATIENCE_S / 10)
+        for what, since_s in list(_calls.values()):
+            if what not in _said and time.monotonic() - since_s > PATIENCE_S:
+                _said.add(what)
+                line = f"{what} has not come back for {PATIENCE_S:g} s; Ctrl-C ends the command"
+                print(f"harness: {line}, which goes on when it is typed again", file=sys.stderr)
 
 
 @contextmanager
@@ -44,7 +75,7 @@ def aside(what: str) -> Iterator[None]:
     """Run code as `strangers` does; what it prints goes to stderr,
     since a program may read stdout.
     """
-    with strangers(what), redirect_stdout(sys.stderr):
+    with watched(what), strangers(what), redirect_stdout(sys.stderr):
         yield
 
 
@@ -68,7 +99,7 @@ def worded(
         yield
         return
     try:
-        with door(what):
+        with watched(what), door(what):
             yield
     except UserError:
         raise

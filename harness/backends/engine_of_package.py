@@ -1,0 +1,65 @@
+"""The door to a package's engine:
+it gets copies of requests, and what it answers is checked and copied.
+
+So it answers what was asked, in the order that it was asked, with numbers that can be, and fails in
+one line, a UserError.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from harness.backends.base import Backend, Completion, Request
+from harness.core.config import convert
+from harness.core.errors import UserError, printable
+from harness.core.strangers import worded
+
+SILENT = "the engine gives no reason"
+
+
+class EngineOfPackage:
+    """A backend of a package's engine; what this has not, is the package's own."""
+
+    def __init__(self, backend: Backend, name: str) -> None:
+        self._backend, self._what = backend, f"engine {printable(name)}"
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        with worded(self._what):
+            completions = list(self._backend.complete([_copy(request) for request in requests]))
+            if len(completions) != len(requests):
+                raise ValueError(f"it gives {len(completions)} answers to {len(requests)} requests")
+            pairs = zip(requests, completions, strict=True)
+            return [self._checked(request, completion) for request, completion in pairs]
+
+    def _checked(self, request: Request, completion: Completion) -> Completion:
+        """Return a plain copy. Raises UserError for a field that no completion can have."""
+        if not isinstance(completion, Completion):
+            raise TypeError(f"it gives a {type(completion).__name__} and no Completion")
+        where = f"{self._what}, answer {printable(request.id)}"
+        fields = dict(vars(completion))
+        if fields.get("request_id") != request.id:
+            raise UserError(
+                f"{where}: request_id is {printable(repr(fields.get('request_id')))}; give answers "
+                "in the order of the requests, each with its request's id"
+            )
+        if (fields.get("error") is not None) != (fields.get("finish_reason") == "error"):
+            raise UserError(f"{where}: an error has finish_reason error, and nothing else has")
+        if fields.get("error") == "":
+            fields["error"] = SILENT
+        return convert(fields, Completion, where)
+
+    def identity(self) -> dict[str, Any]:
+        with worded(self._what):
+            identity = self._backend.identity()
+            if not isinstance(identity, dict):
+                raise TypeError(f"its identity is a {type(identity).__name__} and no dict")
+            plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(identity))
+            return plain
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+
+def _copy(request: Request) -> Request:
+    return request.alike(messages=tuple(dict(message) for message in request.messages))
