@@ -4,16 +4,21 @@ dataset.
 The bars are those of the whole dataset, where the README's table has the intervals.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import decisions, figure, run, spec_of
+from evaluating import decisions, figure, run, scenes_of, spec_of
 from former import DATASET
 from run_on_disk import answers_of
 
+from harness.backends.base import Request
+from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset, find, load
+from harness.evaluate.asking import Asker, requests
+from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import Evaluated
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
@@ -60,6 +65,27 @@ def test_it_is_unsure_where_a_danger_is_hidden(done: Evaluated, shipped: Dataset
 def test_its_helpers_messages_help(done: Evaluated) -> None:
     alone, helped = (figure(done, c, "success_rate").value for c in ("single-local", "6g"))
     assert helped - alone >= 0.08
+
+
+@pytest.mark.slow
+def test_what_it_answered_before_moves_no_answer() -> None:
+    """Rounding in F16 would: so a run that resumes is the run, and repeat 3 is sampling seed 2."""
+    data = load(find("occluded-intersection-v3"), limit=3)
+    spec = spec_of(data, "swarm-tiny", answer="readout")
+    asked = list(requests(spec, scenes_of(data)[:12]))[:24]
+    backend = open_backend(spec.ego.card, device="cpu")
+
+    def answered(some: Sequence[Request]) -> list[tuple[str, float | None]]:
+        asker = Asker(spec, lambda: backend, PAPER)
+        asker.ask(some)
+        return [(answer.raw, answer.label_mass) for answer in asker.answers.values()]
+
+    one, two, others = asked[:1], asked[:2], asked[8:]
+    for some in (one, others, one):
+        answered(some)
+    at_first = answered(two)
+    answered(others)
+    assert answered(two) == at_first
 
 
 def test_it_is_small() -> None:

@@ -253,6 +253,16 @@ def window(backend: Backend) -> int:
     return getattr(backend, "window", 0)
 
 
+def forget(backend: Backend) -> None:
+    """Let a backend answer as if it was just opened; nothing for one that keeps nothing.
+
+    What an engine keeps of earlier prompts saves time, and moves probabilities by rounding.
+    """
+    forgets: Callable[[], None] | None = getattr(backend, "forget", None)
+    if forgets:
+        forgets()
+
+
 @dataclass(frozen=True)
 class Served:
     """Which server gave the answer of a request, and the model that it names;

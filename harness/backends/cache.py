@@ -30,6 +30,7 @@ from harness.backends.base import (
     Request,
     Served,
     doubt,
+    forget,
     served,
     several,
     window,
@@ -263,6 +264,9 @@ class Cached:
 
     def identity(self) -> dict[str, Any]:
         return self._identity
+
+    def forget(self) -> None:
+        forget(self.backend)
 
     def served(self) -> list[Served]:
         return served(self.backend)

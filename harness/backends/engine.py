@@ -86,6 +86,10 @@ class Engine(Protocol):
         """
         ...
 
+    def forget(self) -> None:
+        """Drop what is kept of earlier prompts; no session may be open."""
+        ...
+
     def identity(self) -> dict[str, Any]: ...
 
 

@@ -86,6 +86,9 @@ class LanguageModel:
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 
+    def forget(self) -> None:
+        self.engine.forget()
+
     def identity(self) -> dict[str, Any]:
         return self.engine.identity()
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import Backend, Completion, Request, Served, served, window
+from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
 from harness.backends.cache import cached
 from harness.backends.card import Card
 
@@ -30,6 +30,10 @@ class Swarm:
     def identity(self) -> dict[str, Any]:
         ego, *helpers = (backend.identity() for backend in self._backends)
         return {**ego, "helpers": helpers}
+
+    def forget(self) -> None:
+        for backend in self._backends:
+            forget(backend)
 
     def served(self) -> list[Served]:
         return [each for backend in self._backends for each in served(backend)]

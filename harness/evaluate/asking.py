@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Request, Served, served, window
+from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
 from harness.backends.base import Role as AskedRole
 from harness.backends.card import Card
 from harness.coordination.coordinate import FusionCall
@@ -372,6 +372,7 @@ class Asker:
             return self._answers(backend, chunk)
 
     def _answers(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
+        forget(backend)  # so that a run that resumes, and one of several repeats, answer alike
         answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
         repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):

@@ -77,6 +77,9 @@ class Child:
         identity: dict[str, Any] = self.call("identity")
         return identity
 
+    def forget(self) -> None:
+        self.call("forget")
+
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         prompts: list[str] = self.call("rendered", requests)
         return prompts

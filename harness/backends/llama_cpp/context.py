@@ -38,7 +38,7 @@ class LlamaContext:
     ) -> None:
         self._model = model
         self._projector = projector
-        self._sequences = sequences
+        self.sequences = sequences
         self._context: int | None = None
         self._room = 0
         self.cache_type = "F32" if model.dtype == "F32" else "F16"
@@ -110,9 +110,9 @@ class LlamaContext:
             self._context = None
         params = c.llama_context_default_params()
         self._room = -(-room // _PAGE) * _PAGE
-        params.n_ctx = self._room * self._sequences
+        params.n_ctx = self._room * self.sequences
         params.n_batch = params.n_ubatch = _BATCH
-        params.n_seq_max = params.n_outputs_max = self._sequences
+        params.n_seq_max = params.n_outputs_max = self.sequences
         params.kv_unified = False
         # otherwise a beginning is lost once the sliding window has passed it
         params.swa_full = True
@@ -127,7 +127,7 @@ class LlamaContext:
         self._context = c.llama_init_from_model(self._model.pointer, params)
         if not self._context:
             raise RuntimeError(
-                f"no memory for {self._sequences} x {self._room} tokens: {last_error()}"
+                f"no memory for {self.sequences} x {self._room} tokens: {last_error()}"
             )
         self._model.adapt(self._context)
 

@@ -82,9 +82,7 @@ class LlamaEngine:
         self._card, self._file, self._model = card, file, model
         self._projector = projector
         self.context = LlamaContext(model, batch_size + BEGINNINGS, projector)
-        self._free = list(range(batch_size))
-        # The least recently used comes first.
-        self._beginnings = list(range(batch_size, batch_size + BEGINNINGS))
+        self._set_places()
 
     def look(self, image: Image) -> list[int]:
         if self._projector is None:
@@ -171,6 +169,17 @@ class LlamaEngine:
         for place, length in lengths.items():
             self.context.cut(place, length)
         return logits
+
+    def forget(self) -> None:
+        """Free the memory, too: where its sequences lie moves numbers by rounding."""
+        self.context.free()
+        self._set_places()
+
+    def _set_places(self) -> None:
+        sequences = self.context.sequences
+        self._free = list(range(sequences - BEGINNINGS))
+        # The least recently used comes first.
+        self._beginnings = list(range(sequences - BEGINNINGS, sequences))
 
     def release(self, places: Sequence[int]) -> None:
         for place in places:

@@ -203,6 +203,9 @@ class TransformersEngine:
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
         return self._reader.begin(prompts, exact)
 
+    def forget(self) -> None:
+        self._reader.forget()
+
     def identity(self) -> dict[str, Any]:
         """Return what decides the answers;
         a hub checkpoint is named by its commit, others by their files.

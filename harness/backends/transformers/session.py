@@ -69,6 +69,9 @@ class Reader:
         self._failed = False
         return session
 
+    def forget(self) -> None:
+        self._prefixes.clear()
+
     def _in_float32(self, head: Any, inputs: tuple[Any, ...], logits: Any) -> Any:
         """Replace the exact tokens' logits:
         16 bits leave steps of .06 to .13 between likely ones.
