@@ -359,7 +359,7 @@ class Followed:
             hold_against_options(args)
         elif program == "harness":
             if SHOWN[name(self.page)] and command in ONCE:
-                code, out = 0, self.copied(command)
+                code, out, problem = 0, self.copied(command), ""
             else:
                 path, _ = parsed(args)
                 cut = "" if shown.strip() else CUT.get(command, CUT.get(path, ""))
