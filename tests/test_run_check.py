@@ -35,6 +35,10 @@ def longer(proxy_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(proxy_run, tmp_path / "reports/run"))
 
 
+def hurried(row: Row) -> None:
+    row["slow_s"] = -0.1
+
+
 def table(name: str, before: str, after: str) -> Tamper:
     """Replace a text in a CSV table once."""
 
@@ -110,6 +114,9 @@ IN_TABLES = {
     "success of episodes": (
         lambda run: damage(run, episode=won), "episodes.csv has another success in ",
     ),
+    "delays of answers": (
+        lambda run: damage(run, answer=hurried), "answers.jsonl has a delay of -0.1 s in 0000",
+    ),
     "latency of decisions": (
         lambda run: damage(run, decision=faster), "episodes.csv has another latency_ms in ",
     ),
@@ -145,6 +152,15 @@ def test_tables_that_contradict_each_other_are_named(
     changed: str, run: Path, harness: Harness
 ) -> None:
     check_finds(IN_TABLES[changed], run, harness)
+
+
+def test_a_replay_takes_no_delay_that_no_card_declares(
+    run: Path, two_path: Path, harness: Harness
+) -> None:
+    damage(run, answer=hurried)
+    code, _, error = harness("eval", "--model", f"replay:{run}", "--dataset", two_path)
+    assert code == 2
+    assert f"{run} states a delay of -0.1 s in 00000-0-" in error
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from harness.backends.base import AGAIN, BARE, Backend, Completion, Request, failed, same_model
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
@@ -164,6 +166,8 @@ class Replay:
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or "
                 "dataset; replay it with that run's --prompt, --image and --dataset"
             )
+        if delay := self._run.undeclared_delay(answer):
+            raise UserError(f"{printable(self._run.path)} states {delay}")
         whole = Completion(request.id, answer.raw, **{name: answer.cell(name) for name in _KEPT})
         return _turn(whole, answer.first, again) if answer.first else whole
 
@@ -184,7 +188,7 @@ class Kept(Replay):
     """
 
     def _completion(self, request: Request, answer: Answer) -> Completion:
-        return replace(super()._completion(request, answer), slow_s=0.0)
+        return super()._completion(request, structs.replace(answer, slow_s=0.0))
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """Raise UserError: the run has no such answer."""

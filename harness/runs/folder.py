@@ -20,6 +20,7 @@ import pyarrow.csv as pacsv
 from msgspec import Struct
 
 from harness.core import work
+from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import SUITE
@@ -157,6 +158,21 @@ class Run:
     @cached_property
     def _agents(self) -> dict[int, dict[str, Any]]:
         return {}
+
+    def undeclared_delay(self, answer: Answer) -> str | None:
+        """Return, in words, an answer's seconds beyond its card's latency if the card declares none
+        such; None if it does.
+
+        Allowed are none, and in each turn the slow tail of a rule.
+        """
+        failures = self.agent(answer)["model"].get("failures")
+        tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
+        if not (isinstance(tail_s, int | float) and 0 <= tail_s <= LONGEST_S):
+            tail_s = 0.0
+        if answer.slow_s in [turns * tail_s for turns in range(answer.turns + 1)]:
+            return None
+        name = printable(answer.id)
+        return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
 
     def speed(self, answer: Answer) -> Speed:
         """Return the speed of an answer's agent; only for a run with a device profile."""
