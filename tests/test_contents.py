@@ -27,7 +27,6 @@ from harness.backends.base import Completion, Request
 from harness.backends.proxy import distribution
 from harness.coordination.contents import CONTENTS, OF_HELPERS
 from harness.coordination.coordinate import FusionInputs, coordinate
-from harness.coordination.encodings import reply_bits
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.errors import UserError
@@ -197,10 +196,8 @@ CLEAR = Draws(np.full((1, 3, 2), 0.9), np.zeros((1, 3)))
 
 def decided(point: OperatingPoint, answer: Sequence[float]) -> Any:
     said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
-    said = said if point.content.intent else said.without_models()
-    said = replace(
-        said, payload_bits=reply_bits(point.radio.encoding, point.content, said, headers=False)
-    )
+    said = point.content.able(point, said, None)
+    said = replace(said, payload_bits=point.content.bits(point.radio.encoding, said, headers=False))
     call = lambda on_time: (np.array([answer]), np.full(1, 0.05))  # noqa: E731
     return coordinate(point, said, CLEAR, FusionInputs(call))
 
@@ -249,11 +246,9 @@ def test_a_standards_encoding_has_the_sizes_of_its_messages(
 def test_headers_count_under_a_physical_radio() -> None:
     said = intents([0.3, 0.4, 0.3], [[1.0, 0.0, 0.0]] * 3)
     content = CONTENTS["both"]
-    paper, radio = (reply_bits("etsi", content, said, headers) for headers in (False, True))
+    paper, radio = (content.bits("etsi", said, headers) for headers in (False, True))
     assert (radio > paper + 2 * 8 * 40).all()
-    assert (
-        reply_bits("json", content, said, True) == reply_bits("json", content, said, False)
-    ).all()
+    assert (content.bits("json", said, True) == content.bits("json", said, False)).all()
 
 
 def test_with_both_the_ego_votes_as_it_sees_now() -> None:

@@ -13,7 +13,6 @@ from graphs import MESSAGES
 
 from harness.backends.base import Completion, Request
 from harness.coordination.contents import CONTENTS
-from harness.coordination.encodings import reply_bits
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.core.errors import UserError
@@ -123,7 +122,7 @@ def test_a_text_has_its_bytes_and_what_is_around_them(few: Dataset, encoding: st
     scenes = scenes_of(few)
     words = {"v2": "é is two bytes", "v3": "x"}
     said: Intents = asker_of(spec(few, ask="all"), Talkative(words))(scenes)
-    bits = reply_bits(encoding, CONTENTS["text"], said, headers=False)
+    bits = CONTENTS["text"].bits(encoding, said, headers=False)
     for place, text in enumerate(words.values()):
         n = len(text.encode())
         if encoding == "json":
@@ -131,7 +130,7 @@ def test_a_text_has_its_bytes_and_what_is_around_them(few: Dataset, encoding: st
         else:
             sizes = size(f"{encoding}-intent", Counts(actions=0, text_bytes=n))
             assert (bits[:, place] == sizes.message + sizes.envelope).all()
-            whole = reply_bits(encoding, CONTENTS["intent"], said, headers=False)
+            whole = CONTENTS["intent"].bits(encoding, said, headers=False)
             assert (whole > bits).all()
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, capped, inverse_distance_weights
+from harness.coordination.contents import INTENTS
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -109,7 +110,7 @@ def fuse(
     trust = np.full(heard.on_time.shape, np.nan)
     latency_s, failed = heard.exchange_s, np.zeros_like(heard.own_failed)
     answers = point.has_fusion_call and (
-        point.fusion.consensus == EGO_PROMPT or not point.content.intent
+        point.fusion.consensus == EGO_PROMPT or INTENTS not in point.content.holds
     )
     if point.has_fusion_call:
         if fusion.call is None:

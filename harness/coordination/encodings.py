@@ -11,7 +11,6 @@ transport count as well; those of the radio are its own.
 
 import numpy as np
 
-from harness.coordination.contents import Content
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats
 from harness.radio import messages
@@ -22,30 +21,29 @@ ENCODINGS = (JSON, *NAMES)
 SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 
 
-def reply_bits(encoding: str, content: Content, intents: Intents, headers: bool) -> Floats:
-    """Return the size of each helper's reply, `(..., H)`; one that holds both is two messages."""
-    bits = np.zeros(intents.payload_bits.shape)
-    text_bytes = 0.0 if intents.text_bytes is None else intents.text_bytes
-    if content.words and encoding == JSON:
-        bits += 8 * (len(SAYS) + text_bytes)
-    elif content.asks_helpers or content.plan:
-        holds_intent = content.intent or content.plan
-        counts = Counts(actions=intents.own.shape[-1] * holds_intent, text_bytes=text_bytes)
-        bits += (
-            intents.payload_bits
-            if encoding == JSON
-            else _packet(encoding, "intent", counts, headers)
-        )
-    if content.graph:
-        assert intents.object_bits is not None
-        assert intents.objects is not None
-        counts = Counts(objects=intents.objects)
-        bits += (
-            intents.object_bits
-            if encoding == JSON
-            else _packet(encoding, "objects", counts, headers)
-        )
-    return bits
+def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
+    """Return the size of each helper's intent with its words, `(..., H)`."""
+    if encoding == JSON:
+        return intents.payload_bits
+    counts = Counts(actions=intents.own.shape[-1], text_bytes=_text_bytes(intents))
+    return _replies(encoding, "intent", counts, intents, headers)
+
+
+def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
+    """Return the size of each helper's words alone, `(..., H)`."""
+    if encoding == JSON:
+        return 8 * (len(SAYS) + _text_bytes(intents))
+    counts = Counts(text_bytes=_text_bytes(intents))
+    return _replies(encoding, "intent", counts, intents, headers)
+
+
+def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
+    """Return the size of each helper's list of objects, `(..., H)`, which `intents` has."""
+    assert intents.object_bits is not None
+    assert intents.objects is not None
+    if encoding == JSON:
+        return intents.object_bits
+    return _replies(encoding, "objects", Counts(objects=intents.objects), intents, headers)
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
@@ -58,6 +56,20 @@ def beacon_bytes(encoding: str, rate_hz: float) -> int:
     at so many a second.
     """
     return messages.beacon_bytes(_standard(encoding), rate_hz)
+
+
+def _text_bytes(intents: Intents) -> Floats:
+    if intents.text_bytes is None:
+        return np.zeros(intents.payload_bits.shape)
+    return intents.text_bytes
+
+
+def _replies(
+    encoding: str, content: str, counts: Counts, intents: Intents, headers: bool
+) -> Floats:
+    """Return the size of a message of each helper, `(..., H)`, by a standard's encoding."""
+    bits = _packet(encoding, content, counts, headers)
+    return np.broadcast_to(bits, intents.payload_bits.shape)
 
 
 def _standard(encoding: str) -> Encoding:

@@ -30,6 +30,7 @@ from functools import cached_property
 
 import numpy as np
 
+from harness.coordination.contents import INTENTS
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts import FUSION
@@ -198,7 +199,7 @@ def _ask_helpers(
     """Return when the ego asks, `(..., 1)`, the outcome,
     and until when it waits at most, `(...)`.
     """
-    intends = point.radio.helper_rounds and point.content.intent
+    intends = point.radio.helper_rounds and INTENTS in point.content.holds
     opens_round = (
         triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked)
     )

@@ -6,13 +6,13 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from itertools import chain
-from typing import Any, Literal, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 import msgspec
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
-from harness.coordination.contents import CONTENTS, INTENT, PLAN, Content
+from harness.coordination.contents import CONTENTS, INTENT, INTENTS, PLAN, PLANS, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
@@ -130,9 +130,8 @@ class Rewrites(NamedTuple):
 
     question: str = ""  # the name of what helpers are asked; empty for the plain question
     changes: Changes = Changes()  # what is done to messages
-    graph: str = ""  # what the ego's graph is extended by (`contents.Content`)
-    # what the prompt shows of messages: all of each, its words alone, or nothing
-    shows: Literal["message", "words", ""] = "message"
+    call: str = ""  # the name of what the content asks the ego (`contents.Call`); empty for none
+    whole: bool = True  # whether the prompt shows all of each message
     elsewhere: bool = False  # whether they come from other scenes
 
 
@@ -178,7 +177,7 @@ class OperatingPoint:
         for part in self.more:
             with telling(part):
                 part.check_with(self)
-        if self.content.asks_again and self.radio.edge == FUSION:
+        if self.content.call and self.radio.edge == FUSION:
             raise wrong(
                 "edge",
                 FUSION,
@@ -187,7 +186,7 @@ class OperatingPoint:
         if self.fusion.consensus != EGO_PROMPT:
             return
         where = f"where consensus is {EGO_PROMPT}"
-        if not (self.content.asks_helpers or self.content.plan):
+        if not (self.content.asks_helpers or self.content.of_agents):
             allowed = f"intent, text, both or {PLAN} {where}, which reads the helpers' words"
             raise wrong("content", self.ask.content, allowed)
         if self.radio.edge == FUSION:
@@ -197,9 +196,10 @@ class OperatingPoint:
         """Raise ValueError for a rule that does not fit the content,
         and for what plans go without.
         """
-        asks_again = self.content.plan and self.fusion.consensus == EGO_PROMPT
-        if reads_plans(self.fusion.consensus) != self.content.plan and not asks_again:
-            if self.content.plan:
+        of_agents = self.content.of_agents
+        asks_again = of_agents and self.fusion.consensus == EGO_PROMPT
+        if reads_plans(self.fusion.consensus) != of_agents and not asks_again:
+            if of_agents:
                 able = ", ".join(
                     name for name in names() if reads_plans(name) or name == EGO_PROMPT
                 )
@@ -207,7 +207,7 @@ class OperatingPoint:
             raise wrong(
                 "content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}"
             )
-        if not self.content.plan:
+        if not of_agents:
             if self.fusion.rounds > 1:
                 raise wrong("rounds", self.fusion.rounds, f"1 where {holds}, which holds no plans")
             return
@@ -407,9 +407,10 @@ class OperatingPoint:
         if setting in UNIT and self.radio.edge == "none":
             return "it has no roadside unit (edge is none)"
         on_demand = setting == "on_demand" and self.content.asks_helpers
-        if setting in OF_INTENTS and not (self.content.intent or self.content.plan or on_demand):
+        fuses_none = self.content.holds.isdisjoint((INTENTS, PLANS))
+        if setting in OF_INTENTS and fuses_none and not on_demand:
             return f"content {ask.content} holds no intents"
-        if setting == "rounds" and not self.content.plan:
+        if setting == "rounds" and PLANS not in self.content.holds:
             return f"content {ask.content} holds no plans"
         weighs_none = consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads | Precedence)
         if setting in WEIGHING and weighs_none:
@@ -445,18 +446,19 @@ class OperatingPoint:
         )
 
     def needs(self, what: str) -> bool:
-        """Return whether a schedule, rule or attack of it needs `in_time`, `outlook`,
-        `lot` or `claims`.
+        """Return whether its content, schedule, rule or a part needs `in_time`, `outlook`,
+        `lot`, `claims`, `objects` or `plans`.
         """
         return what in self._needs
 
     @cached_property
     def _needs(self) -> frozenset[str]:
+        needs = set(self.content.needs)
         if self.radio.profile is None:
-            return frozenset()
+            return frozenset(needs)
         rule = RULES.get(self.fusion.consensus)
         plug_ins = (SCHEDULES[self.ask.schedule], rule)
-        needs = {need for plug_in in plug_ins for need in getattr(plug_in, "needs", ())}
+        needs.update(need for plug_in in plug_ins for need in getattr(plug_in, "needs", ()))
         for part in self.more:
             with worded_part(part):
                 needs.update(part.needs)
@@ -486,7 +488,7 @@ class OperatingPoint:
     @property
     def has_fusion_call(self) -> bool:
         """Whether fusion asks the ego's model a second time, with the messages or what they add."""
-        second = self.fusion.consensus == EGO_PROMPT or self.content.asks_again
+        second = self.fusion.consensus == EGO_PROMPT or self.content.call is not None
         return self.radio.profile is not None and second
 
     @property
@@ -522,18 +524,26 @@ class OperatingPoint:
     @property
     def rewrites(self) -> "Rewrites":
         """How its fusion calls show messages."""
-        whole: Literal["message", ""] = "message" if self.fusion.consensus == EGO_PROMPT else ""
-        shows: Literal["message", "words", ""] = "words" if self.content.words else whole
-        graph = self.content.graph
+        call = self.content.call
+        name = call.name if call else ""
+        whole = self.fusion.consensus == EGO_PROMPT and not (call and call.in_words)
         elsewhere = self.elsewhere is not None
-        return Rewrites(self.question.name, self._changes(shows, graph), graph, shows, elsewhere)
+        return Rewrites(self.question.name, self._changes(), name, whole, elsewhere)
 
-    def _changes(self, shows: str, graph: str) -> Changes:
+    @property
+    def shows_words(self) -> bool:
+        """Whether the prompt of its fusion calls shows messages, or their words."""
+        call = self.content.call
+        return self.fusion.consensus == EGO_PROMPT or (call is not None and call.in_words)
+
+    def _changes(self) -> Changes:
         """Return what parts change of messages whose words or objects a fusion call shows."""
+        call = self.content.call
+        objects = call is not None and call.in_graph
         each = []
         for part in self.more:
             with worded_part(part):
-                each.append(Changes(*part.changes(bool(shows), bool(graph))))
+                each.append(Changes(*part.changes(self.shows_words, objects)))
         of_attackers = "&".join(filter(None, (changes.of_attackers for changes in each)))
         return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
 

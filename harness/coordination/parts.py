@@ -103,6 +103,10 @@ class RunFacts(Protocol):
         """Whether the model answers only for the ego."""
 
     @property
+    def several_decide(self) -> bool:
+        """Whether vehicles beside the ego decide, too."""
+
+    @property
     def frozen(self) -> bool:
         """Whether its scenes are frozen."""
 

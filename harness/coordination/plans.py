@@ -10,10 +10,6 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 
 STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
-NO_PLANS = (
-    "condition {}: content plan needs several agents, and here one ego decides; give --agents all "
-    "with `harness drive`, or content=intent"
-)
 
 
 @dataclass(frozen=True)

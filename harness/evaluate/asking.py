@@ -497,7 +497,7 @@ class Asker:
         shape = len(scenes), width - 1
         not_yet = None if self.spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
         own_bits, own_text_bytes = None, None
-        if any(point.content.plan for point in self.spec.points):
+        if any(point.needs("plans") for point in self.spec.points):
             own = [row[0] for row in answers]
             own_bits = np.array(
                 [_bits(scene, a) if a else 0.0 for scene, a in zip(scenes, own, strict=True)],

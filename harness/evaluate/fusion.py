@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.contents import OBJECTS, PLAN, TEXT, TRUTH
+from harness.coordination.contents import PLAN, Call, calls
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites, change_of
@@ -23,8 +23,7 @@ from harness.evaluate.repair import as_text
 from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
 FROM = "from:"  # in a key, before the id of the other scene that a message comes from
-WORDS = "words"  # in a key, after what the graph is extended by: the prompt shows the messages, too
-HOLDS = frozenset((WORDS, TEXT, OBJECTS, TRUTH))  # what a message holds, in its key
+WHOLE = "words"  # in a key, after the name of a call: the prompt shows the whole messages, too
 
 
 @dataclass(frozen=True)
@@ -87,10 +86,8 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
     """
     of_attackers, of_all = rewrites.changes
     changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]
-    if rewrites.graph:
-        changed += [rewrites.graph, *([WORDS] if rewrites.shows else [])]
-    elif rewrites.shows == "words":
-        changed.append(TEXT)
+    if rewrites.call:
+        changed += [rewrites.call, *([WHOLE] if rewrites.whole else [])]
     if source:
         changed.append(FROM + source)
     key = asked_key(helper, rewrites.question)
@@ -138,12 +135,24 @@ def _plan_of(key: str) -> dict[str, Any] | None:
         ) from None
 
 
-def changes_of(key: str) -> list[str]:
-    """Return how the message of a sender's key was changed,
-    and what it holds if not an intent alone.
+def call_of(key: str) -> Call | None:
+    """Return what the ego was asked with the message of a sender's key;
+    None if with all of it, and nothing else.
     """
-    changes = key.partition(REWRITTEN)[2].split("&")
-    return [change for change in changes if change and not change.startswith(FROM)]
+    named = calls()
+    return next((named[mark] for mark in _marks(key) if mark in named), None)
+
+
+def changes_of(key: str) -> list[str]:
+    """Return how the message of a sender's key was changed."""
+    of_calls = {WHOLE, *calls()}
+    return [mark for mark in _marks(key) if mark not in of_calls]
+
+
+def _marks(key: str) -> list[str]:
+    """Return what stands in a sender's key behind its name, but for where it comes from."""
+    marks = key.partition(REWRITTEN)[2].split("&")
+    return [mark for mark in marks if mark and not mark.startswith(FROM)]
 
 
 def source_of(scene: str, senders: Sequence[str]) -> str:
@@ -167,18 +176,17 @@ def messages_of(
         if plan := _plan_of(sender):
             messages.append(plan)
             continue
-        key, changes = sender.partition(REWRITTEN)[0], changes_of(sender)
-        holds = HOLDS.intersection(changes)
-        if holds and holds.isdisjoint((WORDS, TEXT)):
-            continue  # its objects are in the graph
+        key = sender.partition(REWRITTEN)[0]
+        call = None if WHOLE in _marks(sender) else call_of(sender)
+        if call and not call.in_words:
+            continue  # it is in the graph
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
-            for change in changes:
-                if change not in holds:
-                    message = change_of(change).message(message, actions)
+            for change in changes_of(sender):
+                message = change_of(change).message(message, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
-            if TEXT in holds:
-                message = {"evidence": " ".join(message["evidence"].split())}
+            if call:
+                message = dict(call.message(message))
             messages.append({"sender": key.partition(ASKED)[0], **message})
     return messages

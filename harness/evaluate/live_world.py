@@ -183,7 +183,8 @@ class LiveWorld(SceneWorld):
         helpers = max(len(scene.viewers) for scene in self.scenes) - 1
         step = np.full(len(at), self._step)
         draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
-        return Due(at, episode, seed, draws, self._senders(places) if point.content.plan else None)
+        senders = self._senders(places) if point.needs("plans") else None
+        return Due(at, episode, seed, draws, senders)
 
     def _senders(self, places: Sequence[tuple[int, Course]]) -> Ints:
         """Return the decision that each helper makes itself now, (n, H), as `Due.senders`."""

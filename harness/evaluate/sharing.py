@@ -5,16 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec import structs
 
-from harness.coordination.contents import OBJECTS, TRUTH
 from harness.coordination.operating_point import change_of, questions
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene, by_seat
-from harness.evaluate.fusion import HOLDS, changes_of, source_of
+from harness.evaluate.fusion import call_of, changes_of, source_of
 from harness.runs.records import ASKED, REWRITTEN, Answer
-from harness.world.perception.graph import truth_graphs
-from harness.world.perception.shared import Heard, merged
+from harness.world.perception.shared import Heard
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
@@ -25,7 +23,7 @@ def shared_graphs(
     """Return the ego's graph for each scene and the keys of those who were heard in it
     (`fusion.key_of`).
 
-    None where their messages hold no objects. All sets have messages of one content;
+    None where their messages leave it as it is. All sets have messages of one content;
     `scenes` has the scenes that these come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
@@ -40,14 +38,9 @@ def _shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
     keys = [key for _, senders in sets for key in senders]
-    changes = {change for key in keys for change in changes_of(key)}
-    if TRUTH in changes:
-        truths = truth_graphs(scenario, [scene.state for scene, _ in sets])
-        own = [scene.graphs[scene.viewers[0]] for scene, _ in sets]
-        return [
-            structs.replace(t, sectors=o.all_in_sight) for t, o in zip(truths, own, strict=True)
-        ]
-    if OBJECTS not in changes:
+    calls = (call_of(key) for key in keys)
+    call = next((call for call in calls if call and call.in_graph), None)
+    if call is None:
         return [None] * len(sets)
     cases = []
     for scene, senders in sets:
@@ -56,7 +49,7 @@ def _shared_graphs(
         if source.id != scene.id:
             graphs = [_without_ego(graph) for graph in graphs]
         cases.append(Heard(scene.state, scene.graphs[scene.viewers[0]], graphs, source.state))
-    return merged(scenario, cases)
+    return call.graphs(scenario, cases)
 
 
 def _without_ego(graph: SceneGraph) -> SceneGraph:
@@ -70,7 +63,7 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
     sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
     graph = questions()[question].shown(scene.graphs[sender])
-    changes = [change_of(change) for change in changes_of(key) if change not in HOLDS]
+    changes = [change_of(change) for change in changes_of(key)]
     for change in sorted(changes, key=lambda change: change.adds):
         graph = change.graph(graph, scenario, scene)
     return graph

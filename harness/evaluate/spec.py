@@ -16,7 +16,6 @@ from harness.backends.registry import ENGINES
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.parts import worded_part
-from harness.coordination.plans import NO_PLANS
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
@@ -292,27 +291,31 @@ class Spec:
 
     def _check_point(self, point: OperatingPoint) -> None:
         shown, ego = f"condition {printable(point.name)}", self.ego
-        if point.content.plan and not self.several_decide:
-            raise UserError(NO_PLANS.format(printable(point.name)))
+        reads = point.has_fusion_call and point.shows_words
+        if obstacle := self._obstacle(point, reads):
+            raise UserError(f"{shown}: {obstacle}")
+        call = point.content.call
+        if point.has_fusion_call and call and call.in_graph and ego.can.language_model:
+            self._check_shows_objects(shown)
+        if not reads:
+            return
+        reason = self._plan_obstacle if point.content.of_agents else self.fusion_obstacle
+        if reason:
+            raise UserError(f"{shown}: {reason}")
+
+    def _obstacle(self, point: OperatingPoint, reads: bool) -> str | None:
+        """Return why a condition, whose ego `reads` messages, cannot be played; None if it can."""
+        if reads and not self.ego.can.language_model:
+            name = printable(self.ego.card.name)
+            return f"{name} is no language model and cannot fuse messages"
+        if obstacle := point.content.obstacle(point, self):
+            return obstacle
         for part in point.more:
             with worded_part(part):
                 obstacle = part.obstacle(point, self)
             if obstacle:
-                raise UserError(f"{shown}: {obstacle}")
-        if point.has_fusion_call and point.content.graph and ego.can.language_model:
-            self._check_shows_objects(shown)
-        if not (point.has_fusion_call and point.rewrites.shows):
-            return
-        reason = self._plan_obstacle if point.content.plan else self.fusion_obstacle
-        if point.content.words and not ego.prompt.shows_words:
-            version = ego.prompt.version
-            reason = (
-                f"prompt {version} cannot show words without an intent; use --prompt v11 or v12"
-            )
-        if not ego.can.language_model:
-            reason = f"{printable(ego.card.name)} is no language model and cannot fuse messages"
-        if reason:
-            raise UserError(f"{shown}: {reason}")
+                return obstacle
+        return None
 
     def _check_shows_objects(self, shown: str) -> None:
         """Raise UserError if the ego's prompt is the same whatever is around;

@@ -14,17 +14,15 @@ import numpy as np
 
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import Coordination, FusionCall, FusionInputs, fuse
-from harness.coordination.encodings import JSON, reply_bits
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.coordination.parts_of_packages import sources, spoken
-from harness.coordination.plans import NO_PLANS, Plans
+from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import UserError, printable
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate.claims import claims
@@ -243,7 +241,7 @@ def _steps(
         decided = []
         for point, due_here in due.items():
             call = None
-            if point.has_fusion_call and point.content.plan:
+            if point.has_fusion_call and point.content.of_agents:
                 call = ask.plan_call(decision_points, due_here.at, said[point].intents)
             elif point.has_fusion_call:
                 places = places_of(point, due_here, len(decision_points))
@@ -275,9 +273,9 @@ def _with_needs(
         intents = replace(intents, outlook=world.outlook())
     if any(point.needs("claims") for point in due):
         intents = replace(intents, claims=world.claims())
-    if any(point.content.plan for point in due):
+    if any(point.needs("plans") for point in due):
         intents = replace(intents, plans=world.plans())
-    if any(point.content.graph for point in due):
+    if any(point.needs("objects") for point in due):
         counts, bits = world.listed() or (None, None)
         intents = replace(intents, objects=counts, object_bits=bits)
     return intents
@@ -347,21 +345,14 @@ def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) 
     Those of helpers may be answers to another question, or come from other scenes; a decision with
     no other to hear from hears nobody. Who is asked, the distances and the times stay the same.
     """
-    intents = answers[PLAIN]
-    every = np.array_equal(due.at, np.arange(len(intents.own)))
-    own = _able(point, intents if every else intents.take(due.at))
+    own = _able(point, answers[PLAIN], due)
     if point.question != PLAIN:
-        source = _able(point, answers[point.question].take(due.at))
+        source = _able(point, answers[point.question], due)
         own = _with_helpers(own, source, source.valid)
     elif point.elsewhere:
         places = _sources(point, due)
         source, alone = own.take(places), places == np.arange(len(places))
         own = _with_helpers(own, source, source.valid & ~alone[:, None])
-    own = point.prepared(own)
-    if point.content.plan:
-        if own.plans is None or due.senders is None:
-            raise UserError(NO_PLANS.format(printable(point.name)))
-        own = own.planned(due.senders)
     return as_sent(point, own) if point.asks else own
 
 
@@ -372,24 +363,17 @@ def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
     return replace(own, valid=valid, **known)
 
 
-def _able(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return the intents where only those helpers count as valid that have what the content
-    wants.
-    """
-    if point.content.words:
-        return intents.with_words()
-    by_model = point.content.intent or point.content.plan or not point.asks
-    return intents if by_model else intents.without_models()
+def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
+    """Return the intents of the decisions that are due, of helpers that can send the content."""
+    every = np.array_equal(due.at, np.arange(len(intents.own)))
+    own = point.prepared(intents if every else intents.take(due.at))
+    return point.content.able(point, own, due.senders)
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
     """Return what helpers send by the point's content and encoding."""
-    content, encoding = point.content, point.radio.encoding
-    if encoding == JSON and not content.asks_again:
-        return intents
-    return replace(
-        intents, payload_bits=reply_bits(encoding, content, intents, point.physical is not None)
-    )
+    bits = point.content.bits(point.radio.encoding, intents, point.physical is not None)
+    return intents if bits is intents.payload_bits else replace(intents, payload_bits=bits)
 
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:
@@ -428,10 +412,10 @@ def _fusion_calls(
     and return them by rewrites.
 
     This can happen before any decision, since who is heard does not depend on the fusion.
-    Plans are left out: they may be of a later round.
+    What agents decide is left out: it may be of a later round.
     """
     calls = {}
-    due = {point: due_here for point, due_here in due.items() if not point.content.plan}
+    due = {point: due_here for point, due_here in due.items() if not point.content.of_agents}
     for rewrites in dict.fromkeys(point.rewrites for point in due if point.has_fusion_call):
         alike = {point: due_here for point, due_here in due.items() if point.rewrites == rewrites}
         codes = heard_codes(alike, broadcasts, sent, len(decision_points))

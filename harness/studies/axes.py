@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.contents import CONTENTS, OF_HELPERS
+from harness.coordination.contents import CONTENTS, OF_HELPERS, WORDS
 from harness.coordination.operating_point import (
     POINTS,
     SHORT,
@@ -67,7 +67,7 @@ class Axis:
         return freed.changed(**{self.field: setting})
 
 
-OF_ANY_MODEL = [name for name in OF_HELPERS if not CONTENTS[name].words]
+OF_ANY_MODEL = [name for name in OF_HELPERS if CONTENTS[name].holds != {WORDS}]
 AXES = {
     axis.name: axis
     for axis in (

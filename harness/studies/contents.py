@@ -170,7 +170,7 @@ class Result:
         return [
             content
             for content in self.others
-            if content != NOTHING and CONTENTS[content].graph != TRUTH
+            if content != NOTHING and TRUTH not in CONTENTS[content].holds
         ]
 
     @cached_property

@@ -176,7 +176,8 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
         *(
             f"content={name}"
             for name, content in CONTENTS.items()
-            if name != INTENT and not (content.words or content.plan)
+            if name != INTENT
+            and not (content.of_agents or (content.call and content.call.in_words))
         ),
         *(
             f"{'content=objects' if attack.in_objects else 'consensus=trust'},attack={name}:share=2/3"

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from harness.coordination.contents import TRUTH
+from harness.coordination.contents import PLANS, TRUTH
 from harness.coordination.parts import PLAIN, Part, Question, RunFacts, Text, wrong
 from harness.core.arrays import Ints
 from harness.core.errors import unknown
@@ -51,9 +51,9 @@ class Controlled(Part, frozen=True, kw_only=True):
 
     def check_with(self, point: "OperatingPoint") -> None:
         holds = f"where content is {point.ask.content}"
-        if point.content.plan:
+        if PLANS in point.content.holds:
             raise wrong("messages", self.messages, f"own {holds}")
-        if self.elsewhere and point.content.graph == TRUTH:
+        if self.elsewhere and TRUTH in point.content.holds:
             raise wrong("messages", SHUFFLED, f"own or blind {holds}")
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:

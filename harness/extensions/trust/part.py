@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from harness.coordination.contents import OBJECTS
+from harness.coordination.contents import INTENTS, OBJECTS, PLANS, TRUTH, WORDS
 from harness.coordination.parts import Change, Changes, Part, Text, wrong
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT
@@ -77,22 +77,23 @@ class Guard(Part, frozen=True, kw_only=True):
             self._check_defence(point)
 
     def _check_attack(self, point: "OperatingPoint") -> None:
-        attacks, content = attacks_of(self.attack), point.content
+        attacks, holds_kinds = attacks_of(self.attack), point.content.holds
         holds = f"where content is {point.ask.content}"
         allowed = ""
         if point.radio.profile is None:
             allowed = "left out where there is no channel"
-        elif content.plan and any(attack.in_words for attack in attacks):
+        elif PLANS in holds_kinds and any(attack.in_words for attack in attacks):
             allowed = f"one on intents {holds}, which has no words"
-        elif content.graph != OBJECTS and any(attack.in_objects for attack in attacks):
+        elif OBJECTS not in holds_kinds and any(attack.in_objects for attack in attacks):
             allowed = "one on intents where content lists no objects"
-        elif content.graph and len({attack.share for attack in attacks}) > 1:
+        elif holds_kinds & {OBJECTS, TRUTH} and len({attack.share for attack in attacks}) > 1:
             allowed = f"attacks of one share {holds}, as the same vehicles do all"
         elif point.has_fusion_call and not all(attack.by_scene for attack in attacks):
             allowed = "one that needs no past and adds no voices where the ego is asked twice"
-        kind = "in_words" if content.words else "in_objects"
+        words_alone = holds_kinds == {WORDS}
+        kind = "in_words" if words_alone else "in_objects"
         apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
-        if not allowed and not (content.intent or content.plan or apt):
+        if not allowed and not (holds_kinds & {INTENTS, PLANS} or apt):
             able = ", ".join(name for name in ATTACKS if getattr(ATTACKS[name], kind))
             allowed = f"some of {able} and absent {holds}, which holds no intents"
         if allowed:
@@ -100,11 +101,12 @@ class Guard(Part, frozen=True, kw_only=True):
 
     def _check_defence(self, point: "OperatingPoint") -> None:
         holds = f"where content is {point.ask.content}"
-        if point.content.plan:
+        words_alone = point.content.holds == {WORDS}
+        if PLANS in point.content.holds:
             allowed = f"left out {holds}, which is no advice and has no words"
-        elif point.content.words and self.defence != "quoted":
+        elif words_alone and self.defence != "quoted":
             allowed = f"quoted or left out {holds}"
-        elif point.fusion.consensus != EGO_PROMPT and not point.content.words:
+        elif point.fusion.consensus != EGO_PROMPT and not words_alone:
             allowed = f"left out where consensus is not {EGO_PROMPT}"
         else:
             return
