@@ -10,7 +10,7 @@ from harness.backends.registry import Capabilities, Registration
 from harness.cli.show import finish as finish_study
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Kept, Part, RunFacts
+from harness.coordination.parts import ActsOn, Kept, Part, RunFacts
 from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError
@@ -52,6 +52,7 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "PERCENT",
+    "ActsOn",
     "Backend",
     "Bools",
     "Broadcast",

@@ -594,11 +594,11 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(
         ("6g:content=word", "unknown content 'word'"),
         (
             "6g:content=objects,consensus=ego-prompt",
-            "it must be intent, text, both or plan where",
+            "it must be intent, text, plan or both where",
         ),
-        ("6g:content=objects,attack=liar", "some of ghost, hide, shift and absent"),
-        ("6g:attack=ghost", "one on intents where content lists no objects"),
-        ("6g:content=oracle,attack=hide", "one on intents where content lists no objects"),
+        ("6g:content=objects,attack=liar", "it must be absent, ghost, hide, shift or left out"),
+        ("6g:attack=ghost", "where content is intent, which holds no objects"),
+        ("6g:content=oracle,attack=hide", "it must be absent or left out"),
         (
             "6g:content=objects,attack=ghost:share=1/3+hide:share=1",
             "attacks of one share where content is",
@@ -606,7 +606,7 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(
         ("6g:content=both,attack=liar+ghost:share=1", "attacks of one share where content is both"),
         (
             "mode2:content=both,edge=fusion",
-            "none or relay where content is both: a unit sends a policy",
+            "none or relay where content is both: a unit has no model",
         ),
         (
             "6g:content=objects,round_trip=us-drive",

@@ -153,7 +153,7 @@ def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
         ("6g:messages=none", "unknown messages 'none'"),
         (
             "6g:content=oracle,messages=shuffled",
-            "messages is 'shuffled'; it must be own or blind where content is oracle",
+            "messages is 'shuffled'; it must be blind or own where content is oracle, which holds no intents",
         ),
     ],
 )

@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, capped, inverse_distance_weights
+from harness.coordination.contents import INTENTS
 from harness.coordination.robust import (
     HEADS,
     bayes,
@@ -20,7 +21,7 @@ from harness.coordination.robust import (
     geometric_median,
     head_trimmed_mean,
 )
-from harness.coordination.rules import RULES, reads_plans
+from harness.coordination.rules import RULES, reads
 from harness.coordination.trust import Trust, divergence
 
 EQUAL = np.full(4, 0.25)
@@ -62,7 +63,7 @@ def test_one_liar_at_three_metres_flips_every_weighted_rule_and_no_rule_of_heads
     told = messages(
         [[0.6, 0.3, 0.1], CAREFUL, CAREFUL, BOLD], [15, 10, 12, 3], sensed_m=[10, 12, 30]
     )
-    assert {rule for rule in RULES if not reads_plans(rule) and decided(rule, told) == 2} == {
+    assert {rule for rule in RULES if INTENTS in reads(rule) and decided(rule, told) == 2} == {
         "linear",
         "log-pool",
         "median",

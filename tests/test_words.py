@@ -184,10 +184,13 @@ def test_a_run_is_read_as_it_was_asked(few: Dataset, tmp_path: Path) -> None:
     [
         (
             "attack=liar",
-            "some of injection and absent where content is text, which holds no intents",
+            "it must be injection, absent or left out where content is text",
         ),
-        ("defence=schema,consensus=ego-prompt", "quoted or left out where content is text"),
-        ("edge=fusion", "none or relay where content is text: a unit sends a policy"),
+        (
+            "defence=schema,consensus=ego-prompt",
+            "it must be quoted or left out where content is text",
+        ),
+        ("edge=fusion", "none or relay where content is text, which holds no intents"),
     ],
 )
 def test_what_words_alone_cannot_do_is_one_line(point: str, wrong: str) -> None:

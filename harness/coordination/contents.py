@@ -36,6 +36,7 @@ WORDS: Final = "words"  # what helpers' models say beside an intent, or alone
 OBJECTS: Final = "objects"  # what helpers' sensors list
 TRUTH: Final = "truth"  # all that there is, which no message can hold
 PLANS: Final = "plans"  # what agents are themselves going to do
+KINDS = (INTENTS, WORDS, OBJECTS, TRUTH, PLANS)
 BY_MODELS = frozenset((INTENTS, WORDS))  # what a helper's model is asked for
 
 

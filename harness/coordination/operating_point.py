@@ -12,13 +12,14 @@ import msgspec
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
-from harness.coordination.contents import CONTENTS, INTENT, INTENTS, PLAN, PLANS, Content
+from harness.coordination.contents import CONTENTS, INTENTS, KINDS, PLANS, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
     FUSION,
     PLAIN,
     RELAY,
+    ActsOn,
     Ask,
     Change,
     Changes,
@@ -35,7 +36,7 @@ from harness.coordination.parts import (
 from harness.coordination.parts_of_packages import prepared
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
-from harness.coordination.rules import EGO_PROMPT, RULES, names, reads_plans
+from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.coordination.sent import Honest, Speaker
@@ -169,56 +170,41 @@ class OperatingPoint:
         _ = self.channel
 
     def _check_together(self) -> None:
-        holds = f"content is {self.ask.content}"
-        self._check_plans(holds)
+        self._check_reads()
+        for part in (self.radio, self.ask, self.fusion, self.cloud, *self.more):
+            with telling(part):
+                for act in part.acts_on:
+                    self._check_holds(act)
+                part.check_with(self)
         if self.cloud.round_trip and self.has_fusion_call:
             allowed = f"left out where {self.asks_twice}, which asks twice"
             raise wrong("round_trip", self.cloud.round_trip, allowed)
-        for part in self.more:
-            with telling(part):
-                part.check_with(self)
-        if self.content.call and self.radio.edge == FUSION:
-            raise wrong(
-                "edge",
-                FUSION,
-                f"none or relay where {holds}: a unit sends a policy and nothing else",
-            )
-        if self.fusion.consensus != EGO_PROMPT:
-            return
-        where = f"where consensus is {EGO_PROMPT}"
-        if not (self.content.asks_helpers or self.content.of_agents):
-            allowed = f"intent, text, both or {PLAN} {where}, which reads the helpers' words"
-            raise wrong("content", self.ask.content, allowed)
-        if self.radio.edge == FUSION:
-            raise wrong("edge", FUSION, f"none or relay {where}: a unit has no model")
-
-    def _check_plans(self, holds: str) -> None:
-        """Raise ValueError for a rule that does not fit the content,
-        and for what plans go without.
-        """
-        of_agents = self.content.of_agents
-        asks_again = of_agents and self.fusion.consensus == EGO_PROMPT
-        if reads_plans(self.fusion.consensus) != of_agents and not asks_again:
-            if of_agents:
-                able = ", ".join(
-                    name for name in names() if reads_plans(name) or name == EGO_PROMPT
-                )
-                raise wrong("consensus", self.fusion.consensus, f"one of {able} where {holds}")
-            raise wrong(
-                "content", self.ask.content, f"{PLAN} where consensus is {self.fusion.consensus}"
-            )
-        if not of_agents:
-            if self.fusion.rounds > 1:
-                raise wrong("rounds", self.fusion.rounds, f"1 where {holds}, which holds no plans")
-            return
-        if self.fusion.rounds > 1 and (
-            self.cloud.round_trip or self.cloud.round_trip_s is not None
-        ):
+        if self.asks_again and self.radio.edge == FUSION:
+            allowed = f"none or relay where {self.asks_twice}: a unit has no model"
+            raise wrong("edge", FUSION, allowed)
+        in_a_cloud = self.cloud.round_trip or self.cloud.round_trip_s is not None
+        if self.fusion.rounds > 1 and in_a_cloud:
             raise wrong("rounds", self.fusion.rounds, "1 where the ego's model runs in a cloud")
-        if self.ask.on_demand:
-            raise wrong("on_demand", True, f"false where {holds}: an agent plans in any case")
-        if self.radio.edge == FUSION:
-            raise wrong("edge", FUSION, f"none or relay where {holds}: a unit has no plan")
+
+    def _check_reads(self) -> None:
+        """Raise ValueError for a content that holds nothing that its rule reads."""
+        content, consensus = self.ask.content, self.fusion.consensus
+        if _may_read(consensus, self.content):
+            return
+        if consensus == Fusion().consensus:
+            able = [name for name in names() if _may_read(name, self.content)]
+            raise wrong("consensus", consensus, f"{_any_of(able)} where content is {content}")
+        able = [name for name, other in CONTENTS.items() if _may_read(consensus, other)]
+        read = [kind for kind in KINDS if kind in reads(consensus)]
+        where = f"where consensus is {consensus}, which reads {_any_of(read)}"
+        raise wrong("content", content, f"{_any_of(able)} {where}")
+
+    def _check_holds(self, act: ActsOn) -> None:
+        """Raise ValueError for a setting that needs messages of other kinds."""
+        if self.content.holds.isdisjoint(act.kinds):
+            allowed = _any_of((*act.others(self.content.holds), act.instead))
+            holds = f"content is {self.ask.content}, which holds no {_any_of(act.kinds)}"
+            raise wrong(act.setting, act.value, f"{allowed} where {holds}")
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
@@ -488,14 +474,19 @@ class OperatingPoint:
     @property
     def has_fusion_call(self) -> bool:
         """Whether fusion asks the ego's model a second time, with the messages or what they add."""
-        second = self.fusion.consensus == EGO_PROMPT or self.content.call is not None
-        return self.radio.profile is not None and second
+        return self.radio.profile is not None and self.asks_again
+
+    @property
+    def asks_again(self) -> bool:
+        """The same of a point whatever its channel."""
+        return self.fusion.consensus == EGO_PROMPT or self.content.call is not None
 
     @property
     def asks_twice(self) -> str:
         """The setting by which the ego's model is asked a second time, in words."""
-        by_rule = self.content == CONTENTS[INTENT]
-        return f"consensus is {EGO_PROMPT}" if by_rule else f"content is {self.ask.content}"
+        if self.content.call:
+            return f"content is {self.ask.content}"
+        return f"consensus is {EGO_PROMPT}"
 
     @cached_property
     def question(self) -> Question:
@@ -613,6 +604,19 @@ def _gone(setting: str) -> OfExtension | None:
 
 def _lacks(setting: str, value: object, gone: OfExtension) -> str:
     return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"
+
+
+def _may_read(consensus: str, content: Content) -> bool:
+    """Return whether a rule fuses what a content holds, or what the ego answers to it."""
+    told = content.holds
+    if content.call and consensus != EGO_PROMPT:
+        told = told | {INTENTS}
+    return not told.isdisjoint(reads(consensus))
+
+
+def _any_of(names: Iterable[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _error_of(name: str, error: ValueError) -> UserError:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
-from harness.coordination.contents import CONTENTS, INTENT
+from harness.coordination.contents import CONTENTS, INTENT, INTENTS, KINDS, PLANS
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
@@ -87,6 +87,17 @@ class Changes(NamedTuple):
     of_all: tuple[str, ...] = ()
 
 
+class ActsOn(NamedTuple):
+    """A setting that does something with messages of some kinds, and nothing with others."""
+
+    setting: str
+    value: object  # of a text that names several things, one of them
+    kinds: Collection[str]  # `contents.KINDS`; a content that holds none of them is refused
+    instead: str = "left out"  # what the setting must then be
+    # what else it may be with what a content holds
+    others: "Callable[[frozenset[str]], Collection[str]]" = lambda holds: ()
+
+
 class RunFacts(Protocol):
     """What a part is told of the run in which its condition is played."""
 
@@ -150,6 +161,11 @@ class Part(Struct, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Raise ValueError or UserError for what no single setting's type says."""
+
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        """Its settings that need messages of some kind."""
+        return ()
 
     def check_with(self, point: "OperatingPoint") -> None:
         """Raise ValueError for what does not go together with other settings of its condition."""
@@ -286,6 +302,13 @@ class Ask(Part, frozen=True, kw_only=True):
             )
 
     @property
+    def acts_on(self) -> Collection[ActsOn]:
+        if not self.on_demand:
+            return ()
+        others = [kind for kind in KINDS if kind != PLANS]  # an agent plans in any case
+        return (ActsOn("on_demand", True, others, "false"),)
+
+    @property
     def above(self) -> float:
         """The worth above which the ego asks, in the schedule's unit."""
         if self.schedule == PAPER:
@@ -330,6 +353,12 @@ class Radio(Part, frozen=True, kw_only=True):
         if self.encoding not in ENCODINGS:
             raise unknown("encoding", self.encoding, ENCODINGS)
 
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        if self.edge != FUSION:
+            return ()
+        return (ActsOn("edge", FUSION, (INTENTS,), "none or relay"),)
+
 
 class Fusion(Part, frozen=True, kw_only=True):
     """How the ego fuses what it has heard in time."""
@@ -358,6 +387,10 @@ class Fusion(Part, frozen=True, kw_only=True):
             raise unknown("fallback", self.fallback, FALLBACKS)
         if self.consensus not in RULES and self.consensus != EGO_PROMPT:
             raise unknown("consensus", self.consensus, names())
+
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        return (ActsOn("rounds", self.rounds, (PLANS,), "1"),) if self.rounds > 1 else ()
 
 
 class Cloud(Part, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ messages in its prompt (the paper's section III-C).
 """
 
 from harness.coordination.consensus import Pool, Rule, linear_pool, log_pool, median, trimmed_mean
+from harness.coordination.contents import INTENTS, PLANS, WORDS
 from harness.coordination.precedence import PRECEDENCE
 from harness.coordination.robust import HEADS
 from harness.coordination.trust import Trust
@@ -25,9 +26,12 @@ RULES: Plugins[Rule] = Plugins(
 EGO_PROMPT = "ego-prompt"
 
 
-def reads_plans(name: str) -> bool:
-    """Return whether a rule reads what agents are themselves going to do, and no other intents."""
-    return "plans" in getattr(RULES.get(name), "needs", ())
+def reads(name: str) -> frozenset[str]:
+    """Return the kinds of message that a rule fuses, or that `ego-prompt` shows, each alone."""
+    if name == EGO_PROMPT:
+        return frozenset((WORDS, PLANS))
+    of_agents = PLANS in getattr(RULES[name], "needs", ())
+    return frozenset((PLANS,) if of_agents else (INTENTS,))
 
 
 def names() -> tuple[str, ...]:

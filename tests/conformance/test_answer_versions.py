@@ -30,9 +30,9 @@ from harness.backends.card import Card
 from harness.backends.openai import shapes
 from harness.backends.openai.faults import fault_in
 from harness.backends.registry import BUILT_IN, missing, open_backend
-from harness.coordination.contents import CONTENTS, INTENT
+from harness.coordination.contents import CONTENTS, INTENT, INTENTS
 from harness.coordination.operating_point import POINTS, named_point
-from harness.coordination.rules import RULES, reads_plans
+from harness.coordination.rules import RULES, reads
 from harness.coordination.scheduling import FORMULAS
 from harness.core import versions
 from harness.core.files import sha256_bytes
@@ -172,7 +172,7 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
     """
     attacks = pytest.importorskip("harness.extensions.trust.attacks").ATTACKS
     changes = [
-        *(f"consensus={rule}" for rule in RULES.built_in if not reads_plans(rule)),
+        *(f"consensus={rule}" for rule in RULES.built_in if INTENTS in reads(rule)),
         *(
             f"content={name}"
             for name, content in CONTENTS.items()

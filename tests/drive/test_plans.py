@@ -102,13 +102,13 @@ def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path:
 @pytest.mark.parametrize(
     ("condition", "says"),
     [
-        ("6g:content=plan", "consensus is 'linear'; it must be one of yield-by-time"),
+        ("6g:content=plan", "consensus is 'linear'; it must be yield-by-time"),
         ("6g:consensus=auction", "content is 'intent'; it must be plan where consensus is auction"),
         (PLAN + "auction,on_demand=true", "on_demand is True"),
         (PLAN + "auction,messages=blind", "messages is 'blind'"),
         (
             PLAN + "auction,attack=liar+injection",
-            "attack is 'liar.injection'; it must be one on intents",
+            "attack is 'injection'; it must be liar",
         ),
     ],
 )

@@ -1,12 +1,13 @@
 """The setting `messages` of a condition: what the ego hears in the place of its helpers."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from harness.coordination.contents import PLANS, TRUTH
-from harness.coordination.parts import PLAIN, Part, Question, RunFacts, Text, wrong
+from harness.coordination.contents import INTENTS, OBJECTS, TRUTH, WORDS
+from harness.coordination.parts import PLAIN, ActsOn, Part, Question, RunFacts, Text
 from harness.core.arrays import Ints
 from harness.core.errors import unknown
 
@@ -30,6 +31,14 @@ class Blinded(Question):
         return graph.blinded()
 
 
+# An agent that plans is itself asked, and the truth of another scene is another scene.
+ACTS_ON = {BLIND: (INTENTS, WORDS, OBJECTS, TRUTH), SHUFFLED: (INTENTS, WORDS, OBJECTS)}
+
+
+def _others(holds: frozenset[str]) -> list[str]:
+    return [control for control in ACTS_ON if not holds.isdisjoint(ACTS_ON[control])]
+
+
 class Controlled(Part, frozen=True, kw_only=True):
     """What the ego hears. A gain that remains under a control is not from what helpers see."""
 
@@ -49,12 +58,11 @@ class Controlled(Part, frozen=True, kw_only=True):
         if self.messages not in MESSAGES:
             raise unknown("messages", self.messages, MESSAGES)
 
-    def check_with(self, point: "OperatingPoint") -> None:
-        holds = f"where content is {point.ask.content}"
-        if PLANS in point.content.holds:
-            raise wrong("messages", self.messages, f"own {holds}")
-        if self.elsewhere and TRUTH in point.content.holds:
-            raise wrong("messages", SHUFFLED, f"own or blind {holds}")
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        if self.messages == OWN:
+            return ()
+        return (ActsOn("messages", self.messages, ACTS_ON[self.messages], OWN, _others),)
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
         if not self.elsewhere:

@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Meta, structs
 
 from harness.coordination.claims import Claims
+from harness.coordination.contents import INTENTS, KINDS, OBJECTS, PLANS, WORDS
 from harness.coordination.intents import Intents
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import changed, settable
@@ -68,6 +69,13 @@ class Attack:
                 stacklevel=2,
             )
             cls.by_scene = vars(cls)["by_moment"]
+
+    @property
+    def acts_on(self) -> tuple[str, ...]:
+        """The kinds of message of which it changes something (`contents.KINDS`)."""
+        if self.in_objects:
+            return (OBJECTS,)
+        return (WORDS,) if self.in_words else (INTENTS, PLANS)
 
     @property
     def steps(self) -> int:
@@ -277,6 +285,10 @@ class Absent(Attack):
     """Is absent. This is no attack, but a bound: what a rule would hear that knows who attacks."""
 
     by_scene: ClassVar[bool] = True
+
+    @property
+    def acts_on(self) -> tuple[str, ...]:
+        return KINDS
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         return replace(sent, valid=sent.valid & ~turn.attackers)

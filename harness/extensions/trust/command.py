@@ -71,7 +71,8 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
-    from harness.coordination.rules import RULES, reads_plans
+    from harness.coordination.contents import INTENTS
+    from harness.coordination.rules import RULES, reads
     from harness.evaluate.run import read_or_evaluate
     from harness.extensions.trust.attacks import ATTACKS
     from harness.extensions.trust.study import names_of, run_bench, shares_of, trust_study
@@ -79,7 +80,7 @@ def command(
 
     attack_names = names_of("--attacks", attacks, tuple(ATTACKS))
     rule_names, shares = (
-        names_of("--rules", rules, tuple(rule for rule in RULES if not reads_plans(rule))),
+        names_of("--rules", rules, tuple(rule for rule in RULES if INTENTS in reads(rule))),
         shares_of(share),
     )
     if (run is None and model is None) or (run and prompt):

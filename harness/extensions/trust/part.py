@@ -1,17 +1,18 @@
 """The settings `attack` and `defence` of a condition."""
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from harness.coordination.contents import INTENTS, OBJECTS, PLANS, TRUTH, WORDS
-from harness.coordination.parts import Change, Changes, Part, Text, wrong
+from harness.coordination.contents import INTENTS, WORDS
+from harness.coordination.parts import ActsOn, Change, Changes, Part, Text, wrong
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT
 from harness.coordination.sent import Speaker
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import unknown
-from harness.extensions.trust.attacks import ATTACKS, Absent, attacks_of, in_question
+from harness.extensions.trust.attacks import ATTACKS, attacks_of, in_question
 from harness.extensions.trust.changes import MESSAGES, AttackersMessage
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 MAJORITY = "majority"
 DEFENCES = (*MESSAGES, MAJORITY)
+# The kinds of message of which each needs some: `schema` leaves nothing of words alone.
+DEFENDED = {"quoted": (WORDS,), "schema": (INTENTS,), MAJORITY: (INTENTS,)}
 # The usual attacks: each alone, and a false place and several voices with a lie; at a point those
 # it allows.
 USUAL = (
@@ -43,6 +46,14 @@ USUAL = (
     "hide",
     "shift",
 )
+
+
+def _attacks_on(holds: frozenset[str]) -> list[str]:
+    return [name for name in ATTACKS if not holds.isdisjoint(ATTACKS[name].acts_on)]
+
+
+def _defences_on(holds: frozenset[str]) -> list[str]:
+    return [name for name in DEFENCES if not holds.isdisjoint(DEFENDED[name])]
 
 
 class Guard(Part, frozen=True, kw_only=True):
@@ -70,47 +81,36 @@ class Guard(Part, frozen=True, kw_only=True):
             if part not in DEFENCES:
                 raise unknown("defence", part, DEFENCES)
 
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        acts = []
+        for text in filter(None, self.attack.split("+")):
+            [attack] = attacks_of(text)
+            acts.append(ActsOn("attack", text, attack.acts_on, others=_attacks_on))
+        for defence in self.defences:
+            acts.append(ActsOn("defence", defence, DEFENDED[defence], others=_defences_on))
+        return acts
+
     def check_with(self, point: "OperatingPoint") -> None:
         if self.attack:
             self._check_attack(point)
-        if self.defence:
-            self._check_defence(point)
+        if self.defence and not point.shows_words:
+            allowed = f"left out where consensus is not {EGO_PROMPT}"
+            raise wrong("defence", self.defence, allowed)
 
     def _check_attack(self, point: "OperatingPoint") -> None:
-        attacks, holds_kinds = attacks_of(self.attack), point.content.holds
-        holds = f"where content is {point.ask.content}"
+        attacks, call = attacks_of(self.attack), point.content.call
+        shares = {attack.share for attack in attacks}
         allowed = ""
         if point.radio.profile is None:
             allowed = "left out where there is no channel"
-        elif PLANS in holds_kinds and any(attack.in_words for attack in attacks):
-            allowed = f"one on intents {holds}, which has no words"
-        elif OBJECTS not in holds_kinds and any(attack.in_objects for attack in attacks):
-            allowed = "one on intents where content lists no objects"
-        elif holds_kinds & {OBJECTS, TRUTH} and len({attack.share for attack in attacks}) > 1:
-            allowed = f"attacks of one share {holds}, as the same vehicles do all"
+        elif call and call.in_graph and len(shares) > 1:
+            where = f"where content is {point.ask.content}"
+            allowed = f"attacks of one share {where}, as the same vehicles do all"
         elif point.has_fusion_call and not all(attack.by_scene for attack in attacks):
             allowed = "one that needs no past and adds no voices where the ego is asked twice"
-        words_alone = holds_kinds == {WORDS}
-        kind = "in_words" if words_alone else "in_objects"
-        apt = all(getattr(attack, kind) or isinstance(attack, Absent) for attack in attacks)
-        if not allowed and not (holds_kinds & {INTENTS, PLANS} or apt):
-            able = ", ".join(name for name in ATTACKS if getattr(ATTACKS[name], kind))
-            allowed = f"some of {able} and absent {holds}, which holds no intents"
         if allowed:
             raise wrong("attack", self.attack, allowed)
-
-    def _check_defence(self, point: "OperatingPoint") -> None:
-        holds = f"where content is {point.ask.content}"
-        words_alone = point.content.holds == {WORDS}
-        if PLANS in point.content.holds:
-            allowed = f"left out {holds}, which is no advice and has no words"
-        elif words_alone and self.defence != "quoted":
-            allowed = f"quoted or left out {holds}"
-        elif point.fusion.consensus != EGO_PROMPT and not words_alone:
-            allowed = f"left out where consensus is not {EGO_PROMPT}"
-        else:
-            return
-        raise wrong("defence", self.defence, allowed)
 
     @property
     def needs(self) -> frozenset[str]:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harness.coordination.contents import INTENTS
 from harness.coordination.operating_point import OperatingPoint, setting_of
-from harness.coordination.rules import EGO_PROMPT, RULES, reads_plans
+from harness.coordination.rules import EGO_PROMPT, RULES, reads
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
@@ -308,7 +309,7 @@ def run_bench(
         raise UserError(
             f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out"
         )
-    usual = [rule for rule in RULES if not reads_plans(rule)]
+    usual = [rule for rule in RULES if INTENTS in reads(rule)]
     every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*usual, CAPPED)))])
     every: list[Key] = list(
         dict.fromkeys(

@@ -3,7 +3,8 @@
 import re
 from collections.abc import Callable
 
-from harness.coordination.rules import RULES, reads_plans
+from harness.coordination.contents import INTENTS
+from harness.coordination.rules import RULES, reads
 from harness.extensions.trust.attacks import ATTACKS
 
 Said = tuple[int, str, str]
@@ -13,4 +14,4 @@ def test_the_help_of_trust_names_every_attack_and_rule(harness: Callable[..., Sa
     said = set(
         re.findall(r"[a-z-]+", re.sub(r"-\n +", "-", harness("study", "trust", "--help")[1]))
     )
-    assert {*ATTACKS, *(rule for rule in RULES if not reads_plans(rule))} <= said
+    assert {*ATTACKS, *(rule for rule in RULES if INTENTS in reads(rule))} <= said

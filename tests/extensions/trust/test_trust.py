@@ -241,7 +241,12 @@ def test_objects_are_attacked_by_the_usual_attacks_on_objects(
             (),
             "no rule changes anything: content objects holds no intents",
         ),
-        ("6g:content=objects", (), ("ghost", "liar"), "some of ghost, hide, shift and absent"),
+        (
+            "6g:content=objects",
+            (),
+            ("ghost", "liar"),
+            "it must be absent, ghost, hide, shift or left out",
+        ),
     ],
 )
 def test_what_no_message_holds_cannot_be_attacked(
