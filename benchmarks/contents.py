@@ -22,7 +22,6 @@ from families import Row, finished
 from markupsafe import Markup
 from pages import harness, markdown, options, write_tables
 
-from harness.coordination.contents import OF_HELPERS
 from harness.core.arrays import Floats
 from harness.core.figures import shown
 from harness.core.progress import Progress
@@ -35,6 +34,7 @@ from harness.runs.success import Success, alike
 from harness.studies.contents import (
     BASE,
     NOTHING,
+    PLAYED,
     Outcome,
     folders,
     models,
@@ -47,7 +47,9 @@ from harness.studies.study import Study, write_study
 from harness.world import scenarios
 
 SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"
-PLAYED = {NOTHING: "single-local", **{name: f"{BASE},content={name}" for name in OF_HELPERS}}
+CONDITIONS = {
+    name: "single-local" if name == NOTHING else f"{BASE},content={name}" for name in PLAYED
+}
 
 
 class Asked(NamedTuple):
@@ -119,7 +121,7 @@ def drive(asked: Asked, here: Path, limit: int | None, study: Study) -> None:
     """Drive the layouts of a model's datasets with each content that it can play,
     unless it is done.
     """
-    conditions = [PLAYED[content] for content, *_ in study.tables[0].rows]
+    conditions = [CONDITIONS[content] for content, *_ in study.tables[0].rows]
     for name in asked.datasets if asked.drives else ():
         dataset, out = load(find(name)), here / "driven" / name
         layouts = min(limit or len(dataset.episodes), len(dataset.episodes))
@@ -144,7 +146,7 @@ def driven(asked: Asked, here: Path) -> dict[str, Outcome]:
     )
     for name, run in runs.items():
         [success] = by_episode([METRICS[SUCCESS]], run.grid, run.decisions, run.episodes).values()
-        for content, point in PLAYED.items():
+        for content, point in CONDITIONS.items():
             if point in run.conditions:
                 at = run.conditions.index(point)
                 families.setdefault(content, {})[name] = {SUCCESS: success[at]}

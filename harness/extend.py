@@ -9,6 +9,7 @@ from harness.backends.card import Card
 from harness.backends.registry import Capabilities, Registration
 from harness.cli.show import finish as finish_study
 from harness.coordination.consensus import Fused, Messages, Pool, Rule, linear_pool
+from harness.coordination.contents import Call, Content
 from harness.coordination.intents import Intents
 from harness.coordination.parts import ActsOn, Kept, Part, RunFacts
 from harness.coordination.scheduling import Formula, ScheduleInputs
@@ -57,10 +58,12 @@ __all__ = [
     "Bools",
     "Broadcast",
     "Building",
+    "Call",
     "Capabilities",
     "Card",
     "Channel",
     "Completion",
+    "Content",
     "Delivery",
     "Draws",
     "Floats",

@@ -116,7 +116,7 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
 
 def test_what_plug_ins_build_on_is_pinned() -> None:
     names = """
-    ActsOn Backend Bools Broadcast Building Capabilities Card Channel Completion Delivery Draws Floats
+    ActsOn Backend Bools Broadcast Building Call Capabilities Card Channel Completion Content Delivery Draws Floats
     Formula Fused Ground Hook Intents Ints Kept Lane Layout LayoutDraws Links Messages Metric PERCENT
     Parameters Part Path PathKey Physical Plugins Pool Registration Request Road Rule Run RunFacts
     Scenario ScheduleInputs Section Spawn Study Table Unit UserError

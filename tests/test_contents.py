@@ -25,7 +25,7 @@ from msgspec import structs
 
 from harness.backends.base import Completion, Request
 from harness.backends.proxy import distribution
-from harness.coordination.contents import CONTENTS, OF_HELPERS
+from harness.coordination.contents import CONTENTS
 from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
@@ -48,7 +48,11 @@ from harness.world.state import Part, VehicleState, WorldState
 OBJECTS, BOTH, ORACLE = (
     named_point(f"6g:content={name}") for name in ("objects", "both", "oracle")
 )
-LOSSLESS = {name: named_point(f"6g:loss=0,content={name}") for name in OF_HELPERS}
+LOSSLESS = {
+    name: named_point(f"6g:loss=0,content={name}")
+    for name, content in CONTENTS.items()
+    if not content.of_agents
+}
 
 
 def heard_by_all(scene: Scene) -> Heard:

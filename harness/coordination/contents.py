@@ -9,9 +9,10 @@ wait for the helper's inference. Where several vehicles decide, a message can ho
 plan, which costs no further inference.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from msgspec import structs
 
@@ -19,6 +20,8 @@ from harness.coordination.encodings import intent_bits, object_bits, words_bits
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
+from harness.core.plugins import Plugins
+from harness.core.strangers import aside, is_ours, worded
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -37,6 +40,10 @@ OBJECTS: Final = "objects"  # what helpers' sensors list
 TRUTH: Final = "truth"  # all that there is, which no message can hold
 PLANS: Final = "plans"  # what agents are themselves going to do
 KINDS = (INTENTS, WORDS, OBJECTS, TRUTH, PLANS)
+NEEDS = (OBJECTS, PLANS)  # what a content may need of the world
+# in the key of a message, after the name of a call: the prompt shows the whole message, too
+WHOLE: Final = "words"
+NAME = re.compile(r"\w[\w-]*")
 BY_MODELS = frozenset((INTENTS, WORDS))  # what a helper's model is asked for
 
 
@@ -53,20 +60,22 @@ class Call:
         """Return the ego's graph of each case; None where its own stays. All are of one seat."""
         return [None] * len(cases)
 
-    def message(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return what the prompt shows of a message, whose evidence is text."""
-        return message
+    def words(self, evidence: str) -> str:
+        """Return the line that the prompt shows of a helper's words."""
+        return " ".join(evidence.split())
 
 
 class Content:
     """What a message holds; plainly, a helper's intent, with its words beside it."""
 
     holds: ClassVar[frozenset[str]]  # some of the kinds above
-    needs: ClassVar[tuple[str, ...]] = ()  # what it needs of the world: `objects` or `plans`
-    # whether its senders are agents, whose messages are made of what they decide now, and of no
-    # answer
-    of_agents: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ()  # what it needs of the world, some of `NEEDS`
     call: ClassVar[Call | None] = None  # what the ego is asked once more; None if it is not
+
+    @property
+    def of_agents(self) -> bool:
+        """Whether its senders are agents, whose messages are made of what they decide now."""
+        return PLANS in self.holds
 
     @property
     def asks_helpers(self) -> bool:
@@ -100,9 +109,6 @@ class SaysWords(Call):
 
     name = TEXT
     in_words = True
-
-    def message(self, message: Mapping[str, Any]) -> Mapping[str, Any]:
-        return {"evidence": " ".join(message["evidence"].split())}
 
 
 class OfText(Content):
@@ -210,7 +216,6 @@ class OfPlan(Content):
 
     holds = frozenset((PLANS,))
     needs = (PLANS,)
-    of_agents = True
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
         return None if run.several_decide else NO_AGENTS
@@ -225,19 +230,73 @@ NO_AGENTS = (
     "content plan needs several agents, and here one ego decides; give --agents all with `harness "
     "drive`, or content=intent"
 )
-CONTENTS: Mapping[str, Content] = {
-    INTENT: OfIntent(),
-    TEXT: OfText(),
-    PLAN: OfPlan(),
-    OBJECTS: OfObjects(),
-    "both": OfBoth(),
-    "oracle": OfTruth(),
-}
-# What messages of one ego's helpers hold; a plan is sent by agents alone.
-OF_HELPERS = tuple(name for name, content in CONTENTS.items() if not content.of_agents)
+
+
+class Contents(Plugins[Content]):
+    """All contents, by name. A package's call has the name of its content."""
+
+    def _load(self, name: str) -> Content:
+        content = super()._load(name)
+        what = f"plug-in {printable(name)!r} ({self.group})"
+        with worded(what, built_in=is_ours(content), door=aside):
+            _check(name, content)
+        return content
+
+
+def _check(name: str, content: Content) -> None:
+    """Raise ValueError for a package's content that says of itself what does not go."""
+    if not NAME.fullmatch(name) or name == WHOLE:
+        raise ValueError("its name is no plain word")
+    holds, needs, call = content.holds, content.needs, content.call
+    if not isinstance(holds, frozenset) or not holds or not holds <= set(KINDS):
+        raise ValueError(f"holds is no frozenset of {', '.join(KINDS)}")
+    for fact in ("asks_helpers", "of_agents"):
+        if getattr(type(content), fact) is not getattr(Content, fact):
+            raise ValueError(f"{fact} follows from what it holds")
+    if not isinstance(needs, tuple) or not set(needs) <= set(NEEDS):
+        raise ValueError(f"needs is no tuple of {', '.join(NEEDS)}")
+    if PLANS in holds and (call or len(holds) > 1):
+        raise ValueError("a message that holds a plan holds nothing else, and has no call")
+    if call is None:
+        if holds.isdisjoint((INTENTS, PLANS)):
+            raise ValueError("it holds nothing that a rule fuses, and has no call")
+        return
+    if not isinstance(call, Call):
+        raise ValueError("its call is no Call")
+    if not is_ours(call) and call.name != name:
+        raise ValueError(f"its call is named {printable(repr(call.name))}")
+    if bool(call.in_graph) == bool(call.in_words):
+        raise ValueError("its call shows what was heard in the graph or in words, one of both")
+    if call.in_words and WORDS not in holds:
+        raise ValueError("its call shows words, and it holds none")
+
+
+CONTENTS = Contents(
+    "swarmdrive.contents",
+    Content,
+    {
+        INTENT: OfIntent(),
+        TEXT: OfText(),
+        PLAN: OfPlan(),
+        OBJECTS: OfObjects(),
+        "both": OfBoth(),
+        "oracle": OfTruth(),
+    },
+)
+
+
+def of_any_model() -> list[str]:
+    """Return the contents that helpers can send, and egos read, whatever answers for them."""
+    names = []
+    for name, content in CONTENTS.usable().items():
+        in_words = content.call is not None and content.call.in_words
+        if not (content.of_agents or in_words):
+            names.append(name)
+    return names
 
 
 @cache
 def calls() -> Mapping[str, Call]:
     """Return the further questions to the ego that contents ask, by name."""
-    return {content.call.name: content.call for content in CONTENTS.values() if content.call}
+    contents = CONTENTS.usable().values()
+    return {content.call.name: content.call for content in contents if content.call}

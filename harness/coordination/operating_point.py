@@ -194,7 +194,7 @@ class OperatingPoint:
         if consensus == Fusion().consensus:
             able = [name for name in names() if _may_read(name, self.content)]
             raise wrong("consensus", consensus, f"{_any_of(able)} where content is {content}")
-        able = [name for name, other in CONTENTS.items() if _may_read(consensus, other)]
+        able = [name for name, other in CONTENTS.usable().items() if _may_read(consensus, other)]
         read = [kind for kind in KINDS if kind in reads(consensus)]
         where = f"where consensus is {consensus}, which reads {_any_of(read)}"
         raise wrong("content", content, f"{_any_of(able)} {where}")

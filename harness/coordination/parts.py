@@ -18,7 +18,8 @@ from harness.coordination.rules import EGO_PROMPT, RULES, names
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.config import LONGEST_S, Seconds, description
-from harness.core.errors import printable, unknown
+from harness.core.errors import UserError, printable, unknown
+from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.strangers import is_ours, worded
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -282,6 +283,8 @@ class Ask(Part, frozen=True, kw_only=True):
 
     def check(self) -> None:
         if self.content not in CONTENTS:
+            if owner := owner_of_plugin("contents", self.content):
+                raise UserError(f"content {printable(self.content)} is {part_of(owner)}")
             raise unknown("content", self.content, CONTENTS)
         if self.schedule == ORACLE:
             raise ValueError(

@@ -28,6 +28,8 @@ COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdr
 SETTINGS = "swarmdrive.settings"
 # And by control, with the setting of a condition that it is in brackets.
 CONTROLS = "swarmdrive.controls"
+# By kind and name, such as `contents text`, the packages of those that conditions name.
+PLUG_INS = "swarmdrive.plugins"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
@@ -117,6 +119,14 @@ def setting_of_extension(name: str) -> OfExtension | None:
         return None
     package, _, idle = str(entry.value).partition(" ")
     return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
+
+
+def owner_of_plugin(kind: str, name: str) -> str | None:
+    """Return the extension that has a plug-in of a kind, such as `contents`, by the metadata;
+    else None.
+    """
+    entry = entries(PLUG_INS).get(f"{kind} {name}")
+    return _extension_of(entry) if entry else None
 
 
 def control_settings() -> dict[str, str]:

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.contents import PLAN, Call, calls
+from harness.coordination.contents import PLAN, WHOLE, Call, calls
+from harness.coordination.contents_of_packages import words
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import Rewrites, change_of
@@ -23,7 +24,6 @@ from harness.evaluate.repair import as_text
 from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
 FROM = "from:"  # in a key, before the id of the other scene that a message comes from
-WHOLE = "words"  # in a key, after the name of a call: the prompt shows the whole messages, too
 
 
 @dataclass(frozen=True)
@@ -187,6 +187,6 @@ def messages_of(
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
             if call:
-                message = dict(call.message(message))
+                message = {"evidence": as_text(words(call, message["evidence"]))}
             messages.append({"sender": key.partition(ASKED)[0], **message})
     return messages

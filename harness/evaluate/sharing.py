@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec import structs
 
+from harness.coordination.contents_of_packages import graphs as graphs_heard
 from harness.coordination.operating_point import change_of, questions
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
@@ -49,7 +50,7 @@ def _shared_graphs(
         if source.id != scene.id:
             graphs = [_without_ego(graph) for graph in graphs]
         cases.append(Heard(scene.state, scene.graphs[scene.viewers[0]], graphs, source.state))
-    return call.graphs(scenario, cases)
+    return graphs_heard(call, scenario, cases)
 
 
 def _without_ego(graph: SceneGraph) -> SceneGraph:

@@ -13,6 +13,7 @@ from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
+from harness.coordination import contents_of_packages
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.parts import worded_part
@@ -308,7 +309,7 @@ class Spec:
         if reads and not self.ego.can.language_model:
             name = printable(self.ego.card.name)
             return f"{name} is no language model and cannot fuse messages"
-        if obstacle := point.content.obstacle(point, self):
+        if obstacle := contents_of_packages.obstacle(point, self):
             return obstacle
         for part in point.more:
             with worded_part(part):

@@ -13,6 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from harness.coordination.claims import Claims
+from harness.coordination.contents_of_packages import able, bits
 from harness.coordination.coordinate import Coordination, FusionCall, FusionInputs, fuse
 from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
@@ -367,13 +368,13 @@ def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
     """Return the intents of the decisions that are due, of helpers that can send the content."""
     every = np.array_equal(due.at, np.arange(len(intents.own)))
     own = point.prepared(intents if every else intents.take(due.at))
-    return point.content.able(point, own, due.senders)
+    return able(point, own, due.senders)
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
     """Return what helpers send by the point's content and encoding."""
-    bits = point.content.bits(point.radio.encoding, intents, point.physical is not None)
-    return intents if bits is intents.payload_bits else replace(intents, payload_bits=bits)
+    sizes = bits(point, intents)
+    return intents if sizes is intents.payload_bits else replace(intents, payload_bits=sizes)
 
 
 def _sources(point: OperatingPoint, due: Due) -> Ints:

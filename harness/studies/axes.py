@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.coordination.contents import CONTENTS, OF_HELPERS, WORDS
+from harness.coordination.contents import of_any_model
 from harness.coordination.operating_point import (
     POINTS,
     SHORT,
@@ -43,6 +43,12 @@ class Axis:
     scale: float  # what a value is multiplied by to be that setting
     usual: str  # the grid if none is given; empty if one must be
     worded: bool = False  # its values are words, not numbers
+    named: Callable[[], Collection[str]] | None = None  # returns the grid if `usual` is empty
+
+    @property
+    def values(self) -> str:
+        """The grid if none is given; empty if one must be."""
+        return ",".join(self.named()) if self.named else self.usual
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
         """Return the operating point with this setting.
@@ -67,7 +73,6 @@ class Axis:
         return freed.changed(**{self.field: setting})
 
 
-OF_ANY_MODEL = [name for name in OF_HELPERS if CONTENTS[name].holds != {WORDS}]
 AXES = {
     axis.name: axis
     for axis in (
@@ -79,9 +84,7 @@ AXES = {
         ),
         Axis("window", "decision window, ms", *SHORT["window"], "150:400:25"),
         Axis("consensus", "consensus", "consensus", 1.0, ",".join(POOLS), worded=True),
-        Axis(
-            "content", "content of a message", "content", 1.0, ",".join(OF_ANY_MODEL), worded=True
-        ),
+        Axis("content", "content of a message", "content", 1.0, "", True, of_any_model),
     )
 }
 
@@ -109,9 +112,10 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     """
     if text is not None and not text.strip():
         raise UserError(f"--grid: no values for {axis.name}; give some, or leave it out")
-    if not text and not axis.usual:
+    text = text or axis.values
+    if not text:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
-    parts = [part.strip() for part in (text or axis.usual).split(",")]
+    parts = [part.strip() for part in text.split(",")]
     if axis.worded:
         known = {
             "consensus": names(),

@@ -19,7 +19,7 @@ import pytest
 from evaluating import live_spec_of, run, spec_of
 from tiers import some
 
-from harness.coordination.contents import OF_HELPERS, TEXT
+from harness.coordination.contents import CONTENTS, TEXT
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
@@ -30,7 +30,11 @@ from harness.runs.folder import Run
 from harness.world.drivers import DRIVERS
 
 ALONE, OVER_6G = POINTS["single-local"], POINTS["6g"]
-CONTENT = {name: named_point(f"6g:content={name}") for name in OF_HELPERS}
+CONTENT = {
+    name: named_point(f"6g:content={name}")
+    for name, content in CONTENTS.items()
+    if not content.of_agents
+}
 WITHOUT_TEXT = tuple(point for name, point in CONTENT.items() if name != TEXT)
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",

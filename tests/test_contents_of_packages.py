@@ -1,0 +1,222 @@
+"""What a package's content of messages may do: it plays its own condition alone,
+and fails in one line.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from evaluating import says, spec_of, walked
+from packaged import register
+
+from harness.backends.base import Completion, Request
+from harness.coordination import contents_of_packages as door
+from harness.coordination.contents import (
+    CONTENTS,
+    INTENTS,
+    OBJECTS,
+    PLANS,
+    WORDS,
+    Call,
+    Content,
+    OfIntent,
+    calls,
+)
+from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset, Scene
+
+# A list of what is within some metres, which costs a bit for each of them.
+GLANCE = """
+from harness.extend import Call, Content
+
+class Shows(Call):
+    name = "glance"
+    in_graph = True
+
+    def graphs(self, scenario, cases):
+        return [case.own.blinded() for case in cases]
+
+class Glance(Content):
+    holds = frozenset(("objects",))
+    needs = ("objects",)
+    call = Shows()
+
+    def able(self, point, intents, senders):
+        return intents.without_models()
+
+    def bits(self, encoding, intents, headers):
+        return 7.0 + 0 * intents.payload_bits
+
+GLANCE = Glance()
+TAKEN = Glance()
+"""
+ENTRIES = "[swarmdrive.contents]\nglance = glances:GLANCE\nglimpse = glances:TAKEN\n"
+
+
+class Asked:
+    """Remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.asked = list[Request]()
+
+    def complete(self, requests: Sequence[Request]) -> list[Completion]:
+        self.asked += requests
+        return [
+            Completion(r.id, says((0.2, 0.5, 0.3), r.role), None, None, "stop", None, 1)
+            for r in requests
+        ]
+
+    def identity(self) -> dict[str, Any]:
+        return {"engine": "scripted"}
+
+
+@pytest.fixture
+def glances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    register(tmp_path, ENTRIES, glances=GLANCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    calls.cache_clear()
+    yield
+    calls.cache_clear()
+    CONTENTS._loaded.pop("glance", None)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("glances")
+def test_a_packages_content_is_played(small: Dataset) -> None:
+    one = small.of_episodes({0})
+    backend = Asked()
+    point = named_point("6g:schedule=always,loss=0,content=glance")
+    rows = walked(spec_of(one, points=(point,), seeds=(0,), ask="used"), backend)
+    heard = [request for request in backend.asked if "+" in request.id]
+    assert heard
+    assert all(request.view and not request.view.nodes for request in heard)
+    assert all("!glance" in request.id for request in heard)
+    messages, bits = (rows.decisions[name] for name in ("messages", "reply_bits"))
+    assert np.array_equal(bits, 7.0 * messages)
+    assert messages.sum() > 0
+    with pytest.raises(UserError, match="its call is named 'glance'"):
+        named_point("6g:content=glimpse")
+
+
+def made(**parts: Any) -> Content:
+    content: Content = type("Mine", (Content,), {"holds": frozenset((INTENTS,)), **parts})()
+    return content
+
+
+def shown(**parts: Any) -> Call:
+    call: Call = type("Mine", (Call,), {"name": "mine", **parts})()
+    return call
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (made(holds=["intents"]), "holds is no frozenset of intents, words"),
+        (made(holds=frozenset()), "holds is no frozenset"),
+        (made(holds=frozenset(("smells",))), "holds is no frozenset"),
+        (made(needs=("claims",)), "needs is no tuple of objects, plans"),
+        (made(needs="plans"), "needs is no tuple of objects, plans"),
+        (made(asks_helpers=False), "asks_helpers follows from what it holds"),
+        (made(holds=frozenset((PLANS, WORDS))), "a plan holds nothing else"),
+        (made(holds=frozenset((OBJECTS,))), "nothing that a rule fuses, and has no call"),
+        (made(call="twice"), "its call is no Call"),
+        (made(call=shown()), "in the graph or in words, one of both"),
+        (made(call=shown(in_words=True)), "shows words, and it holds none"),
+        (made(call=shown(name="text", in_graph=True)), "its call is named 'text'"),
+    ],
+)
+def test_what_a_content_says_of_itself_is_checked(
+    content: Content, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = SimpleNamespace(value="packages:MINE", load=lambda: content)
+    monkeypatch.setattr(CONTENTS, "_entries", lambda: {"mine": entry})
+    with pytest.raises(UserError) as error:
+        CONTENTS["mine"]
+    assert str(error.value).startswith("plug-in 'mine' (swarmdrive.contents) fails (")
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def of(content: Content) -> OperatingPoint:
+    radio = SimpleNamespace(encoding="json")
+    return cast(OperatingPoint, SimpleNamespace(content=content, radio=radio, physical=None))
+
+
+EVERY = np.ones((1, 3))
+SAID = Intents(
+    np.array([[0.3, 0.4, 0.3]]), np.array([[[1.0, 0.0, 0.0]] * 3]), EVERY > 0,
+    np.full((1, 4), 10.0), 20 * EVERY, 400 * EVERY, np.full((1, 4), 0.1), text_bytes=40 * EVERY,
+)  # fmt: skip
+
+
+def written(given: Any) -> Any:
+    given[:] = 0
+    return given
+
+
+@pytest.mark.parametrize(
+    ("act", "told"),
+    [
+        (lambda i: replace(i, valid=written(i.valid)), "read-only"),
+        (lambda i: replace(i, own=1 - i.own), "it changes own"),
+        (lambda i: replace(i, helpers=0 * i.helpers), "it changes helpers"),
+        (lambda i: replace(i, range_m=0 * i.range_m), "it changes range_m"),
+        (lambda i: replace(i, valid=~i.valid), "who has nothing to send"),
+        (lambda i: replace(i, valid=1.0 * i.valid), "who has nothing to send"),
+        (lambda i: replace(i, valid=i.valid[:, :1]), "valid of shape (1, 1)"),
+        (lambda i: replace(i, inference_s=0 * i.inference_s), "it changes the ego's time"),
+        (lambda i: replace(i, inference_s=i.inference_s * [1, -1, -1, -1]), "a time below 0"),
+        (lambda i: None, "no attribute 'arrays'"),
+    ],
+)
+def test_a_content_says_who_is_able_and_nothing_else(act: Callable[..., Any], told: str) -> None:
+    content = made(able=lambda self, point, intents, senders: act(intents))
+    some = replace(SAID, valid=np.array([[True, False, True]]))
+    with pytest.raises(UserError) as error:
+        door.able(of(content), some, None)
+    assert str(error.value).startswith("content Mine fails (")
+    assert told in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "told"),
+    [
+        (np.full((1, 2), 8.0), "sizes of shape (1, 2)"),
+        (np.full((1, 3), -8.0), "sizes that are no finite numbers of bits"),
+        (np.full((1, 3), np.nan), "sizes that are no finite numbers of bits"),
+        (8.0, "sizes of type float"),
+    ],
+)
+def test_sizes_are_numbers_of_bits(sizes: Any, told: str) -> None:
+    with pytest.raises(UserError) as error:
+        door.bits(of(made(bits=lambda self, *given: sizes)), SAID)
+    assert told in str(error.value)
+
+
+def test_what_a_call_shows_is_a_graph_of_the_egos_or_a_line(small: Dataset) -> None:
+    scene: Scene = small.scenes(small.courses())[0]
+    ego, helper = scene.viewers[:2]
+    case = SimpleNamespace(own=scene.graphs[ego])
+    for given, told in (
+        ([], "0 graphs of 1 cases"),
+        (["a graph"], "no graph of the ego's"),
+        ([scene.graphs[helper]], "no graph of the ego's"),
+    ):
+        call = shown(graphs=lambda self, scenario, cases, given=given: given)
+        with pytest.raises(UserError, match=told):
+            door.graphs(call, small.scenario, [cast(Any, case)])
+    assert door.words(shown(words=lambda self, text: f"{text}\n!"), "Go") == "Go !"
+    with pytest.raises(UserError, match="words of type int"):
+        door.words(shown(words=lambda self, text: 1), "Go")
+
+
+def test_the_papers_own_goes_through_no_door() -> None:
+    point = of(OfIntent())
+    assert door.able(point, SAID, None) is SAID
+    assert door.bits(point, SAID) is SAID.payload_bits
