@@ -27,11 +27,8 @@ from harness.core.figures import shown
 from harness.core.progress import Progress
 from harness.dataset import suites
 from harness.dataset.load import find, load
-from harness.report.document import Table
-from harness.runs.folder import read
-from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode
-from harness.runs.success import Success, alike
-from harness.studies.contents import (
+from harness.extensions.contents.page import contents_study
+from harness.extensions.contents.study import (
     BASE,
     NOTHING,
     PLAYED,
@@ -41,7 +38,10 @@ from harness.studies.contents import (
     panels_of,
     run_contents,
 )
-from harness.studies.contents_page import contents_study
+from harness.report.document import Table
+from harness.runs.folder import read
+from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode
+from harness.runs.success import Success, alike
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
 from harness.world import scenarios

@@ -25,7 +25,7 @@ from shares import SHARES, share_of
 
 from harness import cli
 from harness.cli import shell
-from harness.coordination import operating_point
+from harness.coordination import operating_point, parts
 from harness.core import extensions
 from harness.dataset import rebuilt
 from harness.dataset.build import build
@@ -233,7 +233,8 @@ def part_noted(extension: str) -> str:
 
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
-    operating_point.__dict__["part_of"] = axes.__dict__["part_of"] = part_noted
+    for module in (axes, operating_point, parts):
+        module.__dict__["part_of"] = part_noted
 
 
 def pytest_terminal_summary(

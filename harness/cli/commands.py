@@ -18,7 +18,6 @@ COMMANDS = {
     "plan": "plan",
     "report": "report",
     "study sweep": "sweep",
-    "study contents": "contents",
     "study schedule compare": "schedule:compare",
     "study schedule learn": "schedule:learn",
     "run ls": "runs:ls",
@@ -52,7 +51,7 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "study": "Vary settings: sweeps, contents, schedules.",
+    "study": "Vary settings: sweeps, schedules.",
     "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
     "run": "List finished runs; check, merge or export them.",
     "model": "List and download models; list on-board computers.",

@@ -14,9 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from msgspec import structs
-
-from harness.coordination.encodings import intent_bits, object_bits, words_bits
+from harness.coordination.encodings import intent_bits
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
 
 INTENT: Final = "intent"
-TEXT: Final = "text"
 PLAN: Final = "plan"
 # The kinds of what a message may hold.
 INTENTS: Final = "intents"  # what helpers intend in the ego's place, by their models
@@ -68,9 +65,9 @@ class Call:
 class Content:
     """What a message holds; plainly, a helper's intent, with its words beside it."""
 
-    holds: ClassVar[frozenset[str]]  # some of the kinds above
-    needs: ClassVar[tuple[str, ...]] = ()  # what it needs of the world, some of `NEEDS`
-    call: ClassVar[Call | None] = None  # what the ego is asked once more; None if it is not
+    holds: frozenset[str]  # some of the kinds above
+    needs: tuple[str, ...] = ()  # what it needs of the world, some of `NEEDS`
+    call: Call | None = None  # what the ego is asked once more; None if it is not
 
     @property
     def of_agents(self) -> bool:
@@ -102,113 +99,6 @@ class OfIntent(Content):
     """The paper's."""
 
     holds = frozenset((INTENTS, WORDS))
-
-
-class SaysWords(Call):
-    """Shows each helper's words in one line, and nothing else."""
-
-    name = TEXT
-    in_words = True
-
-
-class OfText(Content):
-    """The helper's words alone: the ego acts on its answer to them."""
-
-    holds = frozenset((WORDS,))
-    call = SaysWords()
-
-    def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        prompt = run.agents[0].prompt
-        if point.has_fusion_call and not prompt.shows_words:
-            return (
-                f"prompt {prompt.version} cannot show words without an intent; use --prompt v11 "
-                "or v12"
-            )
-        return None
-
-    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        return intents.with_words()
-
-    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
-        return words_bits(encoding, intents, headers)
-
-
-class ListsObjects(Call):
-    """Adds to the ego's graph what helpers list, and themselves."""
-
-    name = OBJECTS
-    in_graph = True
-
-    def graphs(
-        self, scenario: "Scenario", cases: Sequence["Heard"]
-    ) -> Sequence["SceneGraph | None"]:
-        from harness.world.perception.shared import merged
-
-        return merged(scenario, cases)
-
-
-class OfObjects(Content):
-    """A list of objects, as a CPM or an SDSM: the ego acts on its answer to the larger graph."""
-
-    holds = frozenset((OBJECTS,))
-    needs = (OBJECTS,)
-    call = ListsObjects()
-
-    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        return intents.without_models() if point.asks else intents
-
-    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
-        return object_bits(encoding, intents, headers)
-
-
-class OfBoth(Content):
-    """Two messages, of which one holds an intent and one objects:
-    the ego's answer to the larger graph is fused with the intents.
-    """
-
-    holds = frozenset((INTENTS, WORDS, OBJECTS))
-    needs = (OBJECTS,)
-    call = ListsObjects()
-
-    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
-        of_intents = intent_bits(encoding, intents, headers)
-        return of_intents + object_bits(encoding, intents, headers)
-
-
-class ShowsTruth(Call):
-    """Takes the true graph, of which every region is in sight, for the ego's."""
-
-    name = TRUTH
-    in_graph = True
-
-    def graphs(
-        self, scenario: "Scenario", cases: Sequence["Heard"]
-    ) -> Sequence["SceneGraph | None"]:
-        from harness.world.perception.graph import truth_graphs
-
-        truths = truth_graphs(scenario, [case.state for case in cases])
-        graphs = []
-        for truth, case in zip(truths, cases, strict=True):
-            graphs.append(structs.replace(truth, sectors=case.own.all_in_sight))
-        return graphs
-
-
-class OfTruth(Content):
-    """Perfect sharing: an ego that hears anybody sees everything, without noise.
-
-    It is no bound, since a model may misread the truth, and plans on its own view again where it
-    does not ask.
-    """
-
-    holds = frozenset((TRUTH,))
-    needs = (OBJECTS,)
-    call = ShowsTruth()
-
-    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        return intents.without_models() if point.asks else intents
-
-    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
-        return object_bits(encoding, intents, headers)
 
 
 class OfPlan(Content):
@@ -276,11 +166,7 @@ CONTENTS = Contents(
     Content,
     {
         INTENT: OfIntent(),
-        TEXT: OfText(),
         PLAN: OfPlan(),
-        OBJECTS: OfObjects(),
-        "both": OfBoth(),
-        "oracle": OfTruth(),
     },
 )
 

@@ -9,7 +9,6 @@ SUITE = "suite.json"  # marks a folder that holds a suite's runs
 # it here.
 STUDIES = {
     "sweep": "sweep",
-    "contents": "contents",
     "repeats": "repeats",
     "schedule": "schedule",
 }

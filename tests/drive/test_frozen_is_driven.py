@@ -19,7 +19,7 @@ import pytest
 from evaluating import live_spec_of, run, spec_of
 from tiers import some
 
-from harness.coordination.contents import CONTENTS, TEXT
+from harness.coordination.contents import CONTENTS, of_any_model
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
@@ -35,7 +35,8 @@ CONTENT = {
     for name, content in CONTENTS.items()
     if not content.of_agents
 }
-WITHOUT_TEXT = tuple(point for name, point in CONTENT.items() if name != TEXT)
+WITHOUT_WORDS = tuple(CONTENT[name] for name in of_any_model())
+SPOKEN = [point for point in CONTENT.values() if point not in WITHOUT_WORDS]
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",
     "least_gap_m", "hard_brakings", "other_crashes", "decisions", "messages", "trigger_rate", "latency_ms",
@@ -90,10 +91,10 @@ def off_lag(of: Run) -> set[Place]:
             for case in few_or_many(driver, (ALONE,), (0,), 1.0, layouts=(3, 40))
         ),
         *few_or_many("proxy", (ALONE, OVER_6G), (0, 1), 0.8, layouts=(2, 20)),
-        *few_or_many("proxy", WITHOUT_TEXT, (0,), 0.8, layouts=(2, 20)),
+        *few_or_many("proxy", WITHOUT_WORDS, (0,), 0.8, layouts=(2, 20)),
         many("proxy", (named_point("its-g5"),), (0, 1), 0.5, 20),
         many("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4, 20),
-        many("swarm-tiny-six", (CONTENT[TEXT],), (0,), 0.8, 3),
+        *(many("swarm-tiny-six", (point,), (0,), 0.8, 3) for point in SPOKEN),
     ],
 )
 def test_what_the_tree_says_is_what_driving_gives(
@@ -105,7 +106,7 @@ def test_what_the_tree_says_is_what_driving_gives(
     layouts: int,
 ) -> None:
     """Both by default. `least` is the share of episodes that is not left out, at least."""
-    spoken = points == (CONTENT[TEXT],)
+    spoken = set(points) <= set(SPOKEN)
     frozen = load(find(DATASET), layouts)
     how: dict[str, Any] = {"points": points, "seeds": seeds}
     if set(points) & {*CONTENT.values()}:  # the ego's second answer would come after the lag

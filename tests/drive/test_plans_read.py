@@ -136,7 +136,7 @@ def test_batches_and_a_stop_change_nothing(tmp_path: Path) -> None:
         ),
         (
             "6g:consensus=ego-prompt,content=objects",
-            "intent, text, plan or both where consensus is ego-prompt",
+            "intent, plan, text or both where consensus is ego-prompt",
         ),
     ],
 )

@@ -341,6 +341,7 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
         (known.COMMANDS, [*extension.commands, *extension.spellings, *extension.short]),
         (known.STUDIES, extension.studies),
         (known.NAMES, extension.adds.get("python", {})),
+        (known.PLUG_INS, [f"contents {name}" for name in extension.adds.get("contents", {})]),
     ):
         named = {
             key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"
@@ -457,17 +458,16 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
         "harness.core.errors import UserError\nprint(OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
-        "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1')):\n    try:\n        "
+        "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
+        "named_point('6g:content=objects')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(core)}, check=True,
-    )  # fmt: skip
+    done = in_the_core(core, tmp_path, code)
     of_one = "is part of the extension calibration, which is not installed"
     assert done.stdout.splitlines() == [
         "True",
         *[f"setting calibration=l1 of a condition {of_one}"] * 2,
+        "content objects is part of the extension contents, which is not installed",
     ]
 
 

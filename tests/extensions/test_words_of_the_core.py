@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD
+from harness.coordination.contents import CONTENTS
 from harness.coordination.operating_point import more_parts
 from harness.core.extensions import Extension, control_settings, extensions
 from harness.extensions.trust.part import DEFENCES
@@ -20,8 +21,10 @@ BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and en
 ORDINARY = {
     "attribute": "of a Python object",
     "benchmark": "what a published dataset is tagged as",
+    "both": "two things",
     "calibration": "how far probabilities are what they say, a metric",
     "closed-loop": "the world that is driven, beside the frozen one",
+    "contents": "what messages hold, and suites and pages",
     "controls": "conditions beside which a gain is compared",
     "decide": "what vehicles do",
     "environment": "one of highway-env, and a variable of the shell",
@@ -32,7 +35,9 @@ ORDINARY = {
     "inspect": "Python's module",
     "media": "a rule of style sheets",
     "notes": "what is kept beside a scene, and Python's of an exception",
+    "objects": "what sensors report, a kind of what messages hold, and JSON's",
     "optimize": "SciPy's module",
+    "oracle": "a bound on schedules",
     "pack": "what is sent to another process",
     "paper": "the one whose method this is",
     "proxy": "the rule that stands for a model",
@@ -40,6 +45,7 @@ ORDINARY = {
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
     "tells": "a verb",
+    "text": "what is read and written",
     "trust": "how far a rule, or a loader of weights, trusts what it is given",
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",
@@ -142,6 +148,13 @@ LOOP = (
 )
 OTHER_THINGS = {
     ("coordination/coordinate.py", "messages"): "what a rule fuses",
+    ("coordination/operating_point.py", "objects"): "whether a call shows what is in the graph",
+    ("coordination/operating_point.py", "text"): "of a condition, and of a message's key",
+    ("evaluate/asking.py", "text"): "what a model says",
+    ("evaluate/spec.py", "objects"): "what a prompt shows",
+    ("evaluate/spec.py", "text"): "of a prompt",
+    ("evaluate/walk.py", "objects"): "of the world, which lists them",
+    ("evaluate/walk.py", "text"): "of a reply, in bytes",
     ("coordination/exchange.py", "messages"): "how many were sent",
     ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
     ("evaluate/asking.py", "messages"): "what a model is sent",
@@ -164,12 +177,13 @@ def said_in(tree: ast.AST) -> Iterator[str]:
 
 
 def test_what_plays_a_decision_names_no_part_of_an_extension() -> None:
-    """Neither settings of conditions, nor questions to helpers, nor controls."""
+    """Neither settings of conditions, nor questions to helpers, nor controls, nor contents."""
     kinds = more_parts().values()
     settings = {setting for kind in kinds for setting in kind.__struct_fields__}
     questions = {question.name for kind in kinds for question in kind.questions}
     controls = {setting.partition("=")[2] for setting in control_settings().values()}
-    theirs = settings | questions | controls | set(DEFENCES)
+    contents = set(CONTENTS) - CONTENTS.built_in.keys()
+    theirs = settings | questions | controls | set(DEFENCES) | contents
     named = {
         (path, word)
         for path in LOOP

@@ -37,7 +37,7 @@ def test_vehicles_are_whole() -> None:
 def test_every_axis_has_a_usual_grid_that_its_point_allows() -> None:
     for axis in AXES.values():
         values = usual_at(axis, POINTS["6g"])
-        assert len(values) > 1
+        assert len(values) > (axis.name != "content")  # the core has one that helpers send
         for value in values:
             axis.at(POINTS["6g"], value)
 
@@ -54,7 +54,7 @@ OF_SCENES = (
         ("6g:content=both", "attack", ("none", *OF_SCENES, "ghost", "hide", "shift")),
         ("6g:content=oracle", "attack", ("none",)),
         ("6g:consensus=ego-prompt", "attack", ("none", *OF_SCENES)),
-        ("6g:consensus=ego-prompt", "content", ("intent", "both")),
+        ("6g:content=both,consensus=ego-prompt", "content", ("intent", "both")),
         ("mode4", "latency", (0, 5, 10, 25, 50, 100)),
     ],
 )

@@ -59,8 +59,14 @@ def command(
     Each is played at every point from stored answers. The model is asked only where the runs have
     no answer. If the study is stopped, the same command continues it.
     """
-    from harness.studies.contents import asked_at_most, folders, models, panels_of, run_contents
-    from harness.studies.contents_page import contents_study
+    from harness.extensions.contents.page import contents_study
+    from harness.extensions.contents.study import (
+        asked_at_most,
+        folders,
+        models,
+        panels_of,
+        run_contents,
+    )
     from harness.studies.replayed_run import ReplayedRun
 
     with bar("points", quiet=as_json or quiet or dry_run, grows=True) as progress:

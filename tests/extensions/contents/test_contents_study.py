@@ -13,11 +13,11 @@ from evaluating import run, spec_of
 from harness.coordination.operating_point import named_point
 from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.load import Dataset
+from harness.extensions.contents.study import NOTHING, Outcome, holding, witnesses
 from harness.report.suite import MEAN
 from harness.runs.folder import read
 from harness.runs.metrics import BALANCED, SUCCESS, over_episodes
 from harness.runs.success import Success
-from harness.studies.contents import NOTHING, Outcome, holding, witnesses
 from harness.studies.replayed_run import ReplayedRun
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
@@ -34,8 +34,8 @@ def done(proxy_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def played(done: Path, tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     from harness.core.progress import Progress
-    from harness.studies.contents import models, panels_of, run_contents
-    from harness.studies.contents_page import contents_study
+    from harness.extensions.contents.page import contents_study
+    from harness.extensions.contents.study import models, panels_of, run_contents
 
     source = ReplayedRun(done)
     panels = panels_of([source], ["6g"], ["loss", "size"], ["0,1", "1,4"])

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import structs
 
-from harness.coordination.contents import CONTENTS, INTENT, TEXT, TRUTH
+from harness.coordination.contents import CONTENTS, INTENT, TRUTH
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.scheduling import NEVER
 from harness.core.arrays import Bools, Floats, Ints
@@ -39,7 +39,7 @@ from harness.world.lookouts import radios
 from harness.world.parameters import Parameters, frames
 
 NOTHING = "nothing"
-PLAYED = (NOTHING, INTENT, TEXT, "objects", "both", "oracle")
+PLAYED = (NOTHING, INTENT, "text", "objects", "both", "oracle")
 BITS, LATE, OFF_LAG = "bits_per_episode", "deadline_miss_rate", "off_lag_rate"
 METRICS = (BITS, LATENCY, LATE, OFF_LAG, "messages_per_episode", "trigger_rate")
 BASE, RADIO = "6g:encoding=etsi", "mode2:encoding=etsi"

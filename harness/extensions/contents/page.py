@@ -14,12 +14,7 @@ from harness.core.figures import shown
 from harness.core.multiplicity import LEVEL
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
-from harness.report.document import Table, strong
-from harness.report.drawing.colours import COLOURS, MARKERS
-from harness.runs.leading import SUCCESS
-from harness.runs.metrics import LATENCY, difference, entry, over_episodes
-from harness.studies.axes import Setting
-from harness.studies.contents import (
+from harness.extensions.contents.study import (
     BITS,
     LATE,
     METRICS,
@@ -33,6 +28,11 @@ from harness.studies.contents import (
     manifest_of,
     place,
 )
+from harness.report.document import Table, strong
+from harness.report.drawing.colours import COLOURS, MARKERS
+from harness.runs.leading import SUCCESS
+from harness.runs.metrics import LATENCY, difference, entry, over_episodes
+from harness.studies.axes import Setting
 from harness.studies.paper_numbers import paper_numbers
 from harness.studies.study import Study, p_cell, percent
 

@@ -598,7 +598,7 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(
         ("6g:content=word", "unknown content 'word'"),
         (
             "6g:content=objects,consensus=ego-prompt",
-            "it must be intent, text, plan or both where",
+            "it must be intent, plan, text or both where",
         ),
         ("6g:content=objects,attack=liar", "it must be absent, ghost, hide, shift or left out"),
         ("6g:attack=ghost", "where content is intent, which holds no objects"),

@@ -1,0 +1,92 @@
+"""Contents of messages that make the ego's graph larger: lists of objects, alone or beside an
+intent, and the truth, which no message can hold.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from msgspec import structs
+
+from harness.coordination import contents as kinds
+from harness.coordination.contents import INTENTS, TRUTH, WORDS, Call, Content
+from harness.coordination.encodings import intent_bits, object_bits
+from harness.coordination.intents import Intents
+from harness.core.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.world.perception.shared import Heard
+    from harness.world.scenario import Scenario
+    from harness.world.scene_graph import SceneGraph
+
+
+class ListsObjects(Call):
+    """Adds to the ego's graph what helpers list, and themselves."""
+
+    name = "objects"
+    in_graph = True
+
+    def graphs(
+        self, scenario: "Scenario", cases: Sequence["Heard"]
+    ) -> Sequence["SceneGraph | None"]:
+        from harness.world.perception.shared import merged
+
+        return merged(scenario, cases)
+
+
+class ShowsTruth(Call):
+    """Takes the true graph, of which every region is in sight, for the ego's."""
+
+    name = "truth"
+    in_graph = True
+
+    def graphs(
+        self, scenario: "Scenario", cases: Sequence["Heard"]
+    ) -> Sequence["SceneGraph | None"]:
+        from harness.world.perception.graph import truth_graphs
+
+        truths = truth_graphs(scenario, [case.state for case in cases])
+        graphs = []
+        for truth, case in zip(truths, cases, strict=True):
+            graphs.append(structs.replace(truth, sectors=case.own.all_in_sight))
+        return graphs
+
+
+class OfLists(Content):
+    """Lists that need no model, and leave as soon as the request is there.
+
+    The ego acts on its answer to the larger graph.
+    """
+
+    needs = (kinds.OBJECTS,)
+
+    def __init__(self, kind: str, call: Call) -> None:
+        self.holds = frozenset((kind,))
+        self.call = call
+
+    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
+        return intents.without_models() if point.asks else intents
+
+    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
+        return object_bits(encoding, intents, headers)
+
+
+class OfBoth(Content):
+    """Two messages, of which one holds an intent and one objects:
+    the ego's answer to the larger graph is fused with the intents.
+    """
+
+    holds = frozenset((INTENTS, WORDS, kinds.OBJECTS))
+    needs = (kinds.OBJECTS,)
+    call = ListsObjects()
+
+    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
+        of_intents = intent_bits(encoding, intents, headers)
+        return of_intents + object_bits(encoding, intents, headers)
+
+
+OBJECTS = OfLists(kinds.OBJECTS, ListsObjects())  # as a CPM or an SDSM
+BOTH = OfBoth()
+# Perfect sharing: an ego that hears anybody sees everything, without noise. It is no bound, since
+# a model may misread the truth, and plans on its own view again where it does not ask.
+ORACLE = OfLists(TRUTH, ShowsTruth())

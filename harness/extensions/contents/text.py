@@ -1,0 +1,44 @@
+"""A content of messages: the helper's words alone. The ego acts on its answer to them."""
+
+from typing import TYPE_CHECKING
+
+from harness.coordination.contents import WORDS, Call, Content
+from harness.coordination.encodings import words_bits
+from harness.coordination.intents import Intents
+from harness.core.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.coordination.parts import RunFacts
+
+
+class SaysWords(Call):
+    """Shows each helper's words in one line, and nothing else."""
+
+    name = "text"
+    in_words = True
+
+
+class OfText(Content):
+    """Words without an intent."""
+
+    holds = frozenset((WORDS,))
+    call = SaysWords()
+
+    def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
+        prompt = run.agents[0].prompt
+        if point.has_fusion_call and not prompt.shows_words:
+            return (
+                f"prompt {prompt.version} cannot show words without an intent; use --prompt v11 "
+                "or v12"
+            )
+        return None
+
+    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
+        return intents.with_words()
+
+    def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
+        return words_bits(encoding, intents, headers)
+
+
+TEXT = OfText()
