@@ -108,7 +108,24 @@ class OfPlan(Content):
     needs = (PLANS,)
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        return None if run.several_decide else NO_AGENTS
+        if not run.several_decide:
+            return NO_AGENTS
+        return self._unread(run) if point.has_fusion_call else None
+
+    def _unread(self, run: "RunFacts") -> str | None:
+        """Return why an agent cannot be asked again with the plans of others; None if all can."""
+        for agent in run.agents:
+            if not agent.can.language_model:
+                name = printable(agent.card.name)
+                return (
+                    f"{name} is no language model and cannot read plans; use "
+                    "consensus=yield-by-time"
+                )
+            if not agent.prompt.shows_plans:
+                return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
+        if run.device_profile:
+            return "no energy is known of answers to plans; leave --device-profile out"
+        return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
         if intents.plans is None or senders is None:

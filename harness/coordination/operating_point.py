@@ -201,7 +201,7 @@ class OperatingPoint:
 
     def _check_holds(self, act: ActsOn) -> None:
         """Raise ValueError for a setting that needs messages of other kinds."""
-        if self.content.holds.isdisjoint(act.kinds):
+        if act.kinds and self.content.holds.isdisjoint(act.kinds):
             allowed = _any_of((*act.others(self.content.holds), act.instead))
             holds = f"content is {self.ask.content}, which holds no {_any_of(act.kinds)}"
             raise wrong(act.setting, act.value, f"{allowed} where {holds}")

@@ -104,7 +104,9 @@ class RunFacts(Protocol):
 
     @property
     def agents(self) -> Sequence[Any]:
-        """The agents, the ego's first; each has `settings()`."""
+        """The agents, the ego's first; each has `settings()`, a `card`, a `prompt`,
+        and what it `can`.
+        """
 
     @property
     def scenario(self) -> Any:

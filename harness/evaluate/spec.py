@@ -298,11 +298,8 @@ class Spec:
         call = point.content.call
         if point.has_fusion_call and call and call.in_graph and ego.can.language_model:
             self._check_shows_objects(shown)
-        if not reads:
-            return
-        reason = self._plan_obstacle if point.content.of_agents else self.fusion_obstacle
-        if reason:
-            raise UserError(f"{shown}: {reason}")
+        if reads and point.content.asks_helpers and self.fusion_obstacle:
+            raise UserError(f"{shown}: {self.fusion_obstacle}")
 
     def _obstacle(self, point: OperatingPoint, reads: bool) -> str | None:
         """Return why a condition, whose ego `reads` messages, cannot be played; None if it can."""
@@ -347,22 +344,6 @@ class Spec:
                     f"prompt {version} fuses messages with a {form}, those of {prompt.version} "
                     f"have a {prompt.helper_answer}; use another --helper-prompt"
                 )
-        return None
-
-    @property
-    def _plan_obstacle(self) -> str | None:
-        """Why an agent cannot be asked again with the plans of others; None if all can."""
-        for agent in self.agents:
-            if not agent.can.language_model:
-                name = printable(agent.card.name)
-                return (
-                    f"{name} is no language model and cannot read plans; use "
-                    "consensus=yield-by-time"
-                )
-            if not agent.prompt.shows_plans:
-                return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
-        if self.device_profile:
-            return "no energy is known of answers to plans; leave --device-profile out"
         return None
 
     @property
