@@ -9,7 +9,7 @@ question.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -135,24 +135,25 @@ def _plan_of(key: str) -> dict[str, Any] | None:
         ) from None
 
 
-def call_of(key: str) -> Call | None:
-    """Return what the ego was asked with the message of a sender's key;
-    None if with all of it, and nothing else.
-    """
-    named = calls()
-    return next((named[mark] for mark in _marks(key) if mark in named), None)
+class Marks(NamedTuple):
+    """What the key of a message says of it, behind its sender's name."""
+
+    changes: list[str]  # how it was changed
+    call: Call | None  # what the ego was asked with it; None if with all of it and nothing else
+    whole: bool  # whether the prompt showed all of it
 
 
-def changes_of(key: str) -> list[str]:
-    """Return how the message of a sender's key was changed."""
-    of_calls = {WHOLE, *calls()}
-    return [mark for mark in _marks(key) if mark not in of_calls]
-
-
-def _marks(key: str) -> list[str]:
-    """Return what stands in a sender's key behind its name, but for where it comes from."""
-    marks = key.partition(REWRITTEN)[2].split("&")
-    return [mark for mark in marks if mark and not mark.startswith(FROM)]
+def marks_of(key: str) -> Marks:
+    """Return what the key of a message says of it, but for the scene that it comes from."""
+    changes, call, whole, named = [], None, False, calls()
+    for mark in filter(None, key.partition(REWRITTEN)[2].split("&")):
+        if mark == WHOLE:
+            whole = True
+        elif mark in named:
+            call = named[mark]
+        elif not mark.startswith(FROM):
+            changes.append(mark)
+    return Marks(changes, call, whole or call is None)
 
 
 def source_of(scene: str, senders: Sequence[str]) -> str:
@@ -177,16 +178,16 @@ def messages_of(
             messages.append(plan)
             continue
         key = sender.partition(REWRITTEN)[0]
-        call = None if WHOLE in _marks(sender) else call_of(sender)
-        if call and not call.in_words:
+        changes, call, whole = marks_of(sender)
+        if call and not (whole or call.in_words):
             continue  # it is in the graph
         if (answer := answers.get(key)) and answer.intent and answer.message:
             message = {"intent": list(answer.intent), **answer.message}
-            for change in changes_of(sender):
+            for change in changes:
                 message = change_of(change).message(message, actions)
             # No special token of a chat template gets through.
             message["evidence"] = as_text(message["evidence"] or "")
-            if call:
+            if call and not whole:
                 message = {"evidence": as_text(words(call, message["evidence"]))}
             messages.append({"sender": key.partition(ASKED)[0], **message})
     return messages

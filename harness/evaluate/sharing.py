@@ -11,7 +11,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene, by_seat
-from harness.evaluate.fusion import call_of, changes_of, source_of
+from harness.evaluate.fusion import marks_of, source_of
 from harness.runs.records import ASKED, REWRITTEN, Answer
 from harness.world.perception.shared import Heard
 from harness.world.scenario import Scenario
@@ -39,7 +39,7 @@ def _shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
     keys = [key for _, senders in sets for key in senders]
-    calls = (call_of(key) for key in keys)
+    calls = (marks_of(key).call for key in keys)
     call = next((call for call in calls if call and call.in_graph), None)
     if call is None:
         return [None] * len(sets)
@@ -64,7 +64,7 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
     sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
     graph = questions()[question].shown(scene.graphs[sender])
-    changes = [change_of(change) for change in changes_of(key)]
+    changes = [change_of(change) for change in marks_of(key).changes]
     for change in sorted(changes, key=lambda change: change.adds):
         graph = change.graph(graph, scenario, scene)
     return graph
