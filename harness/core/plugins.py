@@ -45,10 +45,10 @@ def _declared(group: str) -> list[Any]:
     """Return the entry points of a group.
     Of a package whose metadata cannot be read a line says so.
     """
-    from importlib.metadata import distributions, entry_points  # imported here because it is slow
+    from importlib.metadata import distributions  # imported here because it is slow
 
     try:
-        return list(entry_points(group=group))
+        return list(_all_entries(tuple(sys.path)).select(group=group))
     except Exception:  # whatever the metadata of a package hold
         declared: list[Any] = []
     for distribution in distributions():
@@ -58,6 +58,13 @@ def _declared(group: str) -> list[Any]:
             what = f"the entry points of package {printable(distribution.name)} cannot be read"
             print(f"harness: {what} ({one_line(error)}); it is left out", file=sys.stderr)
     return declared
+
+
+@cache  # for a look at all packages takes as long for one group as for all
+def _all_entries(path: tuple[str, ...]) -> Any:
+    from importlib.metadata import entry_points
+
+    return entry_points()
 
 
 def is_ours(entry: Any) -> bool:
