@@ -24,10 +24,9 @@ from harness.coordination.contents import (
     Call,
     Content,
     OfIntent,
-    calls,
 )
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.operating_point import OperatingPoint, calls, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene
 
@@ -42,6 +41,10 @@ class Shows(Call):
     def graphs(self, scenario, cases):
         return [case.own.blinded() for case in cases]
 
+class Taken(Call):
+    name = "schema"
+    in_graph = True
+
 class Glance(Content):
     holds = frozenset(("objects",))
     needs = ("objects",)
@@ -53,10 +56,14 @@ class Glance(Content):
     def bits(self, encoding, intents, headers):
         return 7.0 + 0 * intents.payload_bits
 
+class Schema(Glance):
+    call = Taken()
+
 GLANCE = Glance()
 TAKEN = Glance()
+SCHEMA = Schema()
 """
-ENTRIES = "[swarmdrive.contents]\nglance = glances:GLANCE\nglimpse = glances:TAKEN\n"
+ENTRIES = "[swarmdrive.contents]\nglance = glances:GLANCE\nglimpse = glances:TAKEN\nschema = glances:SCHEMA\n"
 
 
 class Asked:
@@ -83,7 +90,8 @@ def glances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     calls.cache_clear()
     yield
     calls.cache_clear()
-    CONTENTS._loaded.pop("glance", None)
+    for name in ("glance", "schema"):
+        CONTENTS._loaded.pop(name, None)
 
 
 @pytest.mark.slow
@@ -102,6 +110,15 @@ def test_a_packages_content_is_played(small: Dataset) -> None:
     assert messages.sum() > 0
     with pytest.raises(UserError, match="its call is named 'glance'"):
         named_point("6g:content=glimpse")
+
+
+@pytest.mark.usefixtures("glances")
+def test_a_call_by_whose_name_messages_are_changed_is_refused_and_moves_no_other() -> None:
+    pytest.importorskip("harness.extensions.trust")
+    assert {*calls()} >= {"glance"}
+    assert "schema" not in calls()
+    with pytest.raises(UserError, match="content is 'schema'; it must be another: messages are"):
+        named_point("6g:content=schema")
 
 
 def made(**parts: Any) -> Content:

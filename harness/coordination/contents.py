@@ -10,8 +10,7 @@ plan, which costs no further inference.
 """
 
 import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from harness.coordination.encodings import intent_bits
@@ -196,10 +195,3 @@ def of_any_model() -> list[str]:
         if not (content.of_agents or in_words):
             names.append(name)
     return names
-
-
-@cache
-def calls() -> Mapping[str, Call]:
-    """Return the further questions to the ego that contents ask, by name."""
-    contents = CONTENTS.usable().values()
-    return {content.call.name: content.call for content in contents if content.call}

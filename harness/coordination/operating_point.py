@@ -12,7 +12,7 @@ import msgspec
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
-from harness.coordination.contents import CONTENTS, INTENTS, KINDS, PLANS, Content
+from harness.coordination.contents import CONTENTS, INTENTS, KINDS, PLANS, Call, Content
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
@@ -44,6 +44,7 @@ from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import OfExtension, part_of, setting_of_extension
 from harness.core.pairs import pairs
+from harness.core.strangers import is_ours
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.networks import Network, network
@@ -108,6 +109,23 @@ def change_of(text: str) -> Change:
         if change := kind.change(text):
             return change
     raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
+
+
+@cache
+def calls() -> Mapping[str, Call]:
+    """Return the further questions to the ego that contents ask, by name;
+    none of a package's by whose name a part changes messages.
+    """
+    by_name: dict[str, Call] = {}
+    for content in CONTENTS.usable().values():
+        call = content.call
+        if call and (is_ours(call) or not _changes_messages(call.name)):
+            by_name[call.name] = call
+    return by_name
+
+
+def _changes_messages(text: str) -> bool:
+    return any(kind.change(text) for kind in more_parts().values())
 
 
 @cache
@@ -189,6 +207,9 @@ class OperatingPoint:
     def _check_reads(self) -> None:
         """Raise ValueError for a content that holds nothing that its rule reads."""
         content, consensus = self.ask.content, self.fusion.consensus
+        call = self.content.call
+        if call and call.name not in calls():
+            raise wrong("content", content, "another: messages are changed by that name")
         if _may_read(consensus, self.content):
             return
         if consensus == Fusion().consensus:
