@@ -1,10 +1,16 @@
-"""What packages' rules, channels and attacks return is held to what it must be, and is copied."""
+"""What packages' rules, channels, scenarios and attacks return is held to what it must be, and is
+copied.
+"""
 
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+import one_way_crossing as crossing
 import pytest
+from one_way_crossing import SCENARIO
 
 from harness.coordination.consensus import Fused, Messages
 from harness.coordination.coordinate import _by_rule
@@ -13,6 +19,8 @@ from harness.core.errors import UserError
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import broadcast, delivered
+from harness.world import scenarios
+from harness.world.scenario import Layout, Spawn
 
 P = np.full((2, 2), 0.5)
 HEARD = np.ones((2, 1), dtype=bool)
@@ -144,3 +152,95 @@ def test_a_channel_whose_parameters_no_file_can_hold_is_one_line(
         UserError, match=r"^channel profile mine fails \(TypeError: Encoding objects"
     ):
         CHANNELS.record("mine")
+
+
+LAYOUT = crossing.layout(1, SCENARIO.parameters)
+EGO = LAYOUT.spawns[0]
+XY_M, APPROACHES = np.zeros((4, 2, 2)), np.full((4, 2), "west")
+
+
+def written(xy_m: Any) -> Any:
+    xy_m[...] = 0.0
+    return xy_m
+
+
+def roads(**changes: Any) -> Any:
+    return replace(SCENARIO, road=lambda: replace(crossing.road(), **changes)).road()
+
+
+def laid(layout: Any) -> Any:
+    scenario = replace(SCENARIO, layout=lambda seed, parameters: layout)
+    return scenario.layout(1, scenario.parameters)
+
+
+def ego(**changes: Any) -> Layout:
+    return replace(LAYOUT, spawns=(replace(EGO, **changes), *LAYOUT.spawns[1:]))
+
+
+def cleared(act: Callable[[Any], Any]) -> Any:
+    scenario = replace(SCENARIO, cleared=lambda xy_m, approaches, parameters: act(xy_m))
+    return scenario.cleared(XY_M, APPROACHES, scenario.parameters)
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda: laid(None), "TypeError: layout gives a NoneType and no Layout"),
+        (lambda: laid(replace(LAYOUT, spawns=())), "ValueError: layout does not have one ego"),
+        (lambda: laid(replace(LAYOUT, spawns=LAYOUT.spawns * 2)), "layout has two vehicles v1"),
+        (lambda: laid(replace(LAYOUT, spawns=("v1",))), "layout gives a str and no Spawn"),
+        (lambda: laid(replace(LAYOUT, buildings=(1,))), "layout gives a int and no Building"),
+        (lambda: laid(replace(LAYOUT, danger="zork")), "layout has danger zork of v3, and no such"),
+        (lambda: laid(replace(LAYOUT, danger_id=None)), "layout has danger west of None"),
+        (lambda: laid(ego(arc_m=np.nan)), "v1 has nan as a place"),
+        (lambda: laid(ego(route="left")), "v1 is on south, left, no path of the road"),
+        (lambda: laid(ego(kind="tank")), "ValidationError: Invalid enum value 'tank'"),
+        (lambda: laid(ego(id="zork")), "ValidationError: Expected `str` matching regex"),
+        (lambda: cleared(lambda xy_m: 1 / 0), "ZeroDivisionError: division by zero at "),
+        (lambda: cleared(lambda xy_m: None), "ValueError: cleared of type NoneType"),
+        (lambda: cleared(lambda xy_m: np.bool_(True)), "cleared of type bool"),
+        (lambda: cleared(lambda xy_m: np.zeros(4)), "cleared of type float64, not bool"),
+        (lambda: cleared(written), "assignment destination is read-only"),
+        (lambda: replace(SCENARIO, road=lambda: None).road(), "road gives a NoneType and no Road"),
+        (lambda: roads(ego=("west", "left")), "road has no path ('west', 'left'), which is its"),
+        (lambda: roads(ground=lambda far_m: None).ground_within(9.0), "ground gives a NoneType"),
+        (lambda: roads(goal_m=lambda p: 1 / 0).goal_m(1), "ZeroDivisionError: division by zero"),
+        (lambda: roads(goal_m=lambda p: np.nan).goal_m(1), "ValidationError: Expected `float`"),
+        (lambda: replace(SCENARIO, seats=lambda: None).seats(), "seats gives a NoneType and no M"),
+        (lambda: replace(SCENARIO, seats=lambda: {1: 2}).seats(), "seats gives a int and no Seat"),
+    ],
+)
+def test_what_a_scenario_returns_is_held_to_what_it_must_be(
+    ask: Callable[[], Any], says: str
+) -> None:
+    with pytest.raises(UserError) as error:
+        ask()
+    assert str(error.value).startswith(f"scenario {SCENARIO.name} fails (")
+    assert says in str(error.value)
+
+
+@pytest.mark.slow
+def test_lanes_that_a_network_lacks_are_one_line() -> None:
+    pytest.importorskip("highway_env")
+    lane = ("nowhere", "west", 0)
+    path = replace(crossing.road().ego_path, lanes=(lane,))
+    road = roads(paths={crossing.road().ego: path})
+    with pytest.raises(UserError, match=r"^scenario one-way-crossing fails \(KeyError: 'nowhere'"):
+        road.network()
+
+
+def test_a_scenario_that_ends_the_program_is_named_as_the_user_knows_it() -> None:
+    copied = replace(SCENARIO, name="mine", layout=lambda seed, parameters: sys.exit())
+    with pytest.raises(UserError, match=r"^scenario mine ends the program \(SystemExit at"):
+        copied.layout(1, copied.parameters)
+
+
+def test_a_scenario_is_the_same_behind_its_door_and_one_here_has_none() -> None:
+    again = replace(SCENARIO)
+    assert again == SCENARIO
+    assert again.road() is SCENARIO.road()
+    spawns: tuple[Spawn, ...] = SCENARIO.layout(1, SCENARIO.parameters).spawns
+    assert spawns == LAYOUT.spawns
+    here = scenarios.get("all-way-crossing")
+    for function in (here.road, here.layout, here.cleared, here.seats):
+        assert type(function).__module__ != "harness.world.scenario_of_package"

@@ -29,6 +29,7 @@ from harness.core.parallel import Workers, each
 from harness.core.plugins import Plugins
 from harness.core.seeds import purpose, stated
 from harness.core.shards import Shard
+from harness.core.strangers import worded
 from harness.dataset.forest import Forest
 from harness.dataset.freeze import freeze
 from harness.dataset.schema import (
@@ -47,6 +48,7 @@ from harness.world.environments import environment
 from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
+from harness.world.scenario_of_package import is_ours
 from harness.world.seats import refuse_agents
 
 TOGETHER = 8  # the most layouts that are frozen together
@@ -276,7 +278,9 @@ def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> l
         trees.append(tree)
     checked = [tree for tree in trees if tree.episode % CHECKED_EVERY == 0]
     if checked:
-        _check(scenario, checked)
+        built_in = is_ours(scenario.layout)
+        with worded(f"scenario {printable(scenario.name)}", built_in):
+            _check(scenario, checked)
     return files
 
 

@@ -137,6 +137,10 @@ class Scenario:
     def __post_init__(self, start: Callable[["Scenario", int], Any] | None) -> None:
         if start is not None:
             object.__setattr__(self, "world", _world_of(start))
+        if self.world is None:
+            from harness.world.scenario_of_package import put_doors
+
+            put_doors(self)
 
     @property
     def is_environment(self) -> bool:
