@@ -121,6 +121,7 @@ def test_ints_and_float32_are_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
             "a delay that is negative, infinite or NaN",
         ),
         (DELIVERED._replace(delay_s=np.full((2, 1), 1.0, object)), "delays of type object"),
+        (DELIVERED._replace(delay_s=0.5 * ONE), "a reply that ends 0.5 s after the request"),
         (DELIVERED._replace(loss=masked(np.full((2, 1), 9.0))), "losses of type MaskedArray"),
         (DELIVERED._replace(loss=np.full((2, 1), np.nan)), "a loss that is no probability"),
         (

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core import strangers
-from harness.core.arrays import Floats, Ints, check_shape, numbers, read_only
+from harness.core.arrays import ROUNDING, Floats, Ints, check_shape, numbers, read_only
 from harness.radio.channel import (
     REQUEST,
     Broadcast,
@@ -72,6 +72,12 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
     delay_s = numbers("delays", delay_s, shape)
     if not np.all((delay_s[asked] >= 0.0) & (delay_s[asked] < np.inf)):
         raise ValueError("a delay that is negative, infinite or NaN for a helper that was asked")
+    early = asked & (delay_s < links.ready_s - ROUNDING)
+    if early.any():
+        raise ValueError(
+            f"a reply that ends {delay_s[early][0]:g} s after the request, and is ready after "
+            f"{links.ready_s[early][0]:g} s"
+        )
     loss = numbers("losses", loss, shape, (*shape[:-1], 1))
     if not np.all(((loss >= 0.0) & (loss <= 1.0)) | ~asked):
         raise ValueError("a loss that is no probability for a helper that was asked")
