@@ -66,6 +66,10 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
         raise UserError(f"{printable(file)}: {error}") from None
     for problem in _manifest_problems(manifest, scenario):
         raise UserError(f"{printable(file)}: manifest {problem}; build the dataset again")
+    try:
+        scenario_of(manifest)
+    except UserError as error:
+        raise UserError(f"{printable(file)}: {error}; build the dataset again") from None
     return manifest, sha256_bytes(data)
 
 

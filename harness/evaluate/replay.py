@@ -18,7 +18,7 @@ from harness.evaluate.live_world import ended, looks
 from harness.runs.folder import Run
 from harness.runs.metrics import BASELINE
 from harness.runs.records import ClosedLoop, Decision, Episode, Manifest
-from harness.world import lockstep, scenarios
+from harness.world import lockstep
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
 from harness.world.seats import offset_of
@@ -40,9 +40,7 @@ class ReplayedEpisode:
 
     @cached_property
     def scenario(self) -> Scenario:
-        assert isinstance(self.manifest.world, ClosedLoop)
-        record = self.manifest.world.scenario
-        return scenarios.stated(record["name"], record["parameters"])
+        return self.manifest.scenario
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode:

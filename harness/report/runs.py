@@ -11,9 +11,8 @@ from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.contradictions import refuse
 from harness.runs.folder import Run, read
-from harness.runs.records import ClosedLoop, FrozenScenes
+from harness.runs.records import FrozenScenes
 from harness.runs.run_dataset import dataset_of
-from harness.world import scenarios
 from harness.world.scenario import Scenario
 
 
@@ -40,9 +39,7 @@ class Runs:
         """The scenario of their episodes, with its parameters of then."""
         if self.dataset is not None:
             return self.dataset.scenario
-        world = self.runs[0].manifest.world
-        assert isinstance(world, ClosedLoop)
-        return scenarios.stated(world.scenario["name"], world.scenario["parameters"])
+        return self.runs[0].manifest.scenario
 
     def of_scenes(self, ids: Collection[str]) -> "Runs":
         """Return the runs' part in some scenes, with the trees of their layouts alone."""

@@ -9,12 +9,13 @@ from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
 from harness.coordination.operating_point import OperatingPoint, questions
 from harness.core.config import Seconds, convert
-from harness.core.errors import BETWEEN_NAMES, UserError
+from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
 from harness.runs.settings import Settings
 from harness.world import scenarios
 from harness.world.parameters import DIALS
+from harness.world.scenario import Scenario
 
 PLAIN_ROLES = ("ego", "helper", "merge")  # `merge` is the ego's fusion call
 Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  # one of `roles`
@@ -556,6 +557,16 @@ class Manifest(Struct, frozen=True, kw_only=True):
     retries: int = 0
     cost: dict[str, Cost] | UnsetType = UNSET
     versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of a closed-loop run, with its parameters of then."""
+        assert isinstance(self.world, ClosedLoop)
+        record = self.world.scenario
+        try:
+            return scenarios.stated(record["name"], record["parameters"])
+        except UserError as error:
+            raise UserError(f"run.json of {printable(self.name)}: {error}") from None
 
     def __post_init__(self) -> None:
         of_model, of_prompt = ("name", "engine"), ("version", "sha256")

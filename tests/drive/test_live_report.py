@@ -99,14 +99,23 @@ def test_a_run_is_replayed_with_the_parameters_that_it_states(driven, tmp_path):
     )
     assert played(read(earlier), 0, "6g", 0).scenario.parameters.time_limit_s == 0.5
     assert [replayed.id for replayed in scenes_of(read(earlier), [scene])] == [scene]
-    gone = edited(
-        driven,
-        tmp_path / "gone",
-        "run.json",
-        lambda text: text.replace('"time_limit_s"', '"patience_s"'),
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stated", "says"),
+    [
+        ('"patience_s": 10.0', "scenario occluded-intersection has other parameters here"),
+        ('"time_limit_s": 0.0', r"scenario: time_limit_s is 0\.0; it must be above 0"),
+    ],
+)
+def test_parameters_that_no_scenario_has_are_said_to_be_the_runs(driven, tmp_path, stated, says):
+    scene = next(iter(read(driven).decisions.scenes))
+    forged = edited(
+        driven, tmp_path, "run.json", lambda text: text.replace('"time_limit_s": 10.0', stated)
     )
-    with pytest.raises(UserError, match="scenario occluded-intersection has other parameters here"):
-        scenes_of(read(gone), [scene])
+    with pytest.raises(UserError, match=f"^run.json of [a-z]+: {says}"):
+        scenes_of(read(forged), [scene])
 
 
 @pytest.mark.exhaustive

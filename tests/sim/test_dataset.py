@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from zipfile import ZipFile
 
 import msgspec
@@ -523,6 +523,7 @@ def test_a_tree_that_cannot_be_read_is_refused(copy, text):
         load(copy)
 
 
+USUAL = asdict(SCENARIO.parameters)
 HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "a path upwards": {"files": {"../../etc/passwd": "0" * 64}},
     "an absolute path": {"files": {"/etc/passwd": "0" * 64}},
@@ -537,6 +538,7 @@ HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "one action": {"actions": ["IDLE"]},
     "actions that are no names": {"actions": [["IDLE"], {}]},
     "an allowance that is a text": {"parameters": {"delay_allowance_s": "1"}},
+    "decisions at one time": {"parameters": {**USUAL, "decision_period_s": 0.0}},
     "an unknown field": {"extra": 1},
     "a scenario that is none": {"scenario": "egg"},
 }
