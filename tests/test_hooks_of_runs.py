@@ -3,6 +3,7 @@
 import _thread
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -172,6 +173,37 @@ def test_a_hook_that_ends_the_program_costs_a_run_one_line(
     assert line.startswith("harness: tracker bad: ")
     assert line.endswith("; the run goes on without it")
     assert read(Path("run")).scores
+
+
+def close_numbers() -> None:
+    os.close(1)
+    os.close(2)
+
+
+@pytest.mark.parametrize(
+    "does",
+    [partial(setattr, sys, "stdout", None), partial(setattr, sys, "stderr", None), close_numbers],
+    ids=["stdout", "stderr", "numbers"],
+)
+def test_a_hook_that_takes_the_streams_away_gives_them_back(
+    does: Callable[[], object], two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    install(bad=Bad("begin", does))
+    code, out, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet", "--json"))
+    assert (code, json.loads(out)["run"]) == (0, "run")
+    line = "harness: tracker bad closed or replaced output or error; both are as they were"
+    assert said.splitlines().count(line) == 1
+
+
+@pytest.mark.parametrize("at", ["begin", "answered"])
+def test_a_run_whose_folder_a_hook_deletes_is_one_line(
+    at: str, two_path: Path, harness: Typed, install: Callable[..., None]
+) -> None:
+    install(bad=Bad(at, partial(shutil.rmtree, "run")))
+    code, out, said = harness(*typed_eval(two_path, "--tracker", "bad", "--quiet"))
+    assert (code, out) == (2, "")
+    [line] = [line for line in said.splitlines() if line.startswith("harness:")]
+    assert line.startswith("harness: --out run was deleted while it was written to, by a tracker")
 
 
 @pytest.mark.parametrize(

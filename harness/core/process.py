@@ -5,11 +5,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 STOPS = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}
 # in which the process is gone once its work is done; a tracker may still send things
@@ -193,6 +193,48 @@ def _open_streams() -> None:
         # In the C locale, Python writes what it could not decode, and fails at any other character.
         if isinstance(stream, TextIOWrapper) and stream.errors in ("strict", "surrogateescape"):
             stream.reconfigure(errors="replace")
+
+
+@contextmanager
+def streams_kept(what: str) -> Iterator[None]:
+    """Run code that may close or replace output and error;
+    both are put back, and a line on stderr says whose it was, `what`.
+    """
+    copies = {number: os.dup(number) for number in (1, 2) if _file_at(number)}
+    files = {number: _file_at(number) for number in copies}
+    streams = {"stdout": sys.stdout, "stderr": sys.stderr}
+    try:
+        yield
+    finally:
+        moved: list[object] = [number for number, file in files.items() if _file_at(number) != file]
+        for number, copy in copies.items():
+            if number in moved:
+                os.dup2(copy, number)
+            os.close(copy)
+        for name, stream in streams.items():
+            closed = getattr(stream, "closed", False)
+            if closed or getattr(sys, name) is not stream:
+                setattr(sys, name, _reopened(stream) if closed else stream)
+                moved.append(name)
+        if moved:
+            line = f"{what} closed or replaced output or error; both are as they were"
+            print(f"harness: {line}", file=sys.stderr)
+
+
+def _file_at(number: int) -> tuple[int, int] | None:
+    """Return what tells the open file of a number from others; None if there is none."""
+    try:
+        status = os.fstat(number)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _reopened(stream: TextIO) -> TextIO:
+    """Return a stream in the place of one that was closed, on the same file."""
+    number = 1 if stream is sys.__stdout__ else 2
+    coding, errors = stream.encoding, stream.errors
+    return open(number, "w", 1, encoding=coding, errors=errors, closefd=False)
 
 
 def _leave_out_wrong_date() -> None:

@@ -163,7 +163,12 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
         raise UserError(
             f"--out {printable(out)} is being written by another process; wait for it"
         ) from None
-    except (UserError, OSError):
+    except (UserError, OSError) as error:
+        if isinstance(error, FileNotFoundError) and not work.exists():
+            raise UserError(
+                f"--out {printable(out)} was deleted while it was written to, by a tracker or "
+                "another program; type the same command again, which begins anew"
+            ) from error
         with suppress(OSError):  # another process may be working in one of them by now
             if _nothing_done(work) and not (work / UNANSWERED).exists():
                 shutil.rmtree(work)

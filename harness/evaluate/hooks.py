@@ -102,7 +102,8 @@ class _Caller:
         them apart.
         """
         try:
-            self._call(method, arguments, patience_s)
+            with process.streams_kept(self._what):
+                self._call(method, arguments, patience_s)
         except KeyboardInterrupt as stop:
             stop.add_note(f"it came during {method} of {self._what}")
             raise
