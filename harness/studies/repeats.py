@@ -257,6 +257,7 @@ def between_share(values: Floats) -> Estimate:
     inside = weights @ within / (n * (k - 1))
     total = between + (k - 1) * inside
     share = np.where(total > 1e-12, (between - inside) / np.maximum(total, 1e-12), np.nan)
+    share[np.abs(share) < 1e-9] = 0.0  # else rounding shows a share below 0 where it is 0
     if np.isnan(share[0]):
         return unknown
     low, high = np.nanpercentile(share[1:], (2.5, 97.5))

@@ -131,6 +131,8 @@ def test_variance_lies_between_episodes_or_within() -> None:
     assert share.n == 3
     assert between_share(np.array([[1.0, 1.0], [0.0, 0.0]])).value == pytest.approx(1)
     assert between_share(np.array([[1.0, 0.0], [0.0, 1.0]])).value == pytest.approx(-1)
+    none = between_share(np.array([[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]]) / 3)
+    assert none.value == 0, "what rounding takes off is no share below 0"
     for nothing in (np.ones((4, 3)), np.ones((1, 3))):
         assert math.isnan(between_share(nothing).value)
 
