@@ -115,6 +115,11 @@ def test_a_run_is_repeated_by_its_file(harness: Callable[..., Said], small_path:
     for file in ("a/run.toml", "a"):
         assert harness("eval", file, "--quiet", "--out", f"of-{Path(file).name}") == (0, "", "")
         assert same_decisions(Path("a"), Path(f"of-{Path(file).name}"))
+    Path("a/run.toml").write_text(Path("a/run.toml").read_text().replace("3,7", "3,8"))
+    assert harness("eval", "a", "--seeds", "3:4", "--quiet", "--out", "typed") == (0, "", "")
+    said = "it has --seeds 3,8, and run.json beside it has --seeds 3,7; run.toml is taken"
+    line = f"harness: settings a/run.toml: {said}\n"
+    assert harness("eval", "a", "--quiet", "--out", "edited") == (0, "", line)
     assert harness("eval", "a", "--limit", "1", "--prompt", "v4", "--quiet", "--out", "b")[0] == 0
     changed: Any = read_run(Path("b")).manifest
     assert (changed.world.limit, changed.prompt["version"], changed.tags) == (1, "v4", ("first",))

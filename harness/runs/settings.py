@@ -8,6 +8,7 @@ with its help and its panel there.
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
@@ -18,6 +19,7 @@ from harness.core import extensions
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, printable
 from harness.core.extensions import Setting
+from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
 
 FILE = "run.toml"
@@ -634,10 +636,13 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             "which runs have since 0.3; for another, type the command in its run.json"
         )
     tables = _placed(toml(file, where), world, where)
-    settings = changed(_as_driven(convert(tables, Settings, where), file.parent), given)
+    stated = convert(tables, Settings, where)
+    settings = changed(_as_driven(stated, file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
     _check_extensions(settings, where)
+    if file.name == FILE and (file.parent / "run.json").is_file():
+        _say_otherwise(changed(stated, given), file, given)
     own = {name: words for name, words in _only_typed(settings).items() if name not in given}
     if own:
         flag, value, *_ = beside = [word for words in own.values() for word in words]
@@ -653,6 +658,20 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`"
         )
     return settings
+
+
+def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> None:
+    """Say on stderr what a run's file states otherwise than its `run.json`."""
+    from harness.runs.folder import read as run_of
+
+    with suppress(UserError):  # who needs the run says what is wrong with it
+        made_with = changed(run_of(file.parent).manifest.settings, given)
+        before, now = difference(made_with, settings)
+        if before != now:
+            say_once(
+                f"settings {printable(file)}: it has {printable(now)}, and run.json beside it has "
+                f"{printable(before)}; {FILE} is taken"
+            )
 
 
 def _check_extensions(settings: Settings, where: str) -> None:
