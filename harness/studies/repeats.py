@@ -183,6 +183,19 @@ class Repeats:
             points.append(Wavering(scenes[d], self.conditions[c], float(shares[c, d]), actions))
         return [point for point in points if point.flips > 0]
 
+    def copies(self) -> Iterator[str]:
+        """Yield a sentence for repeats whose answers are the same, word for word."""
+        alike: dict[frozenset[tuple[str, str]], list[str]] = {}
+        for run in self.runs:
+            said = frozenset((answer.id, answer.raw) for answer in run.answers)
+            alike.setdefault(said, []).append(run.path.name)
+        for said, names in alike.items():
+            if said and len(names) > 1:
+                yield (
+                    f"{' and '.join(names)} have the same {amount(len(said), 'answer')}, word for "
+                    "word: chance changed nothing there, or one is a copy of the other."
+                )
+
     def _doubts(self) -> Iterator[tuple[str, Estimate]]:
         """Yield the entropy that the ego's answers state,
         and that of the actions which they rank first.
@@ -325,7 +338,7 @@ def repeats_study(repeats: Repeats) -> Study:
             "temperature": first.settings.temperature,
             "figures": rows,
         },
-        caveats=[finding.sentence for finding in warnings],
+        caveats=[*repeats.copies(), *(finding.sentence for finding in warnings)],
         more=Markup("\n").join(links),
         figures=lambda: {"repeats": _figure(repeats)},
     )

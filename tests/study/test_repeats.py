@@ -199,6 +199,21 @@ def test_a_repeat_is_a_run_with_its_own_sampling_seed(
     assert all("--temperature 0.7 --sampling-seed" in run.manifest.command for run in of.runs)
 
 
+def test_a_repeat_that_is_a_copy_of_another_is_said_to_be(
+    small: Dataset, tmp_path: Path, wanderer: Wanderer
+) -> None:
+    """Its record may state any sampling seed."""
+    spec, out = hot(course(small, 2)), tmp_path / "repeats"
+    assert list(repeated(spec, out, 2).copies()) == []
+    record = (out / "repeat-2/run.json").read_text()
+    shutil.rmtree(out / "repeat-2")
+    shutil.copytree(out / "repeat-1", out / "repeat-2")
+    (out / "repeat-2/run.json").write_text(record)
+    [caveat] = repeats_study(repeated(spec, out, 2)).caveats
+    assert caveat.startswith("repeat-1 and repeat-2 have the same ")
+    assert caveat.endswith("chance changed nothing there, or one is a copy of the other.")
+
+
 @pytest.mark.exhaustive
 def test_a_stopped_one_goes_on_as_if_it_had_not_been(
     small: Dataset, tmp_path: Path, wanderer: Wanderer
