@@ -85,3 +85,20 @@ def test_the_overviews_gains_are_those_of_the_claims_page() -> None:
     assert len(gains) == 6
     for gain in gains:
         assert gain in claims, gain
+
+
+def test_every_decision_stands_once_in_the_index() -> None:
+    folder = ROOT / "docs/decisions"
+    listed = re.findall(r"\b(0\d{3}-[\w-]+)", (folder / "index.md").read_text())
+    assert sorted(listed) == sorted(path.stem for path in folder.glob("0*.md"))
+
+
+ROOMS = sorted(path.parent for path in (ROOT / "harness").glob("*/__init__.py"))
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.name)
+def test_every_room_says_where_to_start_at_files_that_are_there(room: Path) -> None:
+    text = (room / "README.md").read_text()
+    assert len(text.splitlines()) <= 16
+    for name in re.findall(r"`(\w+(?:\.py|/))`", text):
+        assert (room / name).exists() or (ROOT / name).exists(), name
