@@ -19,7 +19,9 @@ SILENT = "the engine gives no reason"
 
 
 class EngineOfPackage:
-    """A backend of a package's engine; what this has not, is the package's own."""
+    """Check what the backend of a package's engine answers;
+    all other attributes are passed on to that backend.
+    """
 
     def __init__(self, backend: Backend, name: str) -> None:
         self._backend, self._what = backend, f"engine {printable(name)}"

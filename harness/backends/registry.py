@@ -46,7 +46,7 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Registration:
-    """One engine."""
+    """What an engine can do, needs and understands, and how the backend of a card is opened."""
 
     # `module:function`, called with a card and the options of `open_backend`; returns a backend
     opens: str

@@ -72,7 +72,7 @@ class Record(Closed, frozen=True):
 
 
 class EnvironmentRecord(Record, frozen=True):
-    """A decision point of an environment."""
+    """A decision point of a highway-env environment, whose state is the actions taken so far."""
 
     snapshot: ActionsTaken | UnsetType = UNSET  # type: ignore[assignment]
 

@@ -34,7 +34,7 @@ class Until:
     looked: Looks | None = None  # how often the run was looked at, once it has stopped
 
     def settings(self) -> dict[str, Any]:
-        """Return this as the settings that ask for it."""
+        """Return the settings of a run, by name, that ask for this rule of stopping."""
         width = None if self.width is None else round(100 * self.width, 9)
         return {
             "until_width": width,

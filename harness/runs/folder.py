@@ -175,7 +175,9 @@ class Run:
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
 
     def speed(self, answer: Answer) -> Speed:
-        """Return the speed of an answer's agent; only for a run with a device profile."""
+        """Return how fast the model of an answer reads and writes tokens on the run's device;
+        only a run with a device profile has that.
+        """
         return self.manifest.latency.speed(self._viewer_place(answer))
 
     def seconds(self, answer: Answer) -> float | None:

@@ -107,9 +107,10 @@ def fit(x: Floats, y: Floats) -> Network:
 def learn(
     train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> Network:
-    """Learn the network from runs on train layouts, under an operating point.
+    """Learn a network that says what asking the helpers is worth, from runs on train layouts.
 
-    Its `max_helpers` are asked while it is learnt; the first round decides by its own schedule.
+    It is learnt under an operating point: as many helpers are asked as that allows, and its
+    schedule decides in the first round of learning.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]

@@ -101,7 +101,9 @@ SOURCES = Plugins[Source]("swarmdrive.sources", Source, {})  # those that extens
 
 
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
-    """Return `COLUMNS`, which the metrics of a panel are of."""
+    """Return what a study's metrics are computed from, by the names in `COLUMNS`:
+    a number for each decision.
+    """
     every = columns(part)
     return {name: every[name] for name in COLUMNS}
 

@@ -107,7 +107,10 @@ class Play:
 def plays(
     choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate], success_rule: Success
 ) -> list[Play]:
-    """Play candidates of one schedule; what asking is worth by it is worked out once."""
+    """Play a schedule at several thresholds, the candidates; return a play of each, in their order.
+
+    What asking is worth by the schedule is computed once for all.
+    """
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
     pairs = zip(candidates, rules, strict=True)

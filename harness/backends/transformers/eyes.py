@@ -104,7 +104,10 @@ class Eyes:
         return [*self._before, *tokens, *self._after]
 
     def encode(self, tokens: Iterable[int]) -> None:
-        """Encode the pictures among some tokens together, unless they are too many to be kept."""
+        """Encode the pictures of a prompt, its negative tokens, in one batch, and keep the result.
+
+        Nothing happens where they are more than are kept: each is encoded when it is read.
+        """
         numbers = list(dict.fromkeys(pictures_in(tokens)))
         if len(numbers) <= KEPT:
             with torch.inference_mode():

@@ -45,7 +45,9 @@ NOTHING = Prefix([], [])
 
 
 class Prefixes:
-    """Recently used beginnings; the least recently used are dropped first."""
+    """Keep the keys and values of recently read beginnings of prompts, a few;
+    the least recently used is dropped first.
+    """
 
     def __init__(self) -> None:
         self._kept: list[Prefix] = []

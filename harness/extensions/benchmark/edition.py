@@ -48,7 +48,7 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One edition."""
+    """A version of the benchmark that never changes: all that a score on it depends on."""
 
     name: str  # of its file
     digest: str  # of its tables, hex SHA-256

@@ -53,9 +53,10 @@ class ShowsTruth(Call):
 
 
 class OfLists(Content):
-    """Lists that need no model, and leave as soon as the request is there.
+    """A message that lists the objects which a helper's sensors see.
 
-    The ego acts on its answer to the larger graph.
+    No model is asked for it, so it leaves as soon as the request is there. The ego's model is asked
+    once more, with a scene graph that has these objects as well, and the ego acts on that answer.
     """
 
     needs = (kinds.OBJECTS,)

@@ -28,7 +28,7 @@ class Schema:
 
 
 class Quoted(Schema):
-    """Makes evidence a JSON string."""
+    """Quote a helper's words as a JSON string in the fusion prompt, so that they are no orders."""
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}
