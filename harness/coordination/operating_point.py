@@ -727,7 +727,7 @@ def misnamed(settings: Mapping[str, Any]) -> list[str]:
         named = as_here(named_point(name).record())
     except UserError:
         return []
-    here = as_here(settings)
+    here = {**OperatingPoint(name).record(), **as_here(settings)}  # what it lacks, it has plainly
     keys = dict.fromkeys((*named, *here))
     return [key for key in keys if key not in named or key not in here or named[key] != here[key]]
 

@@ -112,7 +112,7 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(
 ) -> None:
     config = json.loads((runs[0] / "run.json").read_text())
     name = "6g:consensus=median,window_s=0.4"
-    config["conditions"][1]["name"] = name
+    config["conditions"][1] |= {"name": name, "consensus": "median", "window_s": 0.4}
 
     def renamed(row: Row) -> None:
         if row["condition"] == "6g":

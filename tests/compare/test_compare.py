@@ -325,6 +325,14 @@ def test_answers_that_are_read_otherwise_are_told_by_role(
 
 def test_settings_in_which_runs_differ_are_told(runs: tuple[Path, Path]) -> None:
     config = json.loads((runs[1] / "run.json").read_text())
+    config["conditions"][1]["name"] = "mine"
+
+    def renamed(row: Row) -> None:
+        if row["condition"] == "6g":
+            row["condition"] = "mine"
+
+    for run in runs:
+        change(run, decision=renamed, episode=renamed, conditions=config["conditions"])
     conditions = [{k: v for k, v in c.items() if k != "on_demand"} for c in config["conditions"]]
     conditions[1]["tau_nats"] = 0.5
     configure(
@@ -337,7 +345,7 @@ def test_settings_in_which_runs_differ_are_told(runs: tuple[Path, Path]) -> None
         "answer": ("json", "constrained"),
         "identity.build": (None, "b2"),
         "versions.numpy": (config["versions"]["numpy"], "9"),
-        "condition.6g.tau_nats": ("0.7", "0.5"),
+        "condition.mine.tau_nats": ("0.7", "0.5"),
     }, "a setting that an older run does not have is what it was then"
 
 
