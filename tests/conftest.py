@@ -26,7 +26,7 @@ from shares import SHARES, share_of
 from harness import cli
 from harness.cli import shell
 from harness.coordination import operating_point, parts
-from harness.core import extensions
+from harness.core import extensions, resources
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
@@ -104,7 +104,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in left_out]
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     needs = re.compile(r'importorskip\("(torch|llama)|tiny_')
-    engines = {item.path for item in items if needs.search(text(item.path))}
+    files = {item.path for item in items}
+    engines = {file for file in files if needs.search(text(file))}
     items.sort(key=lambda item: (item.path not in engines, item.path not in slow))
 
 
@@ -267,6 +268,32 @@ def workers_folder(
 def _own_cache(workers_folder: Path) -> None:
     """No test reads or writes the completions that whoever runs the tests keeps."""
     os.environ["SWARMDRIVE_CACHE"] = str(workers_folder / "cache")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _shipped_once() -> Generator[None, None, None]:
+    """What ships, which layouts are held against, is read once by each worker."""
+    reported, starts = rebuilt._reported, rebuilt._starts
+    known, begun = dict[tuple[Path, str], list[Dataset]](), dict[tuple[str, int], dict[str, str]]()
+
+    def reported_once(scenario: str) -> list[Dataset]:
+        place = resources.folder("datasets"), scenario
+        if place not in known:
+            known[place] = list(reported(scenario))
+        return known[place]
+
+    def starts_once(dataset: Dataset) -> dict[str, str]:
+        key = dataset.sha256, len(dataset.episodes)
+        if not dataset.trusted:
+            return starts(dataset)
+        if key not in begun:
+            begun[key] = starts(dataset)
+        return begun[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rebuilt, "_reported", reported_once)
+        patch.setattr(rebuilt, "_starts", starts_once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -133,12 +133,12 @@ def test_whatever_a_tree_says_is_held_against_its_seed(
 def test_typing_a_command_again_draws_no_other_layouts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dataset = load(find("occluded-intersection-v3"))
+    dataset = load(find("occluded-intersection-v3"), 50)
     draws = {tuple(rebuilt.drawn(dataset, 3)) for _ in range(9)}
     assert len(draws) == 1
     monkeypatch.setattr("platform.node", lambda: "another")
     assert tuple(rebuilt.drawn(dataset, 3)) not in draws
-    assert tuple(rebuilt.drawn(load(find("occluded-intersection-v2")), 3)) not in draws
+    assert tuple(rebuilt.drawn(load(find("occluded-intersection-v2"), 50), 3)) not in draws
 
 
 @pytest.mark.slow
