@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager, contextmanager, redirect_stderr, 
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from runpy import run_path
 from typing import Any
@@ -310,8 +311,10 @@ def tries(
     shared_work: Callable[[], AbstractContextManager[None]],
 ) -> Tries:  # fmt: skip
     """Types what is typed of a kind, once for all tests."""
-    for heavy in ("matplotlib.backends.backend_svg", "pandas", "scipy.stats"):
-        pytest.importorskip(heavy)  # here, and not in every process that types a command
+    # here, and not in every process that types a command
+    for heavy in ("matplotlib", "pandas", "scipy.stats"):
+        pytest.importorskip(heavy)
+    import_module("harness.report.drawing.pictures")
 
     def filled(folder: Path, trial: Trial) -> None:
         here = folder / "here"  # at the same place as one that is killed, since manifests name it

@@ -174,15 +174,25 @@ def test_one_that_is_killed_and_typed_again_has_the_bytes_of_one_that_ran_throug
     assert max(asked.values(), default=1) == 1, "an answer is kept twice"
 
 
+@pytest.fixture(scope="module")
+def project(
+    tmp_path_factory: pytest.TempPathFactory, proxy_run: Path, small_path: Path
+) -> tuple[Path, dict[str, str]]:
+    """A project in which nothing is written, and the digests of its files."""
+    here = tmp_path_factory.mktemp("project")
+    laid(here, proxy_run, None, small_path)
+    return here, digests(here)
+
+
 @pytest.mark.usefixtures("unrebuilt")
 @pytest.mark.parametrize(("kind", "options"), WRONG)
 def test_what_cannot_be_is_one_line_and_nothing_is_written(
-    kind: str, options: str, harness: Typed, tmp_path: Path, proxy_run: Path, small_path: Path
-) -> None:
-    trial = TRIALS[kind]
-    laid(tmp_path, proxy_run, None, small_path)
-    before = digests(tmp_path)
+    kind: str, options: str, harness: Typed, project: tuple[Path, dict[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    trial, (here, before) = TRIALS[kind], project
+    monkeypatch.chdir(here)
     code, out, err = harness(*shlex.split(f"{trial.command} {options}"))
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert trial.wrong[options] in err
-    assert digests(tmp_path) == before
+    assert digests(here) == before
