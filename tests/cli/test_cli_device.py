@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluating import run, spec_of
+from evaluating import course, run, spec_of
 from msgspec.structs import replace
 
 from harness.coordination.operating_point import POINTS
@@ -25,7 +25,8 @@ def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the model that ships, each answer asked alone."""
     out = tmp_path_factory.mktemp("runs") / "alone"
     points = (POINTS["6g"],)
-    run(spec_of(small, "swarm-tiny", points=points, seeds=(0,), batch_size=1, limit=1), out)
+    few = course(small, steps=1).of_episodes([0, 1])
+    run(spec_of(few, "swarm-tiny", points=points, seeds=(0,), batch_size=1), out)
     return out
 
 
