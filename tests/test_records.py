@@ -188,8 +188,7 @@ def test_runs_of_different_days_are_compared(harness: Typed) -> None:
     assert harness("report", *pages, "--out", "page.html")[::2] == (0, "")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("commit", ["356ad2b", "0103f23"])
+@pytest.mark.parametrize("commit", some(["356ad2b"], exhaustive=["0103f23"]))
 def test_driven_runs_are_held_against_frozen_ones(commit: str, harness: Typed) -> None:
     run = HERE / commit
     code, _, error = harness("study", "fidelity", run / "proxy", run / "drive", "--out", "fidelity")

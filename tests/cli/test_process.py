@@ -42,10 +42,18 @@ def ended(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("caught", ["BaseException", "KeyboardInterrupt"])
+@pytest.mark.parametrize(
+    ("caught", "number", "code"),
+    some(
+        [("BaseException", signal.SIGTERM, 143), ("KeyboardInterrupt", signal.SIGINT, 130)],
+        exhaustive=[
+            ("BaseException", signal.SIGINT, 130),
+            ("KeyboardInterrupt", signal.SIGTERM, 143),
+        ],
+    ),
+)
 def test_a_command_that_is_stopped_while_it_imports_ends_with_a_line(
-    number: int, code: int, caught: str, tmp_path: Path
+    caught: str, number: int, code: int, tmp_path: Path
 ) -> None:
     """The first package that the command line imports stands in for any."""
     (tmp_path / "typer").mkdir()

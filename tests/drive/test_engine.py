@@ -10,6 +10,7 @@ from driving import ALONE, FROM_LEFT, NO_DANGER, ONCOMING, Script, column, decis
 from evaluating import spec_of
 from former import SCENARIO
 from run_on_disk import UNTIMED
+from tiers import some
 
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
@@ -148,14 +149,15 @@ def by_reference(seed):
     return live.drive_all(SCENARIO, [seed])[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize(
-    "seed",
-    [
-        FROM_LEFT,
-        *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in (NO_DANGER, ONCOMING)),
-    ],
+    ("driver", "seed"),
+    some(
+        [("full-view", FROM_LEFT), ("local-view", FROM_LEFT)],
+        exhaustive=[
+            *product(("brake", "cruise"), [FROM_LEFT]),
+            *product(DRIVERS, (NO_DANGER, ONCOMING)),
+        ],
+    ),
 )
 def test_a_driver_that_takes_the_lag_drives_as_the_reference_does(driver, seed):
     episodes = driven(spec(driver, first_seed=seed)).episodes
