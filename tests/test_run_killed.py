@@ -210,6 +210,34 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     assert b'\\"IDLE\\" ' in (out / "answers.jsonl").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("prompt_sha256", "0" * 64, "answer 00000-0-.* is to another prompt or picture than is"),
+        ("slow_s", -0.1, "states a delay of -0.1 s, which no card of this run declares"),
+        ("prompt_tokens", -5, r"answers\.jsonl is damaged .*prompt_tokens"),
+    ],
+)
+def test_a_kept_answer_is_one_to_what_is_asked(
+    name: str, value: object, said: str, answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    first, *others = answers.splitlines(keepends=True)
+    forged = json.dumps({**json.loads(first), name: value}).encode() + first[len(first.rstrip()) :]
+    out = unfinished(spec_of(small), tmp_path / "run", b"".join([forged, *others]))
+    with pytest.raises(UserError, match=said):
+        run(spec_of(small), out)
+
+
+def test_a_kept_answer_that_nothing_asks_for_is_left_out(
+    answers: bytes, proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    first = json.loads(answers.splitlines()[0])
+    unasked = json.dumps({**first, "heard": ["v2!objects"], "role": "merge"}).encode() + b"\n"
+    out = unfinished(spec_of(small), tmp_path / "run", answers + unasked)
+    run(spec_of(small), out)
+    assert same_files(out, proxy_run)
+
+
 @pytest.mark.parametrize("line", [b"[1", b"\xff", b'{"scene": "\xae"}', b"[" * 100_000])
 def test_damaged_answers_are_one_line(
     line: bytes, answers: bytes, small: Dataset, tmp_path: Path

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
 from msgspec import Meta
 
-from harness.core.config import Count, Seconds, between
+from harness.core.config import Count, Seconds, Whole, between
 from harness.core.files import canonical_json
 from harness.core.image import Image
 from harness.prompts.answer_schema import Shape
@@ -28,7 +28,6 @@ BARE: tuple[AnswerMode, ...] = ("readout", "decision")  # whose answer is a bare
 Letters = Literal["raw", "cyclic"]
 Sums = Literal["refuse", "divide"]
 FinishReason = Literal["stop", "length", "refusal", "error"]
-Whole = Annotated[int, Meta(ge=0, description="a whole number, 0 or more")]
 MOST_CHARS = 4 * 2**20  # of an answer, which has a few thousand
 Text = Annotated[
     str, Meta(max_length=MOST_CHARS, description=f"a text of at most {MOST_CHARS} characters")

@@ -6,7 +6,8 @@ one line, a UserError.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -14,6 +15,9 @@ from harness.backends.base import Backend, Completion, Request
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.strangers import worded
+
+if TYPE_CHECKING:
+    from harness.backends.card import Card
 
 SILENT = "the engine gives no reason"
 
@@ -23,8 +27,9 @@ class EngineOfPackage:
     all other attributes are passed on to that backend.
     """
 
-    def __init__(self, backend: Backend, name: str) -> None:
-        self._backend, self._what = backend, f"engine {printable(name)}"
+    def __init__(self, backend: Backend, card: "Card") -> None:
+        self._backend, self._what = backend, f"engine {printable(card.engine)}"
+        self._delays_s = {0.0, card.failures.slow_s if card.failures else 0.0}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         with worded(self._what):
@@ -47,9 +52,12 @@ class EngineOfPackage:
             )
         if (fields.get("error") is not None) != (fields.get("finish_reason") == "error"):
             raise UserError(f"{where}: an error has finish_reason error, and nothing else has")
-        if fields.get("error") == "":
-            fields["error"] = SILENT
-        return convert(fields, Completion, where)
+        completion = convert(fields, Completion, where)
+        if completion.slow_s not in self._delays_s:
+            raise UserError(
+                f"{where}: slow_s is {completion.slow_s:g}, which its card does not declare"
+            )
+        return replace(completion, error=SILENT) if completion.error == "" else completion
 
     def identity(self) -> dict[str, Any]:
         with worded(self._what):

@@ -5,7 +5,7 @@ kept so that a run can resume.
 import math
 import shlex
 import sys
-from collections.abc import Callable, Collection, Container, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cache, partial
 from itertools import compress, repeat
@@ -26,7 +26,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.errors import Unanswered, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import canonical_bytes, sha256_bytes
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
@@ -189,6 +189,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         finish_reason=completion.finish_reason,
         error=completion.error,
     )
+    prompt_sha256, image_sha256 = _digests(request)
     return Answer(
         scene=scene,
         viewer=viewer,
@@ -210,8 +211,8 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         letter_share=_or_unset(completion.letter_share),
         follows_letter=_or_unset(completion.follows_letter),
         flipped=_or_unset(completion.flipped),
-        prompt_sha256=sha256_bytes(_TEXTS.encode(request.messages)),
-        image_sha256=request.image_sha256 or UNSET,
+        prompt_sha256=prompt_sha256,
+        image_sha256=image_sha256,
         status=str(parsed.status),
         verdict=parsed.verdict,
         repairs=tuple(map(str, parsed.repairs)),
@@ -222,6 +223,11 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         faults=tuple(map(str, parsed.faults)) if len(parsed.faults) > 1 else UNSET,
         extension=_or_unset(parsed.extension),
     )
+
+
+def _digests(request: Request) -> tuple[str, str | UnsetType]:
+    """Return the digests of a request's chat and of its picture; unset without one."""
+    return sha256_bytes(_TEXTS.encode(request.messages)), request.image_sha256 or UNSET
 
 
 def _or_unset(value: T | None) -> T | UnsetType:
@@ -250,18 +256,24 @@ class Asker:
         answers: Mapping[str, Answer] | None = None,
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
+        checks_kept: bool = False,
     ) -> None:
         """Create an asker. `backend` opens the backend, at the first request.
 
         `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets
         the number of new answers, those kept by a stopped run included; `more` that of requests
-        before they are made.
+        before they are made. Who `checks_kept` has a kept answer only once its question is asked
+        here, and with the prompt that it answers.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
         self._progress, self._more = progress, more
         self._given, self.served = frozenset(answers or {}), list[Served]()
-        self.answers = {**self._recalled(), **(answers or {})}
+        recalled = self._recalled()
+        self.answers = {**recalled, **(answers or {})}
+        self._checks_kept = checks_kept
+        # Kept answers whose question was not asked here yet, if these are checked.
+        self._unasked = set(recalled.keys() - (answers or {}).keys()) if checks_kept else set()
         self.tally, self._in_a_row = Tally(), 0
         # How many there are while none could be read; None once one could, or it was said.
         self._unread: int | None = None if self.answers else 0
@@ -274,7 +286,13 @@ class Asker:
         `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
-            self.answers = self._recalled(cut=True) | self.answers
+            recalled = self._recalled(cut=True)
+            if self._checks_kept:
+                self._unasked |= recalled.keys() - self.answers.keys()
+            self.answers = recalled | self.answers
+        for request in asked:
+            if request.id in self._unasked:
+                self._check_kept(request)
         missing = [request for request in asked if request.id not in self.answers]
         if len(missing) < len(asked):
             self._progress(len(asked) - len(missing))
@@ -317,6 +335,25 @@ class Asker:
         recalled = self._kept.recall(cut)
         refuse_other_kept(self._kept.file, recalled.values(), self.spec.agents, self.spec.actions)
         return recalled
+
+    def _check_kept(self, request: Request) -> None:
+        """Raise UserError if an answer was kept of another prompt or picture."""
+        answer = self.answers[request.id]
+        if _digests(request) != (answer.prompt_sha256, answer.image_sha256):
+            assert self._kept
+            raise UserError(
+                f"{printable(self._kept.file)}: answer {printable(request.id)} is to another "
+                "prompt or picture than is asked; delete its folder and start again"
+            )
+        self._unasked.remove(request.id)
+
+    def _has(self, name: str) -> bool:
+        """Return whether there is an answer to a question that was asked here."""
+        return name in self.answers and name not in self._unasked
+
+    def asked(self) -> dict[str, Answer]:
+        """Return the answers without those that were kept and that nothing asked for."""
+        return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
         """Raise Unanswered if too many of the questions that were asked here got no answer."""
@@ -433,7 +470,7 @@ class Asker:
         """For each scene, whether an answer of these viewers is missing;
         to another `question`, a helper's.
         """
-        return list(self._lacking(scenes, self.answers, question, places))
+        return list(self._lacking(scenes, self._has, question, places))
 
     def _ask_at(
         self,
@@ -444,10 +481,10 @@ class Asker:
         """Ask what is missing of the viewers at these places of each scene;
         None for all of them.
         """
-        if not any(self._lacking(scenes, self.answers, question, places)):
+        if not any(self._lacking(scenes, self._has, question, places)):
             return
         # Only the prompts of scenes whose answers were not all given are rendered.
-        lacks = list(self._lacking(scenes, self._given, question, places))
+        lacks = list(self._lacking(scenes, self._given.__contains__, question, places))
         scenes = list(compress(scenes, lacks))
         asked = None if places is None else list(compress(places, lacks))
         self.answer(list(requests(self.spec, scenes, question, asked)))
@@ -455,7 +492,7 @@ class Asker:
     def _lacking(
         self,
         scenes: Sequence[Scene],
-        available: Container[str],
+        is_available: Callable[[str], bool],
         question: Question = PLAIN,
         places: Places | None = None,
     ) -> Iterator[bool]:
@@ -463,7 +500,7 @@ class Asker:
         for scene, asked in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
-                _id(scene, viewer, question) not in available
+                not is_available(_id(scene, viewer, question))
                 for place, viewer in viewers
                 if place >= first and (asked is None or place in asked)
             )
@@ -522,7 +559,7 @@ class Asker:
         """Return the answers so far in a scene, the ego's first, which is asked the plain one."""
         ego, *helpers = scene.viewers
         ids = [_id(scene, ego, PLAIN), *(_id(scene, viewer, question) for viewer in helpers)]
-        return [self.answers.get(name) for name in ids]
+        return [self.answers[name] if self._has(name) else None for name in ids]
 
     def _models(self, scene: Scene, width: int) -> list[int]:
         """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
@@ -535,7 +572,7 @@ class Asker:
     ) -> Fuses:
         sets = list(_heard_sets(scenes, codes, rewrites))
         ids = [fusion_id(*each) for each in sets]
-        if not self.answers.keys() >= set(ids):
+        if not all(map(self._has, ids)):
             self.answer(self.fusion_requests(scenes, codes, rewrites))
         return FusionAnswers(codes, *self._after([scene for scene, _ in sets], ids)).at
 
@@ -562,7 +599,7 @@ class Asker:
         rows = np.flatnonzero(on_time.any(axis=1)).tolist()
         sets = [(scenes[n], plan_keys(scenes[n].viewers[1:], intents, n, on_time[n])) for n in rows]
         by_id = {fusion_id(*each): each for each in sets}
-        if not self.answers.keys() >= by_id.keys():
+        if not all(map(self._has, by_id)):
             self.answer(
                 [fusion_request(self.spec, scene, {}, senders) for scene, senders in by_id.values()]
             )
@@ -575,7 +612,7 @@ class Asker:
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
         sets = list(_heard_sets(scenes, codes, rewrites))
-        lacks = [fusion_id(*each) not in self.answers for each in sets]
+        lacks = [not self._has(fusion_id(*each)) for each in sets]
         by_id = {scene.id: scene for scene in scenes}
         graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks)), by_id))
         calls = []

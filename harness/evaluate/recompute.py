@@ -267,6 +267,9 @@ def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
             yield (
                 f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
             )
+    of_rules = [(a, b) for a, b in asked if b and stated.agent(a)["model"]["engine"] in RULES]
+    if wrong := sum(not close(a.slow_s, b.slow_s) for a, b in of_rules):
+        yield f"answers.jsonl has another delay in {amount(wrong, 'answer')} than the rule here"
     if more := sum(b is None for _, b in asked):
         yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
 

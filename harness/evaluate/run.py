@@ -211,7 +211,7 @@ def _walk(
         decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.decision_points}
         served += asker.served
-        answers, more = asker.answers, world.columns()
+        answers, more = asker.asked(), world.columns()
         if spec.device_profile:
             more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
         decisions = table(decided, more, spec.actions)
@@ -259,7 +259,7 @@ def _frozen(
                 # Each has a file of its own, so that a resumed run asks in the same chunks.
                 kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
                 there = {**given, **before, **so_far}
-                return Asker(spec, lambda: backend, latency, kept, there, progress, more)
+                return Asker(spec, lambda: backend, latency, kept, there, progress, more, True)
 
             # A chunk fits into memory; what a language model's engine leaves behind in cycles might
             # not.
@@ -483,7 +483,10 @@ def _walk_chunk(
             )
         return combined
 
-    return _walk(spec, chunk, lambda n, so_far: Asker(spec, backend, begun.latency, kept, so_far))
+    def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
+        return Asker(spec, backend, begun.latency, kept, so_far, checks_kept=True)
+
+    return _walk(spec, chunk, asker_of)
 
 
 def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":

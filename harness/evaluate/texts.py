@@ -57,11 +57,19 @@ def refuse_other_kept(
 
     So a run that somebody else began goes on from what its answers say.
     """
-    readers = []
+    readers, delays_s = [], {0.0}
     for agent in agents:
+        if agent.card.failures:
+            delays_s |= {agent.card.failures.slow_s, 2 * agent.card.failures.slow_s}
         divides = agent.sums == "divide"
         readers.append(_Reader(agent.prompt, actions, agent.answer, agent.thinking, divides))
     for answer in answers:
+        if answer.slow_s not in delays_s:
+            raise UserError(
+                f"{printable(file)}: answer {printable(answer.id)} states a delay of "
+                f"{answer.slow_s:g} s, which no card of this run declares; delete its folder and "
+                "start again"
+            )
         others = [_other(answer, reader.read(answer)) for reader in readers]
         if all(others):
             raise UserError(

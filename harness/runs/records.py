@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
 
 from harness.coordination.operating_point import OperatingPoint, questions
-from harness.core.config import Seconds, convert
+from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
 from harness.runs.devices import Device, Speed
@@ -17,6 +17,8 @@ from harness.world import scenarios
 from harness.world.parameters import DIALS
 from harness.world.scenario import Scenario
 
+Measured = Annotated[float, Meta(ge=0, description="seconds, 0 or more")]
+Share = Annotated[float, Meta(ge=0, le=1.001, description="a share, 0 to 1")]  # up to rounding
 PLAIN_ROLES = ("ego", "helper", "merge")  # `merge` is the ego's fusion call
 Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  # one of `roles`
 
@@ -53,9 +55,9 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
     raw: str
     status: str
     finish_reason: str
-    prompt_tokens: int | None
-    completion_tokens: int | None
-    seconds: float | None
+    prompt_tokens: Whole | None
+    completion_tokens: Whole | None
+    seconds: Measured | None
     slow_s: float
 
 
@@ -72,13 +74,13 @@ class Answer(Struct, frozen=True, kw_only=True):
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
     finish_reason: str  # `stop`, `length`, `refusal` or `error`
     error: str | None  # the engine's message; None if it answered
-    prompt_tokens: int | None  # tokens in; None if the engine has no tokenizer
-    completion_tokens: int | None  # tokens out; None if the engine has no tokenizer
+    prompt_tokens: Whole | None  # tokens in; None if the engine has no tokenizer
+    completion_tokens: Whole | None  # tokens out; None if the engine has no tokenizer
     # time of this answer if its request was alone in the engine; None otherwise
-    seconds: float | None
-    batch_size: int  # how many requests went through the engine together
-    label_mass: float | None  # probability of all letters together in a read-out; None otherwise
-    retries: int  # failed attempts before this one
+    seconds: Measured | None
+    batch_size: Whole  # how many requests went through the engine together
+    label_mass: Share | None  # probability of all letters together in a read-out; None otherwise
+    retries: Whole  # failed attempts before this one
     cached: bool  # whether it comes from the completion cache
     slow_s: float  # declared seconds that it takes beyond its card's latency
     prompt_sha256: str  # digest of the chat messages
@@ -92,15 +94,15 @@ class Answer(Struct, frozen=True, kw_only=True):
     detail: str  # one sentence for people
     # time to the first token, prefill included; None if `seconds` is None, if it is unknown, or
     # after a repair turn
-    first_token_s: float | None = None
+    first_token_s: Measured | None = None
     # time of each token after the first; None if `first_token_s` is None or no token follows
-    token_s: float | None = None
+    token_s: Measured | None = None
     first: FirstTurn | UnsetType = UNSET  # the answer before a repair turn; unset without one
     # digest of the pixels of the picture in its prompt; unset without one
     image_sha256: str | UnsetType = UNSET
     # how much of a read-out over several orders of its letters follows the letter, 0 to 1; unset
     # where the letters were read once, like the next
-    letter_share: float | UnsetType = UNSET
+    letter_share: Share | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET  # whether one letter is the likeliest in every order
     # whether the likeliest action changed when the list of actions was reversed; unset where that
     # was not asked, or got no answer
@@ -160,17 +162,17 @@ class AnswerFacts(Struct, frozen=True):
     role: Role
     verdict: Literal["strict", "recovered", "failed"]
     repairs: tuple[str, ...]
-    prompt_tokens: int | None
-    completion_tokens: int | None
-    seconds: float | None
-    label_mass: float | None
-    retries: int
+    prompt_tokens: Whole | None
+    completion_tokens: Whole | None
+    seconds: Measured | None
+    label_mass: Share | None
+    retries: Whole
     cached: bool
     error: str | None
-    first_token_s: float | None = None
-    token_s: float | None = None
+    first_token_s: Measured | None = None
+    token_s: Measured | None = None
     first: FirstTurn | UnsetType = UNSET
-    letter_share: float | UnsetType = UNSET
+    letter_share: Share | UnsetType = UNSET
     follows_letter: bool | UnsetType = UNSET
     flipped: bool | UnsetType = UNSET
 

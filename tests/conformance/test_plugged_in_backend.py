@@ -87,6 +87,7 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
     assert "--device cpu: echo-1 has no weights here" in harness(*asked, "--device", "cpu")[2]
 
 
+PROXY = cards.load("proxy")
 REQUEST = Request("00001-0/v1", "ego", ({"role": "user", "content": "?"},), ("STAY", "GO"), 9)
 DONE = Completion(REQUEST.id, "{}", 3, 1, "stop", None, 1)
 
@@ -115,26 +116,27 @@ def stopped(request: Request) -> Any:
 @pytest.mark.parametrize(
     ("answers", "said"),
     [
-        (stopped, r"engine echo fails \(StopIteration at .*"),
-        (lambda request: None, "engine echo fails .*'NoneType' object is not iterable"),
+        (stopped, r"engine proxy fails \(StopIteration at .*"),
+        (lambda request: None, "engine proxy fails .*'NoneType' object is not iterable"),
         (lambda request: [], "it gives 0 answers to 1 requests"),
         (lambda request: ["{}"], "it gives a str and no Completion"),
         (other(request_id="00002-0/v1"), "request_id is '00002-0/v1'; give answers in the order"),
-        (other(text=5), "engine echo fails .*'int' object has no attribute 'isascii'"),
+        (other(text=5), "engine proxy fails .*'int' object has no attribute 'isascii'"),
         (other(text="a" * (MOST_CHARS + 1)), "text = .*; allowed: a text of at most 4194304 char"),
         (other(slow_s=-100.0), "slow_s = -100.0; allowed: seconds, 0 or more, at most 3600"),
+        (other(slow_s=3000.0), "slow_s is 3000, which its card does not declare"),
         (other(seconds=math.nan), "seconds = nan; allowed: seconds"),
         (other(prompt_tokens=-5), "prompt_tokens = -5; allowed: a whole number, 0 or more"),
         (other(completion_tokens=10**30), "completion_tokens = 1000"),
         (other(label_mass="x"), "label_mass = 'x'; allowed: a number"),
         (other(letter_share=99.0), "letter_share = 99.0; allowed: a number from 0 to 1"),
-        (other(finish_reason="done"), "unknown finish_reason in engine echo, answer 00001-0/v1"),
+        (other(finish_reason="done"), "unknown finish_reason in engine proxy, answer 00001-0/v1"),
         (other(error="busy"), "an error has finish_reason error, and nothing else has"),
     ],
 )
 def test_answers_that_cannot_be_are_one_line(answers: Callable[[Request], Any], said: str) -> None:
     with pytest.raises(UserError, match=said):
-        EngineOfPackage(Engine(answers), "echo").complete([REQUEST])
+        EngineOfPackage(Engine(answers), PROXY).complete([REQUEST])
 
 
 def test_what_it_does_to_requests_and_answers_stays_its_own() -> None:
@@ -143,7 +145,7 @@ def test_what_it_does_to_requests_and_answers_stays_its_own() -> None:
         object.__setattr__(request, "id", "other")
         return [DONE]
 
-    [done] = EngineOfPackage(Engine(greedy), "echo").complete([REQUEST])
+    [done] = EngineOfPackage(Engine(greedy), PROXY).complete([REQUEST])
     assert done == DONE
     assert done is not DONE
     assert (REQUEST.id, REQUEST.messages[0]["content"]) == (DONE.request_id, "?")
@@ -151,13 +153,13 @@ def test_what_it_does_to_requests_and_answers_stays_its_own() -> None:
 
 def test_an_error_without_a_reason_has_one() -> None:
     engine = Engine(other(error="", finish_reason="error"))
-    [done] = EngineOfPackage(engine, "echo").complete([REQUEST])
+    [done] = EngineOfPackage(engine, PROXY).complete([REQUEST])
     assert done.error == SILENT
 
 
 def test_an_identity_that_is_none_is_one_line() -> None:
-    with pytest.raises(UserError, match=r"engine echo fails .*its identity is a list and no dict"):
-        EngineOfPackage(Engine(stopped), "echo").identity()
+    with pytest.raises(UserError, match=r"engine proxy fails .*its identity is a list and no dict"):
+        EngineOfPackage(Engine(stopped), PROXY).identity()
 
 
 @pytest.mark.parametrize(
