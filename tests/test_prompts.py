@@ -377,6 +377,7 @@ def test_reasons_before_the_answer_are_a_repair_only_if_the_prompt_did_not_ask(
         )
         told[request.id.partition("/")[2]] = answer_of(request, said)
     fused = fusion_request(spec, scene, told, scene.viewers[1:])
+    assert fused.view is scene.graphs[scene.viewers[0]]
     told["merge"] = answer_of(fused, Completion(fused.id, ego, None, None, "stop", None, 1))
     assert {(a.role, a.status) for a in told.values()} == {
         ("ego", of_ego), ("helper", of_helper), ("merge", of_ego),

@@ -141,16 +141,20 @@ def fusion_request(
 
     With a `graph`, the ego is asked with this one instead of its own.
     """
-    own, heard = scene.graphs[scene.viewers[0]], messages_of(answers, senders, spec.actions)
+    heard = messages_of(answers, senders, spec.actions)
     scenario, index = spec.scenario_of(scene), spec.agent(scene.agent)
     agent, words = spec.agents[index], scenario.prompt_words
     image = picture(spec, index, scene, scene.viewers[0])
-    blank = _blank(spec, index, "ego").alike(id=fusion_id(scene, senders), image=image)
-    if graph is None:
-        return blank.alike(**agent.chats(own, spec.actions, words, heard))
     truth = truth_graph(scenario, scene.state) if agent.card.privileged else None
-    blank = blank.alike(view=graph, truth=truth, scenario=scenario)
-    return blank.alike(**agent.chats(graph, spec.actions, words, heard))
+    view = scene.graphs[scene.viewers[0]] if graph is None else graph
+    return _blank(spec, index, "ego").alike(
+        id=fusion_id(scene, senders),
+        **agent.chats(view, spec.actions, words, heard),
+        image=image,
+        view=view,
+        truth=truth,
+        scenario=scenario,
+    )
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
