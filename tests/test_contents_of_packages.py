@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from evaluating import says, spec_of, walked
+from msgspec.structs import replace as changed
 from packaged import register
 
 from harness.backends.base import Completion, Request
@@ -162,7 +163,12 @@ def test_what_a_content_says_of_itself_is_checked(
 
 def of(content: Content) -> OperatingPoint:
     radio = SimpleNamespace(encoding="json")
-    return cast(OperatingPoint, SimpleNamespace(content=content, radio=radio, physical=None))
+    return cast(
+        OperatingPoint,
+        SimpleNamespace(
+            content=content, radio=radio, physical=None, ask=SimpleNamespace(content="mine")
+        ),
+    )
 
 
 EVERY = np.ones((1, 3))
@@ -188,7 +194,13 @@ def written(given: Any) -> Any:
         (lambda i: replace(i, valid=1.0 * i.valid), "who has nothing to send"),
         (lambda i: replace(i, valid=i.valid[:, :1]), "valid of shape (1, 1)"),
         (lambda i: replace(i, inference_s=0 * i.inference_s), "it changes the ego's time"),
-        (lambda i: replace(i, inference_s=i.inference_s * [1, -1, -1, -1]), "a time below 0"),
+        (
+            lambda i: replace(i, inference_s=i.inference_s * [1, -1, -1, -1]),
+            "times that are not from 0",
+        ),
+        (lambda i: replace(i, inference_s=i.inference_s * [1, 1, np.inf, 1]), "times that are not"),
+        (lambda i: replace(i, inference_s=i.inference_s * [1, 1, np.nan, 1]), "times that are not"),
+        (lambda i: replace(i, inference_s=i.inference_s * [1, 1, 1, 36001]), "from 0 to 3600 s"),
         (lambda i: None, "no attribute 'arrays'"),
     ],
 )
@@ -197,7 +209,7 @@ def test_a_content_says_who_is_able_and_nothing_else(act: Callable[..., Any], to
     some = replace(SAID, valid=np.array([[True, False, True]]))
     with pytest.raises(UserError) as error:
         door.able(of(content), some, None)
-    assert str(error.value).startswith("content Mine fails (")
+    assert str(error.value).startswith("content mine fails (")
     assert told in str(error.value)
 
 
@@ -205,8 +217,9 @@ def test_a_content_says_who_is_able_and_nothing_else(act: Callable[..., Any], to
     ("sizes", "told"),
     [
         (np.full((1, 2), 8.0), "sizes of shape (1, 2)"),
-        (np.full((1, 3), -8.0), "sizes that are no finite numbers of bits"),
-        (np.full((1, 3), np.nan), "sizes that are no finite numbers of bits"),
+        (np.full((1, 3), -8.0), "sizes that are not from 0 to 1e+12 bits"),
+        (np.full((1, 3), np.nan), "sizes that are not from 0"),
+        (np.full((1, 3), 1e300), "sizes that are not from 0"),
         (8.0, "sizes of type float"),
     ],
 )
@@ -219,18 +232,42 @@ def test_sizes_are_numbers_of_bits(sizes: Any, told: str) -> None:
 def test_what_a_call_shows_is_a_graph_of_the_egos_or_a_line(small: Dataset) -> None:
     scene: Scene = small.scenes(small.courses())[0]
     ego, helper = scene.viewers[:2]
-    case = SimpleNamespace(own=scene.graphs[ego])
+    own = scene.graphs[ego]
+    case = SimpleNamespace(own=own)
     for given, told in (
         ([], "0 graphs of 1 cases"),
         (["a graph"], "no graph of the ego's"),
         ([scene.graphs[helper]], "no graph of the ego's"),
+        ([changed(own, nodes=None)], "Expected `array`, got `null`"),
+        ([changed(own, sectors=None)], "Expected `array`, got `null`"),
+        ([changed(own, itself=changed(own.itself, zone_m=np.nan))], "Expected `float`, got `null`"),
+        ([changed(own, ego=None)], "Expected `object`, got `null`"),
+        ([changed(own, role="zork")], "Invalid enum value 'zork'"),
+        ([changed(own, role="helper")], "whose role is another"),
+        ([changed(own, step=-5)], "Expected `int` >= 0"),
+        ([changed(own, step=own.step + 1)], "whose step is another"),
+        ([changed(own, ego=changed(own.ego, speed_mps=99.0))], "whose ego is another"),
     ):
         call = shown(graphs=lambda self, scenario, cases, given=given: given)
         with pytest.raises(UserError, match=told):
             door.graphs(call, small.scenario, [cast(Any, case)])
+    for taken in (own, own.blinded(), None):
+        call = shown(graphs=lambda self, scenario, cases, taken=taken: [taken])
+        assert door.graphs(call, small.scenario, [cast(Any, case)]) == [taken]
     assert door.words(shown(words=lambda self, text: f"{text}\n!"), "Go") == "Go !"
     with pytest.raises(UserError, match="words of type int"):
         door.words(shown(words=lambda self, text: 1), "Go")
+    with pytest.raises(UserError, match=r"^content mine fails .* words of 10001 characters"):
+        door.words(shown(words=lambda self, text: 10001 * text), "G")
+
+
+def test_an_obstacle_is_one_line_or_none() -> None:
+    point, run = of(made(obstacle=lambda self, point, run: run)), cast(Any, "a\nb\x1b[31m")
+    assert door.obstacle(point, run) == "a b\\x1b[31m"
+    assert door.obstacle(point, cast(Any, None)) is None
+    for said in ("", " \n", 5, ["x"]):
+        with pytest.raises(UserError, match="an obstacle that is no text, and not None"):
+            door.obstacle(point, cast(Any, said))
 
 
 def test_the_papers_own_goes_through_no_door() -> None:

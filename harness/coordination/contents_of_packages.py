@@ -10,10 +10,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import json
 
 from harness.coordination.contents import Call, Content
 from harness.coordination.intents import Intents
 from harness.core.arrays import Bools, Floats, Ints, check_shape, numbers, read_only
+from harness.core.config import LONGEST_S
+from harness.core.errors import printable
 from harness.core.strangers import is_ours, worded
 from harness.world.scene_graph import SceneGraph
 
@@ -24,13 +27,22 @@ if TYPE_CHECKING:
     from harness.world.scenario import Scenario
 
 MADE = {"valid", "inference_s", "unasked"}  # what `able` may change
+MOST_BITS = 1e12  # of a reply, which no radio here sends in an hour
+MOST_CHARACTERS = 10_000  # of a helper's words
 
 
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
     """Return why a condition's content cannot be played in a run; None if it can."""
     content = point.content
-    with worded(_named(content), built_in=is_ours(content)):
+    if is_ours(content):
         return content.obstacle(point, run)
+    with worded(_of(point)):
+        said = content.obstacle(point, run)
+        if said is None:
+            return None
+        if not isinstance(said, str) or not said.strip():
+            raise ValueError(f"an obstacle that is no text, and not None: {printable(repr(said))}")
+        return printable(_line(said), 300)
 
 
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
@@ -38,7 +50,7 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
     content = point.content
     if is_ours(content):
         return content.able(point, intents, senders)
-    with worded(_named(content)):
+    with worded(_of(point)):
         made = content.able(point, read_only(intents), read_only(senders))
         after, before = made.arrays(), intents.arrays()
         for name in before.keys() - MADE:
@@ -50,8 +62,10 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
         ready_s = numbers("times", made.inference_s, intents.inference_s.shape)
         if not np.array_equal(ready_s[:, 0], intents.inference_s[:, 0], equal_nan=True):
             raise ValueError("it changes the ego's time")
-        if np.any(ready_s < 0):
-            raise ValueError("a time below 0")
+        fit = (ready_s >= 0) & (ready_s <= LONGEST_S)
+        kept = np.isclose(ready_s, intents.inference_s, rtol=0, atol=0, equal_nan=True)
+        if not np.all(fit | kept):
+            raise ValueError(f"times that are not from 0 to {LONGEST_S:g} s")
         # whose model is not asked for it is not waited for
         unasked = intents.unasked if content.asks_helpers else None
         return replace(intents, valid=made.valid.copy(), inference_s=ready_s, unasked=unasked)
@@ -62,12 +76,12 @@ def bits(point: "OperatingPoint", intents: Intents) -> Floats:
     content, encoding, headers = point.content, point.radio.encoding, point.physical is not None
     if is_ours(content):
         return content.bits(encoding, intents, headers)
-    with worded(_named(content)):
+    with worded(_of(point)):
         given = content.bits(encoding, read_only(intents), headers)
         sizes = numbers("sizes", given, intents.payload_bits.shape)
-        fit = np.isfinite(sizes) & (sizes >= 0)
+        fit = (sizes >= 0) & (sizes <= MOST_BITS)
         if not np.all(fit | ~intents.valid):
-            raise ValueError("sizes that are no finite numbers of bits, 0 or more")
+            raise ValueError(f"sizes that are not from 0 to {MOST_BITS:g} bits")
         return sizes
 
 
@@ -77,27 +91,45 @@ def graphs(
     """Return the ego's graph of each case, by what it has heard."""
     if is_ours(call):
         return call.graphs(scenario, cases)
-    with worded(_named(call)):
+    with worded(_content(call.name)):
         given = list(call.graphs(scenario, cases))
         if len(given) != len(cases):
             raise ValueError(f"{len(given)} graphs of {len(cases)} cases")
-        for graph, case in zip(given, cases, strict=True):
-            if graph is not None and (
-                not isinstance(graph, SceneGraph) or graph.viewer != case.own.viewer
-            ):
-                raise ValueError("it returns what is no graph of the ego's")
-        return given
+        return [_graph(*each) for each in zip(given, cases, strict=True)]
 
 
 def words(call: Call, evidence: str) -> str:
     """Return the line that the prompt shows of a helper's words."""
     if is_ours(call):
         return call.words(evidence)
-    with worded(_named(call)):
+    with worded(_content(call.name)):
         said = call.words(evidence)
         if not isinstance(said, str):
             raise ValueError(f"words of type {type(said).__name__}")
-        return " ".join("".join((said,)).split())
+        if len(line := _line(said)) > MOST_CHARACTERS:
+            raise ValueError(f"words of {len(line)} characters, more than {MOST_CHARACTERS}")
+        return line
+
+
+def _graph(given: object, case: "Heard") -> SceneGraph | None:
+    """Return a graph that a package gave as one that a file may have.
+
+    Raises ValueError or TypeError unless it is the ego's of this case, or None.
+    """
+    if given is None:
+        return None
+    if not isinstance(given, SceneGraph):
+        raise TypeError("it returns what is no graph of the ego's")
+    graph, own = json.decode(json.encode(given), type=SceneGraph), case.own
+    for name in ("viewer", "role", "step", "ego"):
+        if getattr(graph, name) != getattr(own, name):
+            raise ValueError(f"it returns what is no graph of the ego's, whose {name} is another")
+    return graph
+
+
+def _line(text: str) -> str:
+    """Return a text, which may be of a package's class, as a plain one of one line."""
+    return " ".join("".join((text,)).split())
 
 
 def _could(content: Content, intents: Intents) -> Bools:
@@ -105,5 +137,9 @@ def _could(content: Content, intents: Intents) -> Bools:
     return intents.valid if content.asks_helpers else np.isfinite(intents.range_m)
 
 
-def _named(thing: object) -> str:
-    return f"content {type(thing).__name__}"
+def _of(point: "OperatingPoint") -> str:
+    return _content(point.ask.content)
+
+
+def _content(name: str) -> str:
+    return f"content {printable(name)}"
