@@ -5,6 +5,7 @@ copied.
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -20,7 +21,8 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links
 from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import broadcast, delivered
 from harness.world import scenarios
-from harness.world.scenario import Layout, Spawn
+from harness.world.scenario import Layout, Scenario, Spawn
+from harness.world.state import Building
 
 P = np.full((2, 2), 0.5)
 HEARD = np.ones((2, 1), dtype=bool)
@@ -178,6 +180,11 @@ def ego(**changes: Any) -> Layout:
     return replace(LAYOUT, spawns=(replace(EGO, **changes), *LAYOUT.spawns[1:]))
 
 
+def built(**changes: Any) -> Layout:
+    walls = {"west_m": -9.0, "north_m": -9.0, "east_m": -5.0, "south_m": -5.0}
+    return replace(LAYOUT, buildings=(Building("b1", **{**walls, **changes}),))
+
+
 def cleared(act: Callable[[Any], Any]) -> Any:
     scenario = replace(SCENARIO, cleared=lambda xy_m, approaches, parameters: act(xy_m))
     return scenario.cleared(XY_M, APPROACHES, scenario.parameters)
@@ -193,7 +200,14 @@ def cleared(act: Callable[[Any], Any]) -> Any:
         (lambda: laid(replace(LAYOUT, buildings=(1,))), "layout gives a int and no Building"),
         (lambda: laid(replace(LAYOUT, danger="zork")), "layout has danger zork of v3, and no such"),
         (lambda: laid(replace(LAYOUT, danger_id=None)), "layout has danger west of None"),
-        (lambda: laid(ego(arc_m=np.nan)), "v1 has nan as a place"),
+        (lambda: laid(ego(arc_m=np.nan)), "v1 has arc_m nan, not from -1000 to 1000"),
+        (lambda: laid(ego(arc_m=1e9)), "v1 has arc_m 1000000000.0, not from -1000 to 1000"),
+        (lambda: laid(ego(speed_mps=1e6)), "v1 has speed_mps 1000000.0, not from 0 to 200"),
+        (lambda: laid(ego(speed_mps=-30.0)), "v1 has speed_mps -30.0, not from 0 to 200"),
+        (lambda: laid(ego(speed_mps="5")), "v1 has speed_mps '5', not from 0 to 200"),
+        (lambda: laid(ego(brakes_at_s=np.inf)), "v1 has brakes_at_s inf, not from 0 to 20000"),
+        (lambda: laid(ego(brakes_mps2=1e9)), "v1 has brakes_mps2 1000000000.0, not from 0 to 200"),
+        (lambda: laid(built(east_m=np.nan)), "b1 has east_m nan, not from -1000 to 1000"),
         (lambda: laid(ego(route="left")), "v1 is on south, left, no path of the road"),
         (lambda: laid(ego(kind="tank")), "ValidationError: Invalid enum value 'tank'"),
         (lambda: laid(ego(id="zork")), "ValidationError: Expected `str` matching regex"),
@@ -218,6 +232,34 @@ def test_what_a_scenario_returns_is_held_to_what_it_must_be(
         ask()
     assert str(error.value).startswith(f"scenario {SCENARIO.name} fails (")
     assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "says"),
+    [
+        (replace(SCENARIO, name="other"), "its name is 'other'"),
+        (replace(SCENARIO, parameters=cast(Any, 5)), "its parameters are no Parameters"),
+        (replace(SCENARIO, description=""), "its description is no text"),
+        (replace(SCENARIO, words={"task": cast(Any, 5)}), "its words hold what is no text"),
+        (replace(SCENARIO, one_sided=cast(Any, 5)), "one_sided is no text"),
+        (replace(SCENARIO, dials=("zork",)), "its dial 'zork' is no parameter"),
+        (replace(SCENARIO, actions=()), "its actions are (), and not SLOWER, IDLE, FASTER, with"),
+        (replace(SCENARIO, actions=("ZORK",)), "its actions are ('ZORK',), and not SLOWER"),
+        (replace(SCENARIO, actions=(*SCENARIO.actions, "IDLE")), "or one is there twice"),
+        (replace(SCENARIO, actions=cast(Any, 5)), "its actions are no tuple"),
+    ],
+)
+def test_what_a_scenario_says_of_itself_is_checked(
+    scenario: Scenario, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = SimpleNamespace(value="packages:MINE", load=lambda: scenario)
+    monkeypatch.setattr(scenarios.PLUG_INS, "_entries", lambda: {SCENARIO.name: entry})
+    with pytest.raises(UserError) as error:
+        scenarios.PLUG_INS[SCENARIO.name]
+    named = f"plug-in '{SCENARIO.name}' (swarmdrive.scenarios) fails (ValueError: "
+    assert str(error.value).startswith(named)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ stumble over.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,21 @@ from harness.core.arrays import Bools, Floats, Texts, check_shape, read_only
 from harness.core.errors import printable
 from harness.core.strangers import worded
 from harness.world.fields import Kind, Number, Part, VehicleId
+from harness.world.parameters import BOUNDS
 from harness.world.road import Ground, PathKey, Road
 from harness.world.scenario import Layout, Scenario, Seat, Spawn
 from harness.world.state import Building
+
+# What numbers of a layout may be at least and at most, as parameters may; whoever is parked has
+# speed 0.
+SPAWNED = {
+    "arc_m": BOUNDS["_m"],
+    "speed_mps": BOUNDS["_mps"],
+    "brakes_at_s": BOUNDS["_s"],
+    "brakes_mps2": BOUNDS["_mps2"],
+    "brakes_to_mps": BOUNDS["_mps"],
+}
+BUILT = dict.fromkeys(("west_m", "north_m", "east_m", "south_m"), BOUNDS["_m"])
 
 
 @dataclass(frozen=True)
@@ -145,7 +158,7 @@ def _seats(door: _SeatsDoor) -> Mapping[PathKey, Seat]:
 def _check_layout(layout: Layout, road: Road) -> None:
     """Raise ValueError or TypeError for a layout that no episode can begin with."""
     for building in layout.buildings:
-        _instance("layout", building, Building)
+        _check_numbers(_instance("layout", building, Building), BUILT)
     ids = list[str]()
     for spawn in layout.spawns:
         _check_spawn(_instance("layout", spawn, Spawn), road)
@@ -168,6 +181,15 @@ def _check_spawn(spawn: Spawn, road: Road) -> None:
         convert(value, kind)
     if (spawn.approach, spawn.route) not in road.paths:
         raise ValueError(f"{spawn.id} is on {spawn.approach}, {spawn.route}, no path of the road")
-    for number in (spawn.arc_m, spawn.speed_mps, spawn.brakes_at_s or 0.0, spawn.brakes_mps2):
-        if not np.isfinite(number):
-            raise ValueError(f"{spawn.id} has {number} as a place, speed, time or braking")
+    _check_numbers(spawn, SPAWNED)
+
+
+def _check_numbers(thing: Spawn | Building, bounds: Mapping[str, tuple[float, float]]) -> None:
+    """Raise ValueError for a number, by name, that is not within its bounds."""
+    for name, (least, most) in bounds.items():
+        value = getattr(thing, name)
+        if value is None and name == "brakes_at_s":  # it does not brake by itself
+            continue
+        if not (isinstance(value, Real) and least <= float(value) <= most):
+            shown = printable(repr(value))
+            raise ValueError(f"{thing.id} has {name} {shown}, not from {least:g} to {most:g}")
