@@ -18,8 +18,6 @@ COMMANDS = {
     "plan": "plan",
     "report": "report",
     "study sweep": "sweep",
-    "study schedule compare": "schedule:compare",
-    "study schedule learn": "schedule:learn",
     "run ls": "runs:ls",
     "run check": "runs:check",
     "run merge": "runs:merge",
@@ -51,8 +49,7 @@ COMMANDS = {
 }
 
 GROUPS = {
-    "study": "Vary settings: sweeps, schedules.",
-    "study schedule": "Compare schedules (whom to ask, and when), or learn one.",
+    "study": "Vary settings of finished runs.",
     "run": "List finished runs; check, merge or export them.",
     "model": "List and download models; list on-board computers.",
     "model device": "List on-board computers, show or check one, or measure energy.",
@@ -72,7 +69,6 @@ PANELS = {
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.
 OLD = {
     "sweep": "study sweep",
-    "schedule": "study schedule",
     "ls": "run ls",
     "merge": "run merge",
     "export": "run export",

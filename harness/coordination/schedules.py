@@ -2,8 +2,8 @@
 and those that packages add.
 
 A file holds a small network, which says what asking a helper is worth from what the ego knows
-before, and what it was learnt from; `harness study schedule learn` writes it. A package adds a
-schedule by an entry point in the group `swarmdrive.schedules`.
+before, and what it was learnt from. A package adds a schedule by an entry point in the group
+`swarmdrive.schedules`.
 """
 
 import math

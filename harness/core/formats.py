@@ -10,5 +10,4 @@ SUITE = "suite.json"  # marks a folder that holds a suite's runs
 STUDIES = {
     "sweep": "sweep",
     "repeats": "repeats",
-    "schedule": "schedule",
 }

@@ -37,7 +37,7 @@ def learn(
     It learns from runs on train layouts, and chooses the threshold on tune layouts.
     """
     from harness.coordination.operating_point import named_point
-    from harness.studies.learning import ROUNDS, run_learn
+    from harness.extensions.schedules.learning import ROUNDS, run_learn
     from harness.studies.replayed_run import ReplayedRun
 
     if out.suffix != ".toml":
@@ -95,8 +95,8 @@ def compare(
     the run's folder keeps those answers.
     """
     from harness.coordination.schedules import SCHEDULES
+    from harness.extensions.schedules.study import run_schedules, schedule_study
     from harness.studies.replayed_run import ReplayedRun
-    from harness.studies.schedules import run_schedules, schedule_study
 
     names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
     for name in names:

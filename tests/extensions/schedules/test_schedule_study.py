@@ -27,15 +27,15 @@ from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.outlook import outlook
 from harness.evaluate.table import columns
 from harness.evaluate.walk import walk
+from harness.extensions.schedules.choices import COSTS, Choices, choices
+from harness.extensions.schedules.learning import fit, layouts
+from harness.extensions.schedules.study import Candidate, Compared, Play, _area, compare
 from harness.runs import devices
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.success import Success
 from harness.studies import axes
-from harness.studies.choices import COSTS, Choices, choices
-from harness.studies.learning import fit, layouts
 from harness.studies.replayed_run import ReplayedRun, counted
-from harness.studies.schedules import Candidate, Compared, Play, _area, compare
 
 pytestmark = pytest.mark.usefixtures("unrebuilt", "svg_alone")
 

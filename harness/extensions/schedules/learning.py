@@ -24,7 +24,7 @@ from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
 from harness.dataset import rebuilt
-from harness.studies.choices import Choices, Choose, choices
+from harness.extensions.schedules.choices import Choices, Choose, choices
 from harness.studies.replayed_run import ReplayedRun, counted
 
 UNITS = 12

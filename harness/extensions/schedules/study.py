@@ -25,12 +25,12 @@ from harness.core.figures import DASH, shown, some_of
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
+from harness.extensions.schedules.choices import COSTS, Choices, choices
+from harness.extensions.schedules.learning import layouts
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.runs.leading import BALANCED
 from harness.runs.success import Success
-from harness.studies.choices import COSTS, Choices, choices
-from harness.studies.learning import layouts
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import Study, corrected, p_cell, refuse_other
 from harness.studies.sweep import point_of
