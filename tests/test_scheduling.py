@@ -1,68 +1,30 @@
-"""Whom the ego asks, and when: every schedule played by hand, and what holds for all of them.
-
-One scene throughout. The ego is in doubt: .5, .3, .2, which is 1.0297 nats, and its margin is .2.
-It does not see 80 % of the left region and 40 % of the right. The helpers at 10, 20 and 30 m see,
-of what it does not, 0, 50 and 60 % of the left, and 10, 10 and 40 % of the right.
-"""
+"""Whom the ego asks, and when: the paper's schedule, and what holds for every one."""
 
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from one_scene import ALL, NOBODY, SIXG, asked, draws, same, scene
 from swarm_extras import NEAR
 
-from harness.coordination.exchange import Exchange, exchange
-from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.exchange import exchange
+from harness.coordination.operating_point import POINTS, named_point
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import (
-    Formula,
-    Outlook,
-    Schedule,
-    ScheduleInputs,
-    always,
-    chosen,
-)
+from harness.coordination.scheduling import Outlook, Schedule, ScheduleInputs, chosen
 from harness.core.errors import UserError
-from harness.radio.channel import Draws
-from harness.radio.fading import Trips
 
-SIXG = POINTS["6g"]
-SURE = (0.98, 0.01, 0.01)
-BUILT_IN = [name for name in SCHEDULES if name in SCHEDULES.built_in]
-EVERY = [*BUILT_IN, "near"]  # which is of `tests/plugin`
-FREE = {name for name in BUILT_IN if SCHEDULES[name].threshold is None}  # no threshold of their own
+NEVER = named_point("6g:schedule=never")
+OURS = [name for name in SCHEDULES if SCHEDULES.is_ours(name)]
+EVERY = [*OURS, "near"]  # which is of `tests/plugin`
+FREE = {name for name in OURS if SCHEDULES[name].threshold is None}  # no threshold of their own
 
 
 @pytest.fixture(autouse=True)
 def plugin(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCHEDULES._loaded, "near", NEAR)
-
-
-def scene(
-    own=(0.5, 0.3, 0.2), range_m=(10.0, 20.0, 30.0), valid=(True, True, True), unseen=(0.8, 0.4)
-):
-    added = np.array([(0.0, 0.1), (0.5, 0.1), (0.6, 0.4)])
-    return Intents(
-        np.array(own), np.full((3, 3), 1 / 3), np.array(valid), np.full(4, 10.0), np.array(range_m),
-        np.full(3, 1000.0), np.full(4, 0.145), outlook=Outlook(np.array(unseen), added, np.array(3.0)),
-    )  # fmt: skip
-
-
-def draws(seed=0, layout=7, step=0, jitter=0.0) -> Draws:
-    trips = Trips(np.array(seed), np.array(layout), np.array(step), 6)
-    return Draws(np.full((3, 2), 0.9), np.full(3, jitter), trips)
-
-
-def asked(point: str, intents: Intents | None = None, at: Draws | None = None) -> list[bool]:
-    return exchange(named_point(point), intents or scene(), at or draws()).asked.tolist()
-
-
-ALL, NOBODY = [True] * 3, [False] * 3
 
 
 @pytest.mark.parametrize(
@@ -73,34 +35,15 @@ ALL, NOBODY = [True] * 3, [False] * 3
         ("6g:tau=1.02", ALL),
         ("6g:max_helpers=1", [True, False, False]),  # the nearest
         ("6g:schedule=never", NOBODY),
-        ("6g:schedule=always", ALL),
-        ("6g:schedule=always,max_helpers=2", [True, True, False]),
-        ("6g:schedule=margin,threshold=0.79", ALL),  # 1 - (.5 - .3) is .8
-        ("6g:schedule=margin,threshold=0.8", NOBODY),
-        ("6g:schedule=risk,threshold=0.82", ALL),  # 1.0297 nats x .8 is .8238
-        ("6g:schedule=risk,threshold=0.83", NOBODY),
-        ("6g:schedule=coverage", [False, True, True]),  # means over both regions: .05, .3, .5
-        ("6g:schedule=coverage,threshold=0.3", [False, False, True]),
-        ("6g:schedule=coverage,threshold=0.01,max_helpers=1", [False, False, True]),
-        ("6g:schedule=deadline,threshold=1.0", ALL),  # .988² x 1.0297 is 1.005
-        ("6g:schedule=deadline,threshold=1.01", NOBODY),
-        # Over v2x replies end at 170, 195 and 220 ms, jitter aside: the third is never in time.
-        ("v2x:schedule=deadline,threshold=0", [True, True, False]),
-        ("v2x:schedule=deadline,threshold=0,window_s=0.16", NOBODY),
         ("single-local", NOBODY),
-        ("single-local:schedule=always", NOBODY),
     ],
 )
 def test_a_schedule_asks_these(point, who):
     assert asked(point) == who
 
 
-def test_a_sure_ego_asks_nobody_but_by_what_it_does_not_see():
-    sure = scene(own=SURE)
-    for name in ("entropy", "margin", "risk", "deadline"):
-        assert asked(f"6g:schedule={name}", sure) == NOBODY
-    assert asked("6g:schedule=coverage", sure) == [False, True, True]
-    assert asked("6g:schedule=risk", scene(unseen=(0.0, 0.0))) == NOBODY
+def test_a_sure_ego_asks_nobody():
+    assert asked("6g", scene(own=(0.98, 0.01, 0.01))) == NOBODY
 
 
 def test_who_is_out_of_the_radius_or_gave_no_answer_is_asked_by_nobody():
@@ -110,62 +53,6 @@ def test_who_is_out_of_the_radius_or_gave_no_answer_is_asked_by_nobody():
         assert not asked(f"6g:schedule={name}{least}", far)[2]
         assert not asked(f"6g:schedule={name}{least}", mute)[2]
         assert asked(f"6g:schedule={name}{least}", scene(valid=(False,) * 3)) == NOBODY
-
-
-def wide(intents: Intents, n: int) -> Intents:
-    """The same decision n times, nowhere."""
-    alike: Any = {f: np.broadcast_to(v, (n, *v.shape)) for f, v in intents.arrays().items()}
-    return replace(intents, **alike, outlook=None)
-
-
-def test_random_asks_in_its_share_of_decisions_whatever_the_channel_draws():
-    """Lots are keyed by seed, layout and step,
-    and a larger share asks wherever a smaller one did.
-    """
-    places = np.array(
-        [(seed, layout, step) for seed in range(5) for layout in range(40) for step in range(6)]
-    )
-    lots = Draws(
-        np.full((1200, 3, 2), 0.9),
-        np.zeros((1200, 3)),
-        Trips(places[:, 0], places[:, 1], places[:, 2], 6),
-    )
-    point = SIXG.changed(schedule="random")
-
-    def asks(share, at=lots):
-        return exchange(point.changed(threshold=1 - share), wide(scene(), 1200), at).asked.any(
-            axis=1
-        )
-
-    for share in (0.2, 0.5, 1.0):
-        assert asks(share).mean() == pytest.approx(share, abs=0.045)  # 3 standard errors
-    assert not (asks(0.2) & ~asks(0.5)).any()
-    other = replace(lots, link=lots.link * 0.5, jitter=lots.jitter + 0.5)
-    assert (asks(0.5, other) == asks(0.5)).all()
-    for n in range(20):
-        assert exchange(point, scene(), draws(*places[n])).asked.any() == asks(0.5)[n]
-
-
-@pytest.mark.parametrize("profile", ["v2x", "6g"])
-def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, monkeypatch):
-    """The share of 4000 decisions with draws of their own;
-    what is expected looks at none of them.
-    """
-    rng, expected = np.random.default_rng(3), []
-
-    def spied(known: ScheduleInputs) -> np.ndarray:
-        expected.append(known.in_time)
-        return always(known)
-
-    monkeypatch.setitem(SCHEDULES._loaded, "deadline", Formula(spied, 0.0, ("in_time",)))
-    uniforms = Draws(rng.random((4000, 3, 2)), rng.random((4000, 3)))
-    point = OperatingPoint.of("x", profile, window_s=0.196, schedule="deadline")
-    share = exchange(point, wide(scene(), 4000), uniforms).on_time.mean(axis=0)
-    assert expected[0][0] == pytest.approx(share, abs=0.08)  # of 8 imagined jitters
-    assert (expected[0] == expected[0][0]).all()
-
-
-# -- every schedule --------------------------------------------------------------------------------
 
 
 def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> ScheduleInputs:
@@ -231,27 +118,15 @@ def test_of_those_worth_it_the_most_worth_are_asked_and_of_equals_the_nearest(
 
 
 @given(arrays(float, 3, elements=st.floats(0.001, 1)), st.floats(0, 1.2))
-def test_always_is_entropy_at_a_threshold_of_0_where_there_is_any_entropy(shares, tau):
+def test_an_ego_above_tau_asks_all_and_one_below_it_nobody(shares, tau):
     intents = scene(own=tuple(shares / shares.sum()))
-    everybody = exchange(named_point("6g:schedule=always"), intents, draws())
-    at_zero = exchange(SIXG.changed(tau_nats=0.0), intents, draws())
-    assert same(everybody, at_zero)
+    everybody = exchange(SIXG.changed(tau_nats=0.0), intents, draws())
     paper = exchange(SIXG.changed(tau_nats=tau), intents, draws())
     assert same(paper, everybody if paper.entropy_nats > tau else exchange(NEVER, intents, draws()))
 
 
-NEVER = named_point("6g:schedule=never")
-
-
-def same(a: Exchange, b: Exchange) -> bool:
-    return all(
-        np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=True)
-        for f in fields(Exchange)
-    )
-
-
 def test_asking_whom_a_schedule_asks_is_the_same_exchange():
-    for point in (SIXG, POINTS["v2x"], named_point("v2x:schedule=coverage")):
+    for point in (SIXG, POINTS["v2x"]):
         by_schedule = exchange(point, scene(), draws())
         assert same(by_schedule, exchange(point, scene(), draws(), by_schedule.asked))
 
@@ -269,16 +144,8 @@ def test_asking_whom_a_schedule_asks_is_the_same_exchange():
             "threshold is 0.5; it must be left out where schedule is entropy: its is tau_n",
         ),
         (
-            "6g:schedule=always,threshold=0.5",
-            "it must be left out where schedule is always, which has none",
-        ),
-        (
-            "6g:schedule=margin,threshold=-1",
-            "threshold is -1.0; it must be a finite number, 0 or more",
-        ),
-        (
-            "6g:schedule=margin,threshold=x",
-            "threshold is 'x'; it must be a finite number, 0 or more",
+            "6g:schedule=never,threshold=0.5",
+            "it must be left out where schedule is never, which has none",
         ),
     ],
 )
@@ -286,12 +153,3 @@ def test_a_schedule_that_cannot_be_is_one_line(point, says):
     with pytest.raises(UserError, match=says) as error:
         named_point(point)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["coverage", "risk", "random"])
-def test_the_papers_study_has_no_scene_to_look_at(name):
-    nowhere = replace(scene(), outlook=None)
-    with pytest.raises(UserError, match=f"schedule {name} needs vehicles that are somewhere"):
-        exchange(
-            named_point(f"6g:schedule={name}"), nowhere, Draws(np.full((3, 2), 0.9), np.zeros(3))
-        )

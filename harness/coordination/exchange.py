@@ -187,9 +187,8 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
 def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
     """Return who is asked by the point's schedule, `(..., H)`."""
     worth = _worth(point, _with_schedule_needs(point, known, intents, draws))
-    with worded(
-        f"schedule {point.ask.schedule}", built_in=point.ask.schedule in SCHEDULES.built_in
-    ):
+    name = point.ask.schedule
+    with worded(f"schedule {name}", built_in=SCHEDULES.is_ours(name)):
         return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
 
 
@@ -245,7 +244,7 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
 
 def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
     name, shape = point.ask.schedule, known.may_ask.shape
-    if name in SCHEDULES.built_in:
+    if SCHEDULES.is_ours(name):
         return SCHEDULES[name].worth(known)
     with worded(f"schedule {name}"):
         worth = SCHEDULES[name].worth(read_only(known))

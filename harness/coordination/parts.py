@@ -20,6 +20,7 @@ from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.plugins import Plugins
 from harness.core.strangers import is_ours, worded
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -257,6 +258,14 @@ def wrong(key: str, value: object, allowed: str) -> ValueError:
     return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
 
 
+def _lacking(setting: str, name: str, plugins: Plugins[Any]) -> UserError:
+    """Return the error for a name that no plug-in has: whose it is, if its extension is gone."""
+    kind = plugins.group.rpartition(".")[2]
+    if owner := owner_of_plugin(kind, name):
+        return UserError(f"{setting} {printable(name)} is {part_of(owner)}")
+    return unknown(setting, name, plugins)
+
+
 class Ask(Part, frozen=True, kw_only=True):
     """Whom the ego asks, when, and what it hears."""
 
@@ -285,16 +294,14 @@ class Ask(Part, frozen=True, kw_only=True):
 
     def check(self) -> None:
         if self.content not in CONTENTS:
-            if owner := owner_of_plugin("contents", self.content):
-                raise UserError(f"content {printable(self.content)} is {part_of(owner)}")
-            raise unknown("content", self.content, CONTENTS)
+            raise _lacking("content", self.content, CONTENTS)
         if self.schedule == ORACLE:
             raise ValueError(
                 f"schedule {ORACLE} looks at how scenes end; `harness study schedule compare` "
                 f"plays it, and others are {', '.join(SCHEDULES)}"
             )
         if self.schedule not in SCHEDULES:
-            raise unknown("schedule", self.schedule, SCHEDULES)
+            raise _lacking("schedule", self.schedule, SCHEDULES)
         if self.threshold is not None and self.schedule == PAPER:
             raise wrong(
                 "threshold", self.threshold, f"left out where schedule is {PAPER}: its is tau_nats"

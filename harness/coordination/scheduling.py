@@ -1,10 +1,9 @@
 """Schedules: rules for whom the ego asks and when, from what it knows before it asks.
 
-A schedule is one function of `ScheduleInputs` and one entry in `FORMULAS`, or a learnt network
-(`learnt.py`); `schedules.py` has all of them by name. It returns what asking each helper is worth,
-in its own unit. Helpers worth more than the operating point's threshold are asked, up to the number
-that the point allows: those worth the most first, and the nearest first of equals. `entropy` is the
-paper's schedule (Eq. 3).
+A schedule is one function of `ScheduleInputs`; `schedules.py` has all of them by name. It returns
+what asking each helper is worth, in its own unit. Helpers worth more than the operating point's
+threshold are asked, up to the number that the point allows: those worth the most first, and the
+nearest first of equals. `entropy` is the paper's schedule (Eq. 3).
 """
 
 from collections.abc import Callable
@@ -103,72 +102,13 @@ def never(known: ScheduleInputs) -> Floats:
     return np.full((*known.entropy_nats.shape, 1), -np.inf)
 
 
-def always(known: ScheduleInputs) -> Floats:
-    """Every helper is worth asking."""
-    return np.full((*known.entropy_nats.shape, 1), np.inf)
-
-
 def entropy(known: ScheduleInputs) -> Floats:
     """Return the entropy of the ego's intent, in nats (paper Eq. 3)."""
     return known.entropy_nats[..., None]
 
 
-def margin(known: ScheduleInputs) -> Floats:
-    """Return 1 minus the lead of the likeliest action over the next:
-    0 sure, 1 undecided between two.
-    """
-    ranked = np.sort(known.own, axis=-1)
-    lead: Floats = ranked[..., -1] - (ranked[..., -2] if ranked.shape[-1] > 1 else 0.0)
-    return (1.0 - lead)[..., None]
-
-
-def risk(known: ScheduleInputs) -> Floats:
-    """Return the entropy, in nats, times the unseen share of the region that the ego sees least
-    of.
-    """
-    assert known.outlook is not None
-    unseen: Floats = np.max(known.outlook.unseen, axis=-1, initial=0.0)
-    return (known.entropy_nats * unseen)[..., None]
-
-
-def deadline(known: ScheduleInputs) -> Floats:
-    """Return the entropy, in nats, times the probability that the helper's reply arrives in
-    time.
-    """
-    assert known.in_time is not None
-    return np.where(known.may_ask, known.entropy_nats[..., None] * known.in_time, np.nan)
-
-
-def coverage(known: ScheduleInputs) -> Floats:
-    """Return the mean share of the regions that the helper sees and the ego does not.
-
-    This is need times supply at each point of a region,
-    as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
-    """
-    assert known.outlook is not None
-    regions = max(known.outlook.added.shape[-1], 1)
-    return np.where(known.may_ask, np.sum(known.outlook.added, axis=-1) / regions, np.nan)
-
-
-def random(known: ScheduleInputs) -> Floats:
-    """Return a draw in [0, 1), so that the ego asks in a share of 1 minus the threshold of its
-    decisions.
-    """
-    assert known.lot is not None
-    return known.lot[..., None]
-
-
 NEVER = "never"
-FORMULAS = {
-    "entropy": Formula(entropy),
-    NEVER: Formula(never),
-    "always": Formula(always),
-    "margin": Formula(margin, 0.5),
-    "risk": Formula(risk, 0.35, ("outlook",)),
-    "deadline": Formula(deadline, 0.35, ("in_time",), by_presence=True),
-    "coverage": Formula(coverage, 0.1, ("outlook",)),
-    "random": Formula(random, 0.5, ("lot",)),
-}
+FORMULAS = {"entropy": Formula(entropy), NEVER: Formula(never)}
 PAPER = "entropy"  # its threshold is tau
 ORACLE = "oracle"  # a bound that only a study of frozen scenes can play
 

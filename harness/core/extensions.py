@@ -184,6 +184,16 @@ def added(group: str) -> Mapping[str, Any]:
     return by_name
 
 
+def shipped(group: str) -> frozenset[str]:
+    """Return the names of the plug-ins of a group that extensions of this distribution add."""
+    return _shipped(group, tuple(sys.path))
+
+
+@cache
+def _shipped(group: str, path: tuple[str, ...]) -> frozenset[str]:
+    return frozenset(name for name, entry in added(group).items() if is_ours(entry))
+
+
 @cache
 def _extensions(path: tuple[str, ...]) -> Mapping[str, Extension]:
     declared = entries(GROUP)

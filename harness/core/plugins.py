@@ -147,6 +147,12 @@ class Plugins(Mapping[str, T], Generic[T]):
             self._loaded[name] = self._load(name)
         return self._loaded[name]
 
+    def is_ours(self, name: str) -> bool:
+        """Return whether a plug-in ships with the harness: none of others has its name."""
+        from harness.core.extensions import shipped
+
+        return name in self.built_in or name in shipped(self.group)
+
     def usable(self) -> dict[str, T]:
         loaded = resources.each(self, self.__getitem__)
         return {
@@ -214,7 +220,7 @@ class Plugins(Mapping[str, T], Generic[T]):
 class FilesAndPlugins(Plugins[T]):
     """Plug-ins that may also be TOML files, shipped or a project's.
 
-    Built-in ones come first, then files, then packages.
+    Those that ship come first, then files, then packages.
     """
 
     folder: str  # kind of resource that the files are, such as `channels`
@@ -225,7 +231,7 @@ class FilesAndPlugins(Plugins[T]):
 
     def file(self, name: str) -> Path | None:
         """Return the file of a plug-in; None if it is not a file."""
-        if name in self.built_in or Path(f"{name}.toml").stem != name:  # a path is no name
+        if self.is_ours(name) or Path(f"{name}.toml").stem != name:  # a path is no name
             return None
         file = resources.find(self.folder, f"{name}.toml")
         return file if os.path.lexists(file) else None

@@ -43,7 +43,7 @@ NUMBERS = {bool: ("true", "false"), int: ("0", "1", "2"), float: ("0", "0.05", "
 WORDS: Mapping[str, Sequence[str]] = {
     "edge": EDGES,
     "encoding": ENCODINGS,
-    "schedule": tuple(SCHEDULES.built_in),
+    "schedule": [name for name in SCHEDULES if SCHEDULES.is_ours(name)],
     "content": tuple(CONTENTS),
     "consensus": names(),
     "fallback": FALLBACKS,

@@ -40,6 +40,7 @@ ROOT = Path(__file__).parents[2]
 OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
+NAMED = ("contents", "schedules")  # kinds of plug-ins that conditions name
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -336,12 +337,13 @@ def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(installed: Installed) 
 def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     """They say what a command or study was part of where its folder is gone."""
     extension = known.extensions()[name]
+    plug_ins = [f"{kind} {each}" for kind in NAMED for each in extension.adds.get(kind, {})]
     assert ENTRIES[known.GROUP][name] == f"{PACKAGES}{name}:EXTENSION"
     for group, names in (
         (known.COMMANDS, [*extension.commands, *extension.spellings, *extension.short]),
         (known.STUDIES, extension.studies),
         (known.NAMES, extension.adds.get("python", {})),
-        (known.PLUG_INS, [f"contents {name}" for name in extension.adds.get("contents", {})]),
+        (known.PLUG_INS, plug_ins),
     ):
         named = {
             key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"
@@ -459,7 +461,7 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
         "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
         "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
-        "named_point('6g:content=objects')):\n    try:\n        "
+        "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
     done = in_the_core(core, tmp_path, code)
@@ -468,6 +470,7 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
         "True",
         *[f"setting calibration=l1 of a condition {of_one}"] * 2,
         "content objects is part of the extension contents, which is not installed",
+        "schedule margin is part of the extension schedules, which is not installed",
     ]
 
 

@@ -10,6 +10,7 @@ import pytest
 from harness.cli.commands import COMMANDS, GROUPS, OLD
 from harness.coordination.contents import CONTENTS
 from harness.coordination.operating_point import more_parts
+from harness.coordination.schedules import SCHEDULES
 from harness.core.extensions import Extension, control_settings, extensions
 from harness.extensions.trust.part import DEFENCES
 
@@ -19,6 +20,7 @@ BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and en
 
 # Names of extensions that the core has for something of its own.
 ORDINARY = {
+    "always": "at every time",
     "attribute": "of a Python object",
     "benchmark": "what a published dataset is tagged as",
     "both": "two things",
@@ -26,6 +28,8 @@ ORDINARY = {
     "closed-loop": "the world that is driven, beside the frozen one",
     "contents": "what messages hold, and suites and pages",
     "controls": "conditions beside which a gain is compared",
+    "coverage": "of risk by confidence, and of intervals",
+    "deadline": "until when a reply is of use",
     "decide": "what vehicles do",
     "environment": "one of highway-env, and a variable of the shell",
     "examples": "what a prompt shows as earlier turns",
@@ -34,6 +38,7 @@ ORDINARY = {
     "history": "of a browser's tab",
     "inspect": "Python's module",
     "learn": "a verb",
+    "margin": "of pages, pictures and gaps",
     "media": "a rule of style sheets",
     "notes": "what is kept beside a scene, and Python's of an exception",
     "objects": "what sensors report, a kind of what messages hold, and JSON's",
@@ -42,8 +47,9 @@ ORDINARY = {
     "pack": "what is sent to another process",
     "paper": "the one whose method this is",
     "proxy": "the rule that stands for a model",
+    "random": "of draws",
     "read-outs": "of a policy from a model's probabilities",
-    "schedule": "who is asked, a kind of plug-ins",
+    "risk": "an answer's level, and errors by confidence",
     "schedules": "a kind of plug-ins, and the folder of their files",
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
@@ -155,6 +161,7 @@ OTHER_THINGS = {
     ("coordination/operating_point.py", "objects"): "whether a call shows what is in the graph",
     ("coordination/operating_point.py", "text"): "of a condition, and of a message's key",
     ("evaluate/asking.py", "text"): "what a model says",
+    ("evaluate/spec.py", "always"): "how a card thinks",
     ("evaluate/spec.py", "objects"): "what a prompt shows",
     ("evaluate/spec.py", "text"): "of a prompt",
     ("evaluate/walk.py", "objects"): "of the world, which lists them",
@@ -181,13 +188,14 @@ def said_in(tree: ast.AST) -> Iterator[str]:
 
 
 def test_what_plays_a_decision_names_no_part_of_an_extension() -> None:
-    """Neither settings of conditions, nor questions to helpers, nor controls, nor contents."""
+    """Neither settings, nor questions to helpers, controls, contents or schedules."""
     kinds = more_parts().values()
     settings = {setting for kind in kinds for setting in kind.__struct_fields__}
     questions = {question.name for kind in kinds for question in kind.questions}
     controls = {setting.partition("=")[2] for setting in control_settings().values()}
     contents = set(CONTENTS) - CONTENTS.built_in.keys()
-    theirs = settings | questions | controls | set(DEFENCES) | contents
+    schedules = set(SCHEDULES) - SCHEDULES.built_in.keys()
+    theirs = settings | questions | controls | set(DEFENCES) | contents | schedules
     named = {
         (path, word)
         for path in LOOP

@@ -1,4 +1,4 @@
-"""Compare whom the ego asks, and when, over stored runs, and learn it from them."""
+"""Let the ego ask otherwise than the paper's does, and compare and learn whom it asks, and when."""
 
 from harness.core.extensions import Extension
 
@@ -13,4 +13,14 @@ EXTENSION = Extension(
     groups={"study schedule": "Compare schedules (whom to ask, and when), or learn one."},
     spellings={"schedule": "study schedule"},
     studies={"schedule": "schedule"},
+    adds={
+        "schedules": {
+            "always": f"{_HERE}.formulas:ALWAYS",
+            "margin": f"{_HERE}.formulas:MARGIN",
+            "risk": f"{_HERE}.formulas:RISK",
+            "deadline": f"{_HERE}.formulas:DEADLINE",
+            "coverage": f"{_HERE}.formulas:COVERAGE",
+            "random": f"{_HERE}.formulas:RANDOM",
+        }
+    },
 )

@@ -95,10 +95,10 @@ def compare(
     the run's folder keeps those answers.
     """
     from harness.coordination.schedules import SCHEDULES
-    from harness.extensions.schedules.study import run_schedules, schedule_study
+    from harness.extensions.schedules.study import in_order, run_schedules, schedule_study
     from harness.studies.replayed_run import ReplayedRun
 
-    names = list(dict.fromkeys(schedule or SCHEDULES.usable()))
+    names = list(dict.fromkeys(schedule or in_order(SCHEDULES.usable())))
     for name in names:
         if name not in SCHEDULES:
             raise unknown("--schedule", name, SCHEDULES)

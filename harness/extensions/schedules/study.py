@@ -6,7 +6,7 @@ and when. A schedule's settings are its threshold and how many helpers it asks a
 setting is best is chosen on tune layouts, where a run on such is given, and reported on others.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
-from harness.coordination.scheduling import ORACLE, PAPER
+from harness.coordination.scheduling import NEVER, ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
@@ -44,7 +44,9 @@ if TYPE_CHECKING:
 RESAMPLES = 2000
 # of decision points that ask nobody, at the thresholds that are tried
 SHARES = np.arange(0.0, 1.0, 0.1)
-NEVER, ALWAYS, RANDOM = "never", "always", "random"
+ALWAYS, RANDOM = "always", "random"
+# Those that stand first in tables and figures, in this order.
+FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 
 
 @dataclass(frozen=True)
@@ -394,6 +396,12 @@ def run_schedules(
     for run in every:
         run.settle()
     return compared
+
+
+def in_order(names: Collection[str]) -> list[str]:
+    """Return names of schedules, those that ship first."""
+    first = [name for name in FIRST if name in names]
+    return [*first, *(name for name in names if name not in FIRST)]
 
 
 def _means(weights: Floats, values: Sequence[Floats]) -> Floats:
