@@ -25,7 +25,7 @@ from shares import SHARES, share_of
 
 from harness import cli
 from harness.cli import shell
-from harness.coordination import operating_point, parts
+from harness.coordination import operating_point, parts, schedules
 from harness.core import extensions, resources
 from harness.dataset import rebuilt
 from harness.dataset.build import build
@@ -234,7 +234,7 @@ def part_noted(extension: str) -> str:
 
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
-    for module in (axes, operating_point, parts):
+    for module in (axes, operating_point, parts, schedules):
         module.__dict__["part_of"] = part_noted
 
 

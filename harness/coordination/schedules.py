@@ -1,168 +1,20 @@
-"""Find schedules by name: formulas, learnt ones in files `schedules/*.toml`,
-and those that packages add.
-
-A file holds a small network, which says what asking a helper is worth from what the ego knows
-before, and what it was learnt from. A package adds a schedule by an entry point in the group
-`swarmdrive.schedules`.
+"""Find schedules by name: the core's, those of extensions and packages,
+and those in files `schedules/*.toml`, which an extension reads.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
-import numpy as np
-
-from harness.coordination.scheduling import FORMULAS, Schedule, ScheduleInputs
-from harness.core.arrays import Floats
-from harness.core.config import between, convert, toml
+from harness.coordination.scheduling import FORMULAS, Schedule
 from harness.core.errors import UserError, printable
-from harness.core.files import read_once, sha256_file
-from harness.core.plugins import FilesAndPlugins, one_of, tuple_of
+from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.files import sha256_file
+from harness.core.plugins import FilesAndPlugins, Plugins, one_of, tuple_of
 
 NEEDS = ("in_time", "outlook", "lot")  # what a schedule may need to know
-FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
-INPUTS = (
-    "entropy",
-    "margin",
-    "most careful",
-    "least careful",
-    "unseen, most",
-    "unseen, mean",
-    "added, most",
-    "added, mean",
-    "range",
-    "helper to zone",
-    "ego to zone",
-    "seconds to zone",
-    "others nearer",
-    "others",
-)
-
-
-@dataclass(frozen=True)
-class Network:
-    """A network with one hidden layer, of F inputs and J units."""
-
-    centre: Floats  # what is subtracted from each input, (F,)
-    scale: Floats  # what each input is then divided by, (F,)
-    into: Floats  # weights from the inputs to the units, (F, J)
-    bias: Floats  # bias of each unit, (J,)
-    out: Floats  # weights from the units to the output, (J,)
-    base: float  # bias of the output
-
-    def __call__(self, inputs: Floats) -> Floats:
-        """Return the output `(...)` for inputs `(..., F)`."""
-        units = np.tanh(((inputs - self.centre) / self.scale) @ self.into + self.bias)
-        return np.asarray(units @ self.out + self.base)
-
-
-@dataclass(frozen=True)
-class Learnt:
-    """A schedule whose worth is the expected gain in success probability from asking only this
-    helper.
-    """
-
-    network: Network
-    threshold: float
-    needs: ClassVar[tuple[str, ...]] = ("outlook",)
-
-    def worth(self, known: ScheduleInputs) -> Floats:
-        """Return the network's output for each helper, `(..., H)`;
-        NaN for one that may not be asked.
-        """
-        return np.where(known.may_ask, self.network(inputs(known)), np.nan)
-
-
-@dataclass(frozen=True)
-class Weights:
-    """A `Network` as a file states it."""
-
-    centre: tuple[float, ...]
-    scale: tuple[Annotated[float, between(1e-6, 1e6)], ...]
-    into: tuple[tuple[float, ...], ...]
-    bias: tuple[float, ...]
-    out: tuple[float, ...]
-    base: float
-
-
-@dataclass(frozen=True)
-class Stated:
-    """The content of a file of `schedules/`."""
-
-    description: str  # one sentence
-    command: str  # the command that made the file
-    learnt_from: tuple[str, ...]  # the runs that it was learnt from, with their layout seeds
-    tuned_on: tuple[str, ...]  # the runs on which the threshold was chosen, with their layout seeds
-    condition: str  # the operating point under which it was learnt
-    threshold: float  # the schedule's threshold
-    inputs: tuple[str, ...]  # the names of the network's inputs, `INPUTS`
-    network: Weights  # the network's weights
-
-    def schedule(self, where: str) -> Learnt:
-        """Return the schedule. Raises UserError for other inputs than `INPUTS`,
-        or weights of other sizes.
-        """
-        f, j = len(INPUTS), len(self.network.bias)
-        shapes = {
-            "centre": (f,),
-            "scale": (f,),
-            "into": (f, j),
-            "bias": (j,),
-            "out": (j,),
-            "base": (),
-        }
-        arrays: dict[str, Any] = {}
-        for name, shape in shapes.items():
-            try:
-                arrays[name] = np.array(getattr(self.network, name), dtype=float)
-            except ValueError:  # rows of several lengths
-                arrays[name] = np.empty(0)
-            if self.inputs != INPUTS or arrays[name].shape != shape:
-                raise UserError(
-                    f"{where} has other inputs or sizes than the program; learn it again"
-                )
-        return Learnt(Network(**arrays), self.threshold)
-
-
-def inputs(known: ScheduleInputs) -> Floats:
-    """Return `INPUTS` for each helper, `(..., H, F)`; arbitrary for one that may not be asked."""
-    outlook, may_ask = known.outlook, known.may_ask
-    assert outlook is not None
-    ranked = np.sort(known.own, axis=-1)
-    regions = max(outlook.unseen.shape[-1], 1)
-    range_m = np.where(may_ask, known.range_m, np.inf)
-    nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
-    ego_inputs = (
-        known.entropy_nats,
-        1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1),
-        known.own[..., 0],
-        known.own[..., -1],
-        outlook.unseen.max(axis=-1, initial=0.0),
-        outlook.unseen.sum(axis=-1) / regions,
-        known.distance_m[..., 0] / FAR_M,
-        np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
-        may_ask.sum(axis=-1) - 1.0,
-    )
-    entropy, margin, careful, bold, unseen_most, unseen, ego_m, to_zone, others = (
-        np.broadcast_to(column[..., None], may_ask.shape) for column in ego_inputs
-    )
-    columns = (
-        entropy,
-        margin,
-        careful,
-        bold,
-        unseen_most,
-        unseen,
-        outlook.added.max(axis=-1, initial=0.0),
-        outlook.added.sum(axis=-1) / regions,
-        known.range_m / FAR_M,
-        known.distance_m[..., 1:] / FAR_M,
-        ego_m,
-        to_zone,
-        nearer,
-        others,
-    )
-    return np.stack(columns, axis=-1)
+# By folder, such as `schedules`, what reads the files in it; only extensions that ship have one.
+READERS = Plugins[Callable[[Any], Schedule]]("swarmdrive.readers", Callable, {})
 
 
 def _is_threshold(value: Any) -> bool:
@@ -180,19 +32,19 @@ class Schedules(FilesAndPlugins[Schedule]):
     }
 
     def read(self, file: Any) -> Schedule:
-        """Return the learnt schedule in a file."""
-        return _read(file)
+        """Return the schedule in a file.
+        Raises UserError if it is wrong, or no extension reads it.
+        """
+        if not READERS.is_ours(self.folder):
+            owner = owner_of_plugin("readers", self.folder)
+            reader = f"is {part_of(owner)}" if owner else "is gone; install the harness again"
+            raise UserError(f"schedule file {printable(file)}: what reads it {reader}")
+        return READERS[self.folder](file)
 
     def file_sha256(self, name: str) -> str | None:
         """Return the digest of the file that holds a schedule; None if it is not in a file."""
         file = self.file(name)
         return sha256_file(file) if file else None
-
-
-@read_once
-def _read(path: Any) -> Learnt:
-    where = f"schedule file {printable(path)}"
-    return convert(toml(path, where), Stated, where).schedule(where)
 
 
 SCHEDULES = Schedules("swarmdrive.schedules", Schedule, FORMULAS)

@@ -25,7 +25,7 @@ from harness.cli.commands import COMMANDS
 from harness.coordination.added_parts import added_parts
 from harness.coordination.operating_point import more_parts
 from harness.core import extensions as known
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.extensions import Extension
 from harness.core.plugins import Plugins
 from harness.core.work import working
@@ -40,7 +40,8 @@ ROOT = Path(__file__).parents[2]
 OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
-NAMED = ("contents", "schedules")  # kinds of plug-ins that conditions name
+# kinds of plug-ins that conditions name, and of what reads their files
+NAMED = ("contents", "schedules", "readers")
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -461,16 +462,21 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
         "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
         "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
-        "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin')):\n    try:\n        "
+        "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin'), "
+        "lambda: named_point('6g:schedule=learnt')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
     done = in_the_core(core, tmp_path, code)
     of_one = "is part of the extension calibration, which is not installed"
+    learnt = f"file {printable(core / 'schedules/learnt.toml')}: what reads it"
     assert done.stdout.splitlines() == [
         "True",
         *[f"setting calibration=l1 of a condition {of_one}"] * 2,
         "content objects is part of the extension contents, which is not installed",
-        "schedule margin is part of the extension schedules, which is not installed",
+        *[
+            f"schedule {what} is part of the extension schedules, which is not installed"
+            for what in ("margin", learnt)
+        ],
     ]
 
 

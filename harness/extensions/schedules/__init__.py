@@ -21,6 +21,7 @@ EXTENSION = Extension(
             "deadline": f"{_HERE}.formulas:DEADLINE",
             "coverage": f"{_HERE}.formulas:COVERAGE",
             "random": f"{_HERE}.formulas:RANDOM",
-        }
+        },
+        "readers": {"schedules": f"{_HERE}.learnt:read"},
     },
 )

@@ -16,7 +16,6 @@ import numpy as np
 
 from harness.coordination.exchange import known_of
 from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.schedules import INPUTS, Learnt, Network, Stated, Weights, inputs
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
@@ -25,6 +24,7 @@ from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, stated
 from harness.dataset import rebuilt
 from harness.extensions.schedules.choices import Choices, Choose, choices
+from harness.extensions.schedules.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
 from harness.studies.replayed_run import ReplayedRun, counted
 
 UNITS = 12

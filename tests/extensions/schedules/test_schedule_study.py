@@ -16,7 +16,7 @@ from relabelling import relabel
 
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, named_point
-from harness.coordination.schedules import SCHEDULES, Learnt
+from harness.coordination.schedules import SCHEDULES
 from harness.core.config import toml
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
@@ -28,8 +28,18 @@ from harness.evaluate.outlook import outlook
 from harness.evaluate.table import columns
 from harness.evaluate.walk import walk
 from harness.extensions.schedules.choices import COSTS, Choices, choices
+from harness.extensions.schedules.formulas import MARGIN
 from harness.extensions.schedules.learning import fit, layouts
-from harness.extensions.schedules.study import Candidate, Compared, Play, _area, compare
+from harness.extensions.schedules.learnt import Learnt
+from harness.extensions.schedules.study import (
+    FIRST,
+    Candidate,
+    Compared,
+    Play,
+    _area,
+    compare,
+    in_order,
+)
 from harness.runs import devices
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
@@ -139,6 +149,19 @@ def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
         ]
         assert asked[0] == asked[1]
         assert sum(asked[0]) > 0
+
+
+def test_what_ships_stands_first_and_no_file_takes_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    assert set(FIRST) == {name for name in SCHEDULES if SCHEDULES.is_ours(name)}
+    assert in_order(["mine", *reversed(FIRST)]) == [*FIRST, "mine"]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / MARKER).touch()
+    (tmp_path / "schedules").mkdir()
+    (tmp_path / "schedules/margin.toml").touch()
+    assert SCHEDULES["margin"] is MARGIN
+    assert SCHEDULES.file_sha256("margin") is None
 
 
 # -- fronts and areas, by hand ---------------------------------------------------------------------
