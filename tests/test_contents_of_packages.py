@@ -100,7 +100,7 @@ def glances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_a_packages_content_is_played(small: Dataset) -> None:
     one = small.of_episodes({0})
     backend = Asked()
-    point = named_point("6g:schedule=always,loss=0,content=glance")
+    point = named_point("6g:tau=0,loss=0,content=glance")
     rows = walked(spec_of(one, points=(point,), seeds=(0,), ask="used"), backend)
     heard = [request for request in backend.asked if "+" in request.id]
     assert heard

@@ -142,7 +142,7 @@ def test_a_run_says_who_decided_and_how_all_of_them_ended(driven: Path) -> None:
 
 def beside_few() -> Spec:
     """Two episodes, in one of which nobody beside the ego decides."""
-    points = named_point("6g"), named_point("6g:schedule=always,content=plan,consensus=auction")
+    points = named_point("6g"), named_point("6g:tau=0,content=plan,consensus=auction")
     source = LiveSource(200_003, 2, "all-way-crossing:agent_share=0.2")
     return replace(live_spec_of(prompt="v4", seeds=(0,)), source=source, points=points)
 

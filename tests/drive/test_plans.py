@@ -25,7 +25,7 @@ from harness.runs import folder
 
 ALL = "all-way-crossing:agent_share=1"
 CAREFUL, STEADY, BOLD = [0.6, 0.3, 0.1], [0.2, 0.7, 0.1], [0.1, 0.2, 0.7]
-PLAN = "6g:schedule=always,content=plan,consensus="
+PLAN = "6g:tau=0,content=plan,consensus="
 
 
 def decided(rule, intents, reaches_s, lost_s=(), heard=None, vehicle=None) -> list[float]:

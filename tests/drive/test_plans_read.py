@@ -24,7 +24,7 @@ from harness.evaluate.walk import Decided, walk
 from harness.prompts import versions
 
 ALL = "all-way-crossing:agent_share=1"
-READS = "6g:schedule=always,content=plan,consensus=ego-prompt"
+READS = "6g:tau=0,content=plan,consensus=ego-prompt"
 Steps = list[Sequence[Decided[Scene]]]
 TWICE = f"{READS},rounds=2,window_s=0.6"
 
