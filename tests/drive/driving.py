@@ -44,7 +44,11 @@ class Script:
 
     def _say(self, request: Request) -> Completion:
         self.asked.append(request.id)
-        p = self.line(request.view.viewer, request.view.step) if request.view else self.fused
+        p = (
+            self.line(request.view.viewer, request.view.step)
+            if "+" not in request.id
+            else self.fused
+        )
         return Completion(request.id, says(p, request.role), None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:

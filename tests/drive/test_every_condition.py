@@ -65,7 +65,8 @@ class Sees:
         return [self._say(request) for request in requests]
 
     def _say(self, request: Request) -> Completion:
-        seen = bool(request.view.nodes) if request.view else "SLOWER" in str(request.messages)
+        told = "+" in request.id and "SLOWER" in str(request.messages)
+        seen = told or bool(request.view.nodes)
         p = (0.6, 0.3, 0.1) if seen else (0.2, 0.5, 0.3)
         return Completion(request.id, says(p, request.role), None, None, "stop", None, 1)
 
