@@ -34,7 +34,7 @@ OTHERS = (
     "<scr<script>ipt>alert(1)</scr</script>ipt>",
     "<ScRiPt>alert(1)</sCrIpT>",
     "\u202e<script>alert(1)</script>\u202c",
-    "<\x00script>alert(1)</script>",
+    "<\x0cscript>alert(1)</script>",
     "<svg><animate onbegin=alert(1) attributeName=x dur=1s>",
     "<math><mtext><style><img src=x onerror=alert(1)>",
     "=cmd|'/c calc'!A0",
