@@ -390,7 +390,7 @@ def test_no_object_can_be_left_out_of_a_picture(
 def test_typed_it_says_what_moves_most_in_eighty_columns(
     harness: Callable[..., Said], small: Dataset, tmp_path: Path
 ) -> None:
-    control = SIXG.changed(name="6g:messages=blind", messages="blind")
+    control = named_point("6g:loss=0,messages=blind")
     run(spec_of(small, limit=2, points=(control, SIXG), seeds=(0,)), tmp_path / "run")
     code, out, _ = harness("study", "attribute", "run", "--sample", "10")
     assert code == 0
@@ -411,8 +411,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
     kept = of_run(folder.read(tmp_path / "run"))
     assert kept
     assert (
-        f"moved the answers at {kept.decision_points} decision points under 6g:messages=blind"
-        in page
+        f"moved the answers at {kept.decision_points} decision points under {control.name}" in page
     )
 
 
