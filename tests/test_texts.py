@@ -44,7 +44,7 @@ def bolder(row: Row) -> None:
 
 
 def test_a_run_as_it_was_made_says_what_its_texts_say(run: Path) -> None:
-    refuse_others(read(run), read(run).answers)
+    refuse_others(read(run))
 
 
 @pytest.mark.parametrize(

@@ -155,6 +155,11 @@ class Card:
     price: Price | None = None  # what its tokens cost; None if it costs nothing, or nobody says
 
     @property
+    def slow_s(self) -> float:
+        """Seconds that some of its answers take longer than its latency, by `failures`; or 0."""
+        return self.failures.slow_s if self.failures else 0.0
+
+    @property
     def shown(self) -> str:
         return f"model {printable(self.name)!r}"
 

@@ -29,7 +29,7 @@ class EngineOfPackage:
 
     def __init__(self, backend: Backend, card: "Card") -> None:
         self._backend, self._what = backend, f"engine {printable(card.engine)}"
-        self._delays_s = {0.0, card.failures.slow_s if card.failures else 0.0}
+        self._delays_s = {0.0, card.slow_s}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         with worded(self._what):

@@ -44,7 +44,7 @@ from harness.evaluate.latency import fusion_s, inference_s
 from harness.evaluate.pictures import picture
 from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
-from harness.evaluate.texts import refuse_other_kept
+from harness.evaluate.texts import ASKED_AGAIN, refuse_other_kept
 from harness.evaluate.walk import Fuses
 from harness.parsing.parse import parse
 from harness.runs.records import (
@@ -347,7 +347,7 @@ class Asker:
             assert self._kept
             raise UserError(
                 f"{printable(self._kept.file)}: answer {printable(request.id)} is to another "
-                "prompt or picture than is asked; delete its folder and start again"
+                f"prompt or picture than is asked; {ASKED_AGAIN}"
             )
         self._unasked.remove(request.id)
 

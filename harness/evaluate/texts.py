@@ -20,11 +20,12 @@ from harness.runs.folder import Run
 from harness.runs.records import Answer, is_helper
 from harness.runs.sources import lacking, prompt_of
 
+ASKED_AGAIN = "delete that file, and its questions are asked again"
 OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
 
 
-def refuse_others(run: Run, more: Iterable[Answer] = ()) -> None:
-    """Raise UserError if an answer of a run, or one `more`, states what its text does not say.
+def refuse_others(run: Run) -> None:
+    """Raise UserError if an answer of a run states what its text does not say.
 
     Also if a prompt of the run is neither here nor kept, so that nothing can be read again.
     """
@@ -44,10 +45,6 @@ def refuse_others(run: Run, more: Iterable[Answer] = ()) -> None:
         reader = readers[msgspec.json.encode(run.agent(answer))]
         if other := _other(answer, reader.read(answer)):
             raise _contradicts(run, answer, other)
-    for answer in more:  # which vehicle of its scene answered only the dataset knows
-        others = [_other(answer, reader.read(answer)) for reader in readers.values()]
-        if all(others) and others[0]:
-            raise _contradicts(run, answer, others[0])
 
 
 def refuse_other_kept(
@@ -57,25 +54,21 @@ def refuse_other_kept(
 
     So a run that somebody else began goes on from what its answers say.
     """
-    readers, delays_s = [], {0.0}
+    readers = []
     for agent in agents:
-        if agent.card.failures:
-            delays_s |= {agent.card.failures.slow_s, 2 * agent.card.failures.slow_s}
         divides = agent.sums == "divide"
         readers.append(_Reader(agent.prompt, actions, agent.answer, agent.thinking, divides))
     for answer in answers:
-        if answer.slow_s not in delays_s:
+        stated = f"{printable(file)}: answer {printable(answer.id)} states"
+        if not any(answer.may_take_longer(agent.card.slow_s) for agent in agents):
             raise UserError(
-                f"{printable(file)}: answer {printable(answer.id)} states a delay of "
-                f"{answer.slow_s:g} s, which no card of this run declares; delete its folder and "
-                "start again"
+                f"{stated} a delay of {answer.slow_s:g} s, which no card of this run declares; "
+                f"{ASKED_AGAIN}"
             )
+        # Which vehicle of its scene answered only the dataset knows.
         others = [_other(answer, reader.read(answer)) for reader in readers]
         if all(others):
-            raise UserError(
-                f"{printable(file)}: answer {printable(answer.id)} states another {others[0]} than "
-                "its text says; delete its folder and start again"
-            )
+            raise UserError(f"{stated} another {others[0]} than its text says; {ASKED_AGAIN}")
 
 
 def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:

@@ -162,14 +162,12 @@ class Run:
     def undeclared_delay(self, answer: Answer) -> str | None:
         """Return, in words, an answer's seconds beyond its card's latency if the card declares none
         such; None if it does.
-
-        Allowed are none, and in each turn the slow tail of a rule.
         """
         failures = self.agent(answer)["model"].get("failures")
         tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
         if not (isinstance(tail_s, int | float) and 0 <= tail_s <= LONGEST_S):
             tail_s = 0.0
-        if answer.slow_s in [turns * tail_s for turns in range(answer.turns + 1)]:
+        if answer.may_take_longer(tail_s):
             return None
         name = printable(answer.id)
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"

@@ -120,6 +120,12 @@ class Answer(Struct, frozen=True, kw_only=True):
         """How many questions it took: 2 with a repair turn."""
         return 2 if self.first else 1
 
+    def may_take_longer(self, tail_s: float) -> bool:
+        """Return whether its seconds beyond the card's latency are those that a card may declare:
+        none, or in each turn the slow tail of a rule, `tail_s`.
+        """
+        return self.slow_s in [turns * tail_s for turns in range(self.turns + 1)]
+
     @property
     def first_status(self) -> str | None:
         return self.first.status if self.first else None

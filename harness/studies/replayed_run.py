@@ -131,8 +131,7 @@ class ReplayedRun:
             self._count_answered,
             self._set_left,
         )
-        added = (answer for name, answer in self.answers.items() if name not in answers)
-        refuse_others(self.run, added)
+        refuse_others(self.run)
 
     def _set_left(self, count: int) -> None:
         self._left = count

@@ -114,7 +114,7 @@ class AnswerChanged:
 
 @dataclass(frozen=True)
 class AnswersHeld:
-    """The answers of both runs to the same questions, held against each other.
+    """The answers of both runs to the same questions, compared.
 
     The same question is the same messages and the same picture. Under another prompt no question is
     the same, and a fusion call is another question as soon as one message in it is another.
