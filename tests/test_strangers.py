@@ -58,6 +58,7 @@ def test_what_does_not_come_back_is_named_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doors, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(doors, "LOOK_S", 0.01)
     monkeypatch.setattr(doors, "_watchers", set())
     for _ in range(2):
         with doors.worded("rule slow of mine"):

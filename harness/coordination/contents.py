@@ -18,7 +18,7 @@ from harness.coordination.intents import Intents
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins
-from harness.core.strangers import aside, is_ours, worded
+from harness.core.strangers import is_ours
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -141,40 +141,32 @@ NO_AGENTS = (
 class Contents(Plugins[Content]):
     """All contents, by name. A package's call has the name of its content."""
 
-    def _load(self, name: str) -> Content:
-        content = super()._load(name)
-        what = f"plug-in {printable(name)!r} ({self.group})"
-        with worded(what, built_in=is_ours(content), door=aside):
-            _check(name, content)
-        return content
-
-
-def _check(name: str, content: Content) -> None:
-    """Raise ValueError for a package's content that says of itself what does not go."""
-    if not NAME.fullmatch(name) or name == WHOLE:
-        raise ValueError("its name is no plain word")
-    holds, needs, call = content.holds, content.needs, content.call
-    if not isinstance(holds, frozenset) or not holds or not holds <= set(KINDS):
-        raise ValueError(f"holds is no frozenset of {', '.join(KINDS)}")
-    for fact in ("asks_helpers", "of_agents"):
-        if getattr(type(content), fact) is not getattr(Content, fact):
-            raise ValueError(f"{fact} follows from what it holds")
-    if not isinstance(needs, tuple) or not set(needs) <= set(NEEDS):
-        raise ValueError(f"needs is no tuple of {', '.join(NEEDS)}")
-    if PLANS in holds and (call or len(holds) > 1):
-        raise ValueError("a message that holds a plan holds nothing else, and has no call")
-    if call is None:
-        if holds.isdisjoint((INTENTS, PLANS)):
-            raise ValueError("it holds nothing that a rule fuses, and has no call")
-        return
-    if not isinstance(call, Call):
-        raise ValueError("its call is no Call")
-    if not is_ours(call) and call.name != name:
-        raise ValueError(f"its call is named {printable(repr(call.name))}")
-    if bool(call.in_graph) == bool(call.in_words):
-        raise ValueError("its call shows what was heard in the graph or in words, one of both")
-    if call.in_words and WORDS not in holds:
-        raise ValueError("its call shows words, and it holds none")
+    def check(self, name: str, plugin: Content) -> None:
+        """Raise ValueError for a package's content that says of itself what does not go."""
+        if not NAME.fullmatch(name) or name == WHOLE:
+            raise ValueError("its name is no plain word")
+        holds, needs, call = plugin.holds, plugin.needs, plugin.call
+        if not isinstance(holds, frozenset) or not holds or not holds <= set(KINDS):
+            raise ValueError(f"holds is no frozenset of {', '.join(KINDS)}")
+        for fact in ("asks_helpers", "of_agents"):
+            if getattr(type(plugin), fact) is not getattr(Content, fact):
+                raise ValueError(f"{fact} follows from what it holds")
+        if not isinstance(needs, tuple) or not set(needs) <= set(NEEDS):
+            raise ValueError(f"needs is no tuple of {', '.join(NEEDS)}")
+        if PLANS in holds and (call or len(holds) > 1):
+            raise ValueError("a message that holds a plan holds nothing else, and has no call")
+        if call is None:
+            if holds.isdisjoint((INTENTS, PLANS)):
+                raise ValueError("it holds nothing that a rule fuses, and has no call")
+            return
+        if not isinstance(call, Call):
+            raise ValueError("its call is no Call")
+        if not is_ours(call) and call.name != name:
+            raise ValueError(f"its call is named {printable(repr(call.name))}")
+        if bool(call.in_graph) == bool(call.in_words):
+            raise ValueError("its call shows what was heard in the graph or in words, one of both")
+        if call.in_words and WORDS not in holds:
+            raise ValueError("its call shows words, and it holds none")
 
 
 CONTENTS = Contents(

@@ -4,21 +4,19 @@ import os
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from threading import Timer
 from typing import Any, ClassVar, Generic, TypeVar
 
 from harness.core import resources
 from harness.core.errors import UserError, one_line, printable
-from harness.core.strangers import aside
+from harness.core.strangers import aside, watched, worded
 
 T = TypeVar("T")
 Said = TypeVar("Said")
 # whether a value is one that a plug-in may state, and which are, in words
 Allowed = tuple[Callable[[Any], bool], str]
-SAID_S = 3.0  # after which a line says which package a command waits for
+LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
 def entries(group: str) -> Mapping[str, Any]:
@@ -76,21 +74,6 @@ def is_ours(entry: Any) -> bool:
 def say_once(line: str) -> None:
     """Print a line on stderr, once."""
     print(f"harness: {line}", file=sys.stderr)
-
-
-@contextmanager
-def _waiting(what: str, entry: Any) -> Iterator[None]:
-    """Say what a command waits for if a package takes long to load: nothing can stop that."""
-    if is_ours(entry):
-        yield
-        return
-    timer = Timer(SAID_S, say_once, [f"waiting for {what}, which loads"])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def texts(said: Any, what: str = "its answer") -> list[str]:
@@ -196,7 +179,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         what = f"plug-in {printable(name)!r} ({self.group}): {printable(entry.value)}"
         repair = "repair or uninstall the package that registers it"
         try:
-            with _waiting(what, entry), aside(what):
+            with watched(what, LOADING_S), aside(what):
                 plugin: T = entry.load()
                 # A class has the methods of its instances, and would pass the check of a protocol.
                 is_class = isinstance(plugin, type) and self.kind is not object
@@ -214,7 +197,12 @@ class Plugins(Mapping[str, T], Generic[T]):
                 raise UserError(
                     f"{what} has {field} {printable(repr(value))}; allowed: {allowed}; {repair}"
                 )
+        with worded(f"plug-in {printable(name)!r} ({self.group})", is_ours(entry), aside):
+            self.check(name, plugin)
         return plugin
+
+    def check(self, name: str, plugin: T) -> None:
+        """Raise an error for a package's plug-in that says of itself what does not go."""
 
 
 class FilesAndPlugins(Plugins[T]):

@@ -20,16 +20,19 @@ from harness.core.errors import UserError, printable
 from harness.core.process import Stop
 
 PATIENCE_S = 20.0  # after which a line says what a command waits for
-_calls: dict[object, tuple[str, float]] = {}  # what runs now, and since when
+LOOK_S = 1.0  # between two looks at what runs
+_calls: dict[object, tuple[str, float, float]] = {}  # what runs now, since when, for how long
 _said: set[str] = set()
 _watchers: set[int] = set()  # processes with a thread that watches
 
 
 @contextmanager
-def watched(what: str) -> Iterator[None]:
-    """Run code; a line on stderr says it, once, if that takes longer than `PATIENCE_S`."""
+def watched(what: str, patience_s: float | None = None) -> Iterator[None]:
+    """Run code; a line on stderr says it, once, if that takes longer than `patience_s`, in
+    seconds, or than `PATIENCE_S`.
+    """
     call = object()
-    _calls[call] = what, time.monotonic()
+    _calls[call] = what, time.monotonic(), patience_s or PATIENCE_S
     if os.getpid() not in _watchers:
         _watchers.add(os.getpid())
         threading.Thread(target=_watch, daemon=True).start()
@@ -41,11 +44,11 @@ def watched(what: str) -> Iterator[None]:
 
 def _watch() -> None:
     while True:
-        time.sleep(PATIENCE_S / 10)
-        for what, since_s in list(_calls.values()):
-            if what not in _said and time.monotonic() - since_s > PATIENCE_S:
+        time.sleep(LOOK_S)
+        for what, since_s, patience_s in list(_calls.values()):
+            if what not in _said and time.monotonic() - since_s > patience_s:
                 _said.add(what)
-                line = f"{what} has not come back for {PATIENCE_S:g} s; Ctrl-C ends the command"
+                line = f"{what} has not come back for {patience_s:g} s; Ctrl-C ends the command"
                 print(f"harness: {line}, which goes on when it is typed again", file=sys.stderr)
 
 

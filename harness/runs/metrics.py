@@ -154,18 +154,16 @@ class Metrics(Plugins[Metric]):
     def __iter__(self) -> Iterator[str]:
         return iter({**self.own, **self._entries()})
 
-    def _load(self, name: str) -> Metric:
-        metric = super()._load(name)
-        functions = [each for each in (metric.decisions, metric.episodes) if each]
-        if metric.name != name or not name.isidentifier() or len(functions) != 1 or metric.primary:
+    def check(self, name: str, plugin: Metric) -> None:
+        functions = [each for each in (plugin.decisions, plugin.episodes) if each]
+        if plugin.name != name or not name.isidentifier() or len(functions) != 1 or plugin.primary:
             raise UserError(
                 f"plug-in {printable(name)!r} ({self.group}) is the metric "
-                f"{printable(metric.name)!r} with {len(functions)} "
-                f"functions{', a primary one' * metric.primary}; give it the name of its entry "
+                f"{printable(plugin.name)!r} with {len(functions)} "
+                f"functions{', a primary one' * plugin.primary}; give it the name of its entry "
                 "point, of letters, digits and _, and one function, of decisions or of episodes; "
                 "a package's metric is not primary"
             )
-        return metric
 
 
 def _rate(

@@ -632,10 +632,12 @@ def test_a_plug_in_of_an_extension_with_the_name_of_a_built_in_one_is_left_out(
 def test_a_package_that_takes_long_to_load_is_named(
     installed: Installed, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.core.plugins.SAID_S", 0.05)
+    monkeypatch.setattr("harness.core.plugins.LOADING_S", 0.05)
+    monkeypatch.setattr("harness.core.strangers.LOOK_S", 0.01)
+    monkeypatch.setattr("harness.core.strangers._watchers", set())
     installed(odd="__import__('time').sleep(0.2)")
     assert "odd" not in known.extensions()
     assert (
-        "waiting for plug-in 'odd' (swarmdrive.extensions): of_others:ODD, which loads"
+        "plug-in 'odd' (swarmdrive.extensions): of_others:ODD has not come back for 0.05 s"
         in capsys.readouterr().err
     )

@@ -17,7 +17,6 @@ from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.plugins import Plugins
-from harness.core.strangers import aside, worded
 from harness.world.environments import environment
 from harness.world.parameters import LATER, SCENES, SUITES, Parameters
 from harness.world.scenario import Scenario
@@ -28,35 +27,28 @@ FURTHER = ("LANE_LEFT", "LANE_RIGHT")  # actions that the simulator knows beside
 class PackagesScenarios(Plugins[Scenario]):
     """Scenarios of packages, by name, whose facts are checked where they are loaded."""
 
-    def _load(self, name: str) -> Scenario:
-        scenario = super()._load(name)
-        with worded(f"plug-in {printable(name)!r} ({self.group})", door=aside):
-            _check(name, scenario)
-        return scenario
-
-
-def _check(name: str, scenario: Scenario) -> None:
-    """Raise ValueError for a package's scenario that says of itself what does not go."""
-    if scenario.name != name:
-        raise ValueError(f"its name is {printable(repr(scenario.name))}")
-    if not isinstance(scenario.parameters, Parameters):
-        raise ValueError("its parameters are no Parameters")
-    if not isinstance(scenario.description, str) or not scenario.description.strip():
-        raise ValueError("its description is no text")
-    if not all(isinstance(text, str) for text in scenario.words.values()):
-        raise ValueError("its words hold what is no text")
-    if not isinstance(scenario.one_sided, str | None):
-        raise ValueError("one_sided is no text, and not None")
-    actions = scenario.actions
-    if not isinstance(actions, tuple) or len(set(actions)) < len(actions):
-        raise ValueError("its actions are no tuple, or one is there twice")
-    needed = environment.KNOWN_ACTIONS
-    if not scenario.is_environment and not {*needed} <= {*actions} <= {*needed, *FURTHER}:
-        allowed = f"{', '.join(needed)}, with or without {' and '.join(FURTHER)}"
-        raise ValueError(f"its actions are {printable(repr(actions))}, and not {allowed}")
-    for dial in scenario.dials:
-        if not hasattr(scenario.parameters, dial):
-            raise ValueError(f"its dial {printable(repr(dial))} is no parameter")
+    def check(self, name: str, plugin: Scenario) -> None:
+        """Raise ValueError for a package's scenario that says of itself what does not go."""
+        if plugin.name != name:
+            raise ValueError(f"its name is {printable(repr(plugin.name))}")
+        if not isinstance(plugin.parameters, Parameters):
+            raise ValueError("its parameters are no Parameters")
+        if not isinstance(plugin.description, str) or not plugin.description.strip():
+            raise ValueError("its description is no text")
+        if not all(isinstance(text, str) for text in plugin.words.values()):
+            raise ValueError("its words hold what is no text")
+        if not isinstance(plugin.one_sided, str | None):
+            raise ValueError("one_sided is no text, and not None")
+        actions = plugin.actions
+        if not isinstance(actions, tuple) or len(set(actions)) < len(actions):
+            raise ValueError("its actions are no tuple, or one is there twice")
+        needed = environment.KNOWN_ACTIONS
+        if not plugin.is_environment and not {*needed} <= {*actions} <= {*needed, *FURTHER}:
+            allowed = f"{', '.join(needed)}, with or without {' and '.join(FURTHER)}"
+            raise ValueError(f"its actions are {printable(repr(actions))}, and not {allowed}")
+        for dial in plugin.dials:
+            if not hasattr(plugin.parameters, dial):
+                raise ValueError(f"its dial {printable(repr(dial))} is no parameter")
 
 
 PLUG_INS = PackagesScenarios("swarmdrive.scenarios", Scenario, {})
