@@ -23,8 +23,8 @@ from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.live_world import LiveSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 

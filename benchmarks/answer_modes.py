@@ -43,8 +43,8 @@ from harness.coordination.operating_point import POINTS
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 

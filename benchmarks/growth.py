@@ -41,8 +41,8 @@ from harness.core.parallel import spread
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.report.drawing.colours import BAD, GREY, INK

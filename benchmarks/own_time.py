@@ -33,7 +33,7 @@ from harness.coordination.operating_point import POINTS
 from harness.core.files import canonical_json
 from harness.core.resources import DATASET
 from harness.dataset import load
-from harness.evaluate import asking, run, walk
+from harness.evaluate import asking, requests, run, walk
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource
@@ -175,7 +175,7 @@ def limit_s(spec: Spec, out: Path) -> float:
     """
     assert isinstance(spec.source, FrozenSource)
     scenes = spec.source.dataset.scenes(list(read(out).decisions.scenes))
-    messages = [request.messages for request in asking.requests(spec, scenes)]
+    messages = [request.messages for request in requests.requests(spec, scenes)]
     decoded = [json.loads(line) for line in (out / "answers.jsonl").read_text().splitlines()]
     decisions = read(out).decisions
     start = process_time()

@@ -22,8 +22,8 @@ from harness.backends.base import Backend, Request
 from harness.backends.registry import open_backend
 from harness.dataset.load import find, load
 from harness.evaluate.agent import Agent, ImageMode
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.extensions.learn.training.model import new_model, save_tokenizer, train_tokenizer
 from harness.prompts import versions

@@ -49,9 +49,10 @@ from harness.core.parallel import each, share
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.latency import PAPER
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.runs.settings import Settings

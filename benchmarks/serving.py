@@ -24,8 +24,8 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import find, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 

@@ -21,11 +21,12 @@ from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Edge, End
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.fusion import messages_of
 from harness.evaluate.lifecycle import Evaluated
 from harness.evaluate.live_world import LiveSource
+from harness.evaluate.requests import requests
 from harness.evaluate.run import evaluate
 from harness.evaluate.sharing import as_asked
 from harness.evaluate.spec import Source, Spec

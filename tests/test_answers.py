@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.core.files import canonical_json
-from harness.evaluate.asking import payload_bits
+from harness.evaluate.answer_arrays import payload_bits
 from harness.runs.answers import MARKS, Answers
 from harness.runs.records import Answer
 

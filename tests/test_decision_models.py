@@ -33,7 +33,8 @@ from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate import flip
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of, requests
+from harness.evaluate.asking import answer_of
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import folder

@@ -32,7 +32,7 @@ from harness.backends.registry import open_backend
 from harness.backends.transformers.engine import TransformersEngine
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.parsing.parse import parse
 from harness.prompts import readout
 

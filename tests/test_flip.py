@@ -20,9 +20,10 @@ from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import Asker, answer_of, requests
+from harness.evaluate.asking import Asker, answer_of
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import finished_with
+from harness.evaluate.requests import requests
 from harness.evaluate.resolve import agents
 from harness.evaluate.spec import Spec
 from harness.prompts import readout, versions

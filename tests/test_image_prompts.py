@@ -17,9 +17,9 @@ from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, Scene, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.pictures import GREY, another
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
 from harness.world.perception.camera import frame

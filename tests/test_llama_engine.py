@@ -37,7 +37,7 @@ from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.prompts import readout
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch

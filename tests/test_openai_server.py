@@ -21,8 +21,8 @@ from harness.backends.registry import open_backend
 from harness.backends.servers import Server
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
-from harness.evaluate.asking import requests
 from harness.evaluate.latency import PAPER
+from harness.evaluate.requests import requests
 from harness.parsing.parse import parse
 
 NEEDED = ("torch", "transformers", "llama_cpp", "fastapi", "uvicorn", "starlette_context", "sse_starlette",

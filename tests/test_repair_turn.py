@@ -38,8 +38,9 @@ from harness.core.process import Stop
 from harness.core.resources import folder
 from harness.dataset.load import Dataset
 from harness.evaluate import repair
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.latency import fusion_s
+from harness.evaluate.requests import requests
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import difference

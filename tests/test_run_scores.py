@@ -31,8 +31,9 @@ from harness.backends.base import Completion, Role
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import wilson
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import answer_of, requests
+from harness.evaluate.asking import answer_of
 from harness.evaluate.latency import inference_s
+from harness.evaluate.requests import requests
 from harness.runs.leading import PAIRED
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.records import Answer, Latency, Score, Variant

@@ -23,7 +23,7 @@ from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.parsing.parse import parse
 from harness.prompts import versions
 from harness.runs.folder import read

@@ -17,9 +17,10 @@ from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.asking import Asker, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.requests import requests
 
 pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
 

@@ -19,7 +19,7 @@ from harness.backends.base import Request
 from harness.backends.registry import open_backend
 from harness.core.arrays import Floats
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.world.perception.camera import Sight
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch

@@ -11,7 +11,7 @@ from functools import cache, partial
 from itertools import compress, repeat
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -19,7 +19,6 @@ from msgspec import UNSET, UnsetType
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
-from harness.backends.base import Role as AskedRole
 from harness.backends.card import Card
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
@@ -27,21 +26,28 @@ from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import canonical_bytes, sha256_bytes
+from harness.core.files import sha256_bytes
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate import flip, repair, servers
+from harness.evaluate.answer_arrays import intents_of, models_of
 from harness.evaluate.fusion import (
     FusionAnswers,
-    heard_in,
-    key_of,
-    messages_of,
     plan_keys,
     source_of,
 )
 from harness.evaluate.kept_answers import KeptAnswers
-from harness.evaluate.latency import fusion_s, inference_s
-from harness.evaluate.pictures import picture
+from harness.evaluate.latency import fusion_s
+from harness.evaluate.requests import (
+    EGO,
+    Places,
+    fusion_id,
+    fusion_request,
+    heard_sets,
+    request_id,
+    requests,
+    wanted_in,
+)
 from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import ASKED_AGAIN, refuse_other_kept
@@ -53,12 +59,9 @@ from harness.runs.records import (
     Answer,
     Latency,
     Role,
-    asked_key,
     is_helper,
 )
 from harness.runs.unanswered import Tally
-from harness.world.perception.graph import truth_graph
-from harness.world.scene_graph import SceneGraph
 
 T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
@@ -66,100 +69,7 @@ FIRST = 8  # fewest questions that a server is asked before it has answered any
 # questions without an answer, one after the other, after which nothing more is asked
 IN_A_ROW = CHUNK
 WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
-EGO = (0,)
 _TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where there is no number
-Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
-
-
-def requests(
-    spec: Spec,
-    scenes: Sequence[Scene],
-    question: Question = PLAIN,
-    places: Places | None = None,
-) -> Iterator[Request]:
-    """Yield the requests of scenes, the ego's first; only helpers are asked another `question`.
-
-    With `places`, only those of the viewers at these places of each scene, the ego at 0.
-    """
-    agents, actions = spec.agents, spec.actions
-    privileged, sees = (
-        any(agent.card.privileged for agent in agents),
-        any(agent.sees for agent in agents),
-    )
-    blank = cache(partial(_blank, spec))
-    for scene, asked in zip(scenes, places or repeat(None), strict=False):
-        scenario = spec.scenario_of(scene)
-        words = scenario.prompt_words
-        truth = truth_graph(scenario, scene.state) if privileged else None
-        for place, viewer in enumerate(spec.viewers(scene)):
-            of_ego = not place
-            if (of_ego and question != PLAIN) or (asked is not None and place not in asked):
-                continue
-            graph, index = question.shown(scene.graphs[viewer]), spec.agent(scene.place(place))
-            agent = agents[index]
-            image = picture(spec, index, scene, viewer, question.pictured) if sees else None
-            yield blank(index, graph.role).alike(
-                id=_id(scene, viewer, question),
-                **agent.chats(graph, actions, words),
-                image=image,
-                view=graph,
-                truth=truth if agent.card.privileged else None,
-                scenario=scenario,
-            )
-
-
-def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
-    """Return the scenes where a helper is wanted, (n, H),
-    and the places of those helpers in each.
-    """
-    rows = np.flatnonzero(wanted.any(axis=1)).tolist()
-    return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
-
-
-def _id(scene: Scene, viewer: str, question: Question) -> str:
-    return f"{scene.id}/{asked_key(viewer, question.name)}"
-
-
-def _blank(spec: Spec, index: int, role: AskedRole) -> Request:
-    """Return a request to an agent in a role, without what differs between such requests."""
-    agent = spec.agents[index]
-    sampled: dict[str, Any] = {}
-    if agent.samples:
-        sampled = {"temperature": spec.settings.temperature, "sample": spec.settings.sampling_seed}
-    return agent.blank(role, spec.actions).alike(agent=index, **sampled)
-
-
-def fusion_request(
-    spec: Spec,
-    scene: Scene,
-    answers: Mapping[str, Answer],
-    senders: Sequence[str],
-    graph: SceneGraph | None = None,
-) -> Request:
-    """Return the fusion call with these senders' messages;
-    `answers` has the same keys as `senders`.
-
-    With a `graph`, the ego is asked with this one instead of its own.
-    """
-    heard = messages_of(answers, senders, spec.actions)
-    scenario, index = spec.scenario_of(scene), spec.agent(scene.agent)
-    agent, words = spec.agents[index], scenario.prompt_words
-    image = picture(spec, index, scene, scene.viewers[0])
-    truth = truth_graph(scenario, scene.state) if agent.card.privileged else None
-    view = scene.graphs[scene.viewers[0]] if graph is None else graph
-    return _blank(spec, index, "ego").alike(
-        id=fusion_id(scene, senders),
-        **agent.chats(view, spec.actions, words, heard),
-        image=image,
-        view=view,
-        truth=truth,
-        scenario=scenario,
-    )
-
-
-def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
-    """Return the id of the fusion call with the messages of these keys."""
-    return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
 @cache  # once: a run has an asker for each of its parts
@@ -193,7 +103,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
         finish_reason=completion.finish_reason,
         error=completion.error,
     )
-    prompt_sha256, image_sha256 = _digests(request)
+    prompt_sha256, image_sha256 = digests(request)
     return Answer(
         scene=scene,
         viewer=viewer,
@@ -229,7 +139,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
     )
 
 
-def _digests(request: Request) -> tuple[str, str | UnsetType]:
+def digests(request: Request) -> tuple[str, str | UnsetType]:
     """Return the digests of a request's chat and of its picture; unset without one."""
     return sha256_bytes(_TEXTS.encode(request.messages)), request.image_sha256 or UNSET
 
@@ -343,7 +253,7 @@ class Asker:
     def _check_kept(self, request: Request) -> None:
         """Raise UserError if an answer was kept of another prompt or picture."""
         answer = self.answers[request.id]
-        if _digests(request) != (answer.prompt_sha256, answer.image_sha256):
+        if digests(request) != (answer.prompt_sha256, answer.image_sha256):
             assert self._kept
             raise UserError(
                 f"{printable(self._kept.file)}: answer {printable(request.id)} is to another "
@@ -504,7 +414,7 @@ class Asker:
         for scene, asked in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
-                not is_available(_id(scene, viewer, question))
+                not is_available(request_id(scene, viewer, question))
                 for place, viewer in viewers
                 if place >= first and (asked is None or place in asked)
             )
@@ -516,65 +426,21 @@ class Asker:
         NaN without an intent.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
-        width = max([width, *[len(row) for row in answers]])
-        unknown = (math.nan,) * len(self.spec.actions)
-        p, distances_m, ranges_m, bits, texts_b, unasked = [], [], [], [], [], []
-        models = [self._models(scene, width) for scene in scenes]
-        for scene, row in zip(scenes, answers, strict=True):
-            record, (ego, *helpers) = scene.record, scene.viewers
-            absent = width - len(row)
-            unasked.append([*[answer is None for answer in row[1:]], *[False] * absent])
-            row += [None] * absent
-            p.append([answer.intent or unknown if answer else unknown for answer in row])
-            distance_m, range_m = record.distance_m, record.range_m
-            distances_m.append(
-                [distance_m[ego], *[distance_m[v] for v in helpers], *[math.nan] * absent]
-            )
-            ranges_m.append([*[range_m[v] for v in helpers], *[math.nan] * absent])
-            bits.append([_bits(scene, answer) if answer else 0 for answer in row[1:]])
-            texts_b.append([len(_text(answer).encode()) for answer in row[1:]])
-        intents = np.array(p, dtype=float)
-        valid = ~np.isnan(intents[:, 1:]).any(axis=-1)
-        shape = len(scenes), width - 1
-        not_yet = None if self.spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
-        own_bits, own_text_bytes = None, None
-        if any(point.needs("plans") for point in self.spec.points):
-            own = [row[0] for row in answers]
-            own_bits = np.array(
-                [_bits(scene, a) if a else 0.0 for scene, a in zip(scenes, own, strict=True)],
-                dtype=float,
-            )
-            own_text_bytes = np.array([len(_text(a).encode()) for a in own], dtype=float)
-        return Intents(
-            intents[:, 0],
-            intents[:, 1:],
-            valid if not_yet is None else valid | not_yet,
-            np.array(distances_m, dtype=float),
-            np.array(ranges_m, dtype=float).reshape(shape),
-            np.array(bits, dtype=float).reshape(shape),
-            inference_s(self.latency, answers, models),
-            unasked=not_yet,
-            text_bytes=np.array(texts_b, dtype=float).reshape(shape),
-            own_bits=own_bits,
-            own_text_bytes=own_text_bytes,
-        )
+        return intents_of(self.spec, self.latency, scenes, answers, width)
 
     def _answers_in(self, scene: Scene, question: Question) -> list[Answer | None]:
         """Return the answers so far in a scene, the ego's first, which is asked the plain one."""
         ego, *helpers = scene.viewers
-        ids = [_id(scene, ego, PLAIN), *(_id(scene, viewer, question) for viewer in helpers)]
+        ids = [
+            request_id(scene, ego, PLAIN),
+            *(request_id(scene, viewer, question) for viewer in helpers),
+        ]
         return [self.answers[name] if self._has(name) else None for name in ids]
-
-    def _models(self, scene: Scene, width: int) -> list[int]:
-        """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
-        there = range(len(scene.viewers))
-        places = [scene.place(n) for n in there] if self.spec.helpers else [*there]
-        return [*places, *range(len(places), width)]
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        sets = list(_heard_sets(scenes, codes, rewrites))
+        sets = list(heard_sets(scenes, codes, rewrites))
         ids = [fusion_id(*each) for each in sets]
         if not all(map(self._has, ids)):
             self.answer(self.fusion_requests(scenes, codes, rewrites))
@@ -585,7 +451,7 @@ class Asker:
         and their seconds (K,).
         """
         answers = [self.answers[name] for name in ids]
-        models = [self._models(scene, 1)[0] for scene in scenes]
+        models = [models_of(self.spec, scene, 1)[0] for scene in scenes]
         unknown = [np.nan] * len(self.spec.actions)
         intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
         return intents, fusion_s(self.latency, answers, models)
@@ -615,7 +481,7 @@ class Asker:
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
         """Return the requests of the fusion calls with these sets of messages."""
-        sets = list(_heard_sets(scenes, codes, rewrites))
+        sets = list(heard_sets(scenes, codes, rewrites))
         lacks = [not self._has(fusion_id(*each)) for each in sets]
         by_id = {scene.id: scene for scene in scenes}
         graphs = iter(shared_graphs(self.spec.scenario, list(compress(sets, lacks)), by_id))
@@ -664,40 +530,3 @@ def _answer_chunks(
                 refused = error
     if refused:
         raise refused
-
-
-def _heard_sets(
-    scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
-) -> Iterator[tuple[Scene, list[str]]]:
-    """Yield the scene of each set of messages and the keys of its senders."""
-    helpers = max(len(scene.viewers) for scene in scenes) - 1
-    for code in codes.tolist():
-        at, heard, attacking = heard_in(code, helpers, bool(rewrites.changes.of_attackers))
-        at, source = divmod(at, len(scenes)) if rewrites.elsewhere else (at, at)
-        name, viewers = scenes[source].id if rewrites.elsewhere else "", scenes[source].viewers
-        yield scenes[at], [key_of(viewers[1 + h], rewrites, h in attacking, name) for h in heard]
-
-
-def _text(answer: Answer | None) -> str:
-    """Return the words of a helper's message; none of a failed answer."""
-    return str(answer.message.get("evidence") or "") if answer and answer.message else ""
-
-
-def _bits(scene: Scene, answer: Answer) -> int:
-    sender = scene.state.vehicle(answer.viewer)
-    return payload_bits((sender.x_m, sender.y_m), answer)
-
-
-def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Return the bits of a helper's message:
-    id, position, intent, evidence and risk, as compact JSON.
-
-    Positions have one decimal and probabilities two at most.
-    """
-    intent = "null"
-    if answer.intent:
-        shares = [f"{share:.2f}" for share in answer.intent]
-        intent = f"[{','.join([share[:-1] if share[-1] == '0' else share for share in shares])}]"
-    numbers = f'{{"from":,"intent":{intent},"says":,"xy_m":[{xy_m[0]:.1f},{xy_m[1]:.1f}]}}'
-    texts = canonical_bytes([answer.viewer, answer.message])
-    return 8 * (len(numbers) + len(texts) - len("[,]"))

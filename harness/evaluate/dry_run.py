@@ -10,8 +10,8 @@ from harness.backends.tokens import counter, summarize_counts
 from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.asking import EGO, fusion_id, requests
 from harness.evaluate.fusion import key_of
+from harness.evaluate.requests import EGO, fusion_id, requests
 from harness.evaluate.spec import Spec
 
 

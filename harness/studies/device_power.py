@@ -14,8 +14,8 @@ from harness.core.resources import DATASET
 from harness.core.statistics import Estimate, seed_interval
 from harness.dataset import load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.runs.settings import Settings
 

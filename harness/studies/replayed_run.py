@@ -32,10 +32,11 @@ from harness.core.files import alone, canonical_json
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import device
-from harness.evaluate.asking import EGO, Asker, wanted_in
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.of_run import check_prompts, points_of, spec_of
+from harness.evaluate.requests import EGO, wanted_in
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses

@@ -37,7 +37,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.core import versions
 from harness.core.files import sha256_bytes
 from harness.dataset.load import Dataset, find, load
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.parsing.parse import parse
 from harness.runs import folder
 

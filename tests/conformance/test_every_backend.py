@@ -21,7 +21,7 @@ from harness.backends.openai.constraint import broken
 from harness.backends.registry import BUILT_IN, capabilities, missing, open_backend
 from harness.core.files import digest
 from harness.dataset.load import load
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 

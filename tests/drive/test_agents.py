@@ -19,9 +19,9 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset.build import build
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import EGO, requests
 from harness.evaluate.live_world import LiveSource, looks
 from harness.evaluate.replay import scenes_of
+from harness.evaluate.requests import EGO, requests
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions

@@ -152,7 +152,9 @@ LOOP = (
     "coordination/coordinate.py",
     "coordination/exchange.py",
     "coordination/operating_point.py",
+    "evaluate/answer_arrays.py",
     "evaluate/asking.py",
+    "evaluate/requests.py",
     "evaluate/spec.py",
     "evaluate/walk.py",
 )

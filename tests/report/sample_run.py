@@ -11,9 +11,10 @@ from run_on_disk import restated
 
 from harness.backends.base import Completion
 from harness.core.versions import FIGURES
-from harness.evaluate.asking import Asker, answer_of, requests
+from harness.evaluate.asking import Asker, answer_of
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
+from harness.evaluate.requests import requests
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.runs import formats, writer

@@ -12,8 +12,9 @@ from harness.core.progress import Progress
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of, requests
+from harness.evaluate.asking import answer_of
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.extensions.checkups.answers import Checkup
 from harness.extensions.checkups.answers import check as ask

@@ -124,8 +124,8 @@ def parity(
     from harness.backends.registry import missing
     from harness.dataset import load
     from harness.evaluate.agent import Agent
-    from harness.evaluate.asking import requests
     from harness.evaluate.frozen_world import FrozenSource
+    from harness.evaluate.requests import requests
     from harness.evaluate.spec import Spec
     from harness.extensions.checkups.parity import PASSES, compare
     from harness.prompts import versions

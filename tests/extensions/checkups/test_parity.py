@@ -22,7 +22,7 @@ from harness.backends import cards
 from harness.backends.gguf_export import export
 from harness.cli import app
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.extensions.checkups.parity import PASSES, Finding, compare
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch

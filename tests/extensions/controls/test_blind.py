@@ -32,8 +32,8 @@ from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
-from harness.evaluate.asking import requests
 from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.requests import requests
 from harness.evaluate.resolve import points
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec

@@ -23,7 +23,7 @@ from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene, load
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.extensions.studies.twins import asking, declared, scoring
 from harness.extensions.studies.twins import study as twins_page

@@ -18,7 +18,7 @@ from harness.core.resources import folder
 from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import requests
+from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.extensions.studies.twins.asking import _twins as twins_of
 from harness.extensions.studies.twins.asking import lack

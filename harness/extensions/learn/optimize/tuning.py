@@ -21,9 +21,10 @@ from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.progress import Progress
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.asking import Asker, Places
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.kept_answers import read_kept
+from harness.evaluate.requests import Places
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses, walk
 from harness.extensions.learn.optimize.candidate import Candidate

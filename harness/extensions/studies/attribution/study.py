@@ -25,9 +25,9 @@ from harness.core.figures import shown as figure
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate, rate_interval
 from harness.dataset.load import Scene
-from harness.evaluate.asking import requests
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
+from harness.evaluate.requests import requests
 from harness.evaluate.walk import Decided, Memory, places_of, shown, walk
 from harness.extensions.studies.attribution.record import FILE, Attribution, LeftOut
 from harness.extensions.studies.twins.scoring import distance

@@ -16,11 +16,12 @@ from harness.core.errors import Unanswered, UserError, printable
 from harness.core.files import digest, write_whole
 from harness.core.parallel import Workers, each, spread
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.asking import Asker, fusion_request, requests
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.fusion import messages_of
 from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.latency import PAPER
+from harness.evaluate.requests import fusion_request, requests
 from harness.evaluate.spec import Spec
 from harness.extensions.studies.twins.declared import TWINS, Twin
 from harness.extensions.studies.twins.scoring import Pair, distance, held

@@ -1,0 +1,128 @@
+"""Make the requests of scenes: what each viewer is asked, and the ego of the messages it heard."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cache, partial
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+
+from harness.backends.base import Request
+from harness.backends.base import Role as AskedRole
+from harness.coordination.operating_point import Rewrites
+from harness.coordination.parts import PLAIN, Question
+from harness.core.arrays import Bools, Ints
+from harness.dataset.load import Scene
+from harness.evaluate.fusion import heard_in, key_of, messages_of
+from harness.evaluate.pictures import picture
+from harness.evaluate.spec import Spec
+from harness.runs.records import Answer, asked_key
+from harness.world.perception.graph import truth_graph
+from harness.world.scene_graph import SceneGraph
+
+EGO = (0,)
+Places = Sequence[Collection[int]]  # of the viewers of each scene, the ego at 0
+
+
+def requests(
+    spec: Spec,
+    scenes: Sequence[Scene],
+    question: Question = PLAIN,
+    places: Places | None = None,
+) -> Iterator[Request]:
+    """Yield the requests of scenes, the ego's first; only helpers are asked another `question`.
+
+    With `places`, only those of the viewers at these places of each scene, the ego at 0.
+    """
+    agents, actions = spec.agents, spec.actions
+    privileged, sees = (
+        any(agent.card.privileged for agent in agents),
+        any(agent.sees for agent in agents),
+    )
+    blank = cache(partial(_blank, spec))
+    for scene, asked in zip(scenes, places or repeat(None), strict=False):
+        scenario = spec.scenario_of(scene)
+        words = scenario.prompt_words
+        truth = truth_graph(scenario, scene.state) if privileged else None
+        for place, viewer in enumerate(spec.viewers(scene)):
+            of_ego = not place
+            if (of_ego and question != PLAIN) or (asked is not None and place not in asked):
+                continue
+            graph, index = question.shown(scene.graphs[viewer]), spec.agent(scene.place(place))
+            agent = agents[index]
+            image = picture(spec, index, scene, viewer, question.pictured) if sees else None
+            yield blank(index, graph.role).alike(
+                id=request_id(scene, viewer, question),
+                **agent.chats(graph, actions, words),
+                image=image,
+                view=graph,
+                truth=truth if agent.card.privileged else None,
+                scenario=scenario,
+            )
+
+
+def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
+    """Return the scenes where a helper is wanted, (n, H),
+    and the places of those helpers in each.
+    """
+    rows = np.flatnonzero(wanted.any(axis=1)).tolist()
+    return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
+
+
+def request_id(scene: Scene, viewer: str, question: Question) -> str:
+    """Return the id of a viewer's request in a scene; of a helper's to another question."""
+    return f"{scene.id}/{asked_key(viewer, question.name)}"
+
+
+def _blank(spec: Spec, index: int, role: AskedRole) -> Request:
+    """Return a request to an agent in a role, without what differs between such requests."""
+    agent = spec.agents[index]
+    sampled: dict[str, Any] = {}
+    if agent.samples:
+        sampled = {"temperature": spec.settings.temperature, "sample": spec.settings.sampling_seed}
+    return agent.blank(role, spec.actions).alike(agent=index, **sampled)
+
+
+def fusion_request(
+    spec: Spec,
+    scene: Scene,
+    answers: Mapping[str, Answer],
+    senders: Sequence[str],
+    graph: SceneGraph | None = None,
+) -> Request:
+    """Return the fusion call with these senders' messages;
+    `answers` has the same keys as `senders`.
+
+    With a `graph`, the ego is asked with this one instead of its own.
+    """
+    heard = messages_of(answers, senders, spec.actions)
+    scenario, index = spec.scenario_of(scene), spec.agent(scene.agent)
+    agent, words = spec.agents[index], scenario.prompt_words
+    image = picture(spec, index, scene, scene.viewers[0])
+    truth = truth_graph(scenario, scene.state) if agent.card.privileged else None
+    view = scene.graphs[scene.viewers[0]] if graph is None else graph
+    return _blank(spec, index, "ego").alike(
+        id=fusion_id(scene, senders),
+        **agent.chats(view, spec.actions, words, heard),
+        image=image,
+        view=view,
+        truth=truth,
+        scenario=scenario,
+    )
+
+
+def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
+    """Return the id of the fusion call with the messages of these keys."""
+    return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
+
+
+def heard_sets(
+    scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
+) -> Iterator[tuple[Scene, list[str]]]:
+    """Yield the scene of each set of messages and the keys of its senders."""
+    helpers = max(len(scene.viewers) for scene in scenes) - 1
+    for code in codes.tolist():
+        at, heard, attacking = heard_in(code, helpers, bool(rewrites.changes.of_attackers))
+        at, source = divmod(at, len(scenes)) if rewrites.elsewhere else (at, at)
+        name, viewers = scenes[source].id if rewrites.elsewhere else "", scenes[source].viewers
+        yield scenes[at], [key_of(viewers[1 + h], rewrites, h in attacking, name) for h in heard]
