@@ -83,27 +83,6 @@ def test_every_decision_waits_for_a_round_trip_of_its_own_on_top_of_the_models_i
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("cloud:round_trip=lte", "unknown round_trip 'lte'; known: 5g-city, us-drive"),
-        (
-            "cloud:round_trip=us-drive,round_trip_s=0.3",
-            "round_trip is 'us-drive'; it must be left out where",
-        ),
-        (
-            "6g:consensus=ego-prompt,round_trip=us-drive",
-            "it must be left out where consensus is ego-prompt",
-        ),
-    ],
-)
-def test_a_network_that_is_not_allowed_is_one_line(text: str, says: str):
-    with pytest.raises(UserError) as error:
-        named_point(text)
-    assert says in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("100 = 60", "90 = 60", "mine.toml: quantiles_ms must go from 0 to 100"),

@@ -79,15 +79,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ),
         ({"edge_delay_s": -1}, "edge_delay_s is -1; it must be seconds, 0 or more"),
         ({"edge_antenna_m": 0.5}, "edge_antenna_m is 0.5; it must be metres from 1 to 100"),
-        (
-            {"profile": "mode2", "edge": "fusion", "consensus": "ego-prompt"},
-            "edge is 'fusion'; it must be none or relay where consensus is ego-prompt",
-        ),
         ({"density_coupled": 1}, "density_coupled is 1; it must be true or false"),
-        (
-            {"loss": 0.1, "density_coupled": True},
-            "loss is 0.1; it must be left out where density_coupled",
-        ),
         ({"name": " "}, "operating point name ' ': give it some text"),
     ],
 )
@@ -151,10 +143,9 @@ def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
         ("6g:window=300,window_s=0.2", "window_s is given twice"),
         ("6g:consensus=vote", "unknown consensus 'vote'"),
         ("6g:messages=none", "unknown messages 'none'"),
-        (
-            "6g:content=oracle,messages=shuffled",
-            "messages is 'shuffled'; it must be blind or own where content is oracle, which holds no intents",
-        ),
+        ("cloud:round_trip=lte", "unknown round_trip 'lte'; known: 5g-city, us-drive"),
+        ("6g:content=word", "unknown content 'word'"),
+        ("6g:rounds=4", "rounds is 4; it must be a whole number from 1 to 3"),
     ],
 )
 def test_a_change_that_is_not_allowed_is_one_line(text, says):

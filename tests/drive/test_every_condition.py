@@ -4,7 +4,10 @@ Conditions are drawn from the settings of all parts, those of extensions too. So
 settle between each other is tried, whoever says it.
 """
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -90,25 +93,55 @@ def values_of(setting: str) -> Sequence[str]:
 SETTINGS = {setting: values for setting in typed_settings() if (values := values_of(setting))}
 
 
+@dataclass(frozen=True)
+class Typed:
+    """A condition as it is typed: a channel, and settings beside it."""
+
+    profile: str
+    settings: Mapping[str, str]
+
+    def __str__(self) -> str:
+        beside = [f"{name}={value}" for name, value in self.settings.items()]
+        return f"{self.profile}:{','.join(beside)}" if beside else self.profile
+
+    def without(self, setting: str) -> "Typed":
+        rest = {name: value for name, value in self.settings.items() if name != setting}
+        return Typed(self.profile, rest)
+
+
 @st.composite
-def conditions(draw: st.DrawFn) -> tuple[str, list[str]]:
-    """Draw a condition as it is typed, with its settings."""
+def conditions(draw: st.DrawFn) -> Typed:
     profile = draw(st.sampled_from(sorted(CHANNELS)))
     chosen = draw(st.lists(st.sampled_from(sorted(SETTINGS)), min_size=1, max_size=4, unique=True))
-    typed = [f"{setting}={draw(st.sampled_from(SETTINGS[setting]))}" for setting in chosen]
-    return f"{profile}:{','.join(typed)}", chosen
+    return Typed(profile, {name: draw(st.sampled_from(SETTINGS[name])) for name in chosen})
 
 
-def allowed(typed: str, chosen: Sequence[str], dataset: Dataset) -> Spec | None:
-    """Return an evaluation under a condition; None if it is refused, as people are told."""
+def played(typed: Typed, dataset: Dataset) -> Spec | None:
+    """Return an evaluation under a condition; None if it is refused.
+
+    The line that refuses it names all settings without which it would not be.
+    """
+    spec, said = opened(typed, dataset)
+    if spec:
+        return spec
+    for setting in typed.settings:
+        fewer = typed.without(setting)
+        other, line = opened(fewer, dataset)
+        if other is None:
+            typed, said = fewer, line
+    assert "\n" not in said
+    line = said.replace(repr(str(typed)), "")
+    assert all(setting in line for setting in typed.settings), said
+    return None
+
+
+def opened(typed: Typed, dataset: Dataset) -> tuple[Spec | None, str]:
+    """Return an evaluation under a condition; or None, and the line that refuses it."""
     try:
-        point = named_point(typed)
-        return spec_of(dataset, "swarm-tiny", "v12", points=(point,), seeds=(0,))
+        point = named_point(str(typed))
+        return spec_of(dataset, "swarm-tiny", "v12", points=(point,), seeds=(0,)), ""
     except UserError as error:
-        said = str(error)
-        assert "\n" not in said
-        assert any(setting in said for setting in chosen), said
-        return None
+        return None, str(error)
 
 
 def unknown_or_finite(decisions: Decisions) -> Iterator[str]:
@@ -135,17 +168,23 @@ def told(decisions: Decisions) -> tuple[dict[Place, list[Any]], set[Place]]:
 
 
 @pytest.mark.slow
-def test_a_condition_is_played_or_refused_in_one_line(two: Dataset) -> None:
+def test_a_condition_is_played_or_refused_in_one_line(two: Dataset, tmp_path: Path) -> None:
+    """What is played is the same twice, from the beginning and from where it was killed."""
+    file = tmp_path / "answers.jsonl"
+
     @settings(max_examples=25)
-    @given(drawn=conditions())
-    def holds(drawn: tuple[str, list[str]]) -> None:
-        frozen = allowed(*drawn, two)
+    @given(typed=conditions(), kept=st.floats(0, 1))
+    def holds(typed: Typed, kept: float) -> None:
+        frozen = played(typed, two)
         if frozen is None:
             return
-        once, again = walked(frozen, Sees()), walked(frozen, Sees())
-        assert once.decisions.table.equals(again.decisions.table)
+        file.unlink(missing_ok=True)
+        once = walked(frozen, Sees(), kept=file)
+        os.truncate(file, round(kept * file.stat().st_size))
+        resumed = walked(frozen, Sees(), kept=file)
+        assert resumed.decisions.table.equals(once.decisions.table)
+        assert resumed.answers == once.answers
         assert not list(unknown_or_finite(once.decisions))
-        assert once.answers == again.answers
 
     holds()
 
@@ -153,9 +192,9 @@ def test_a_condition_is_played_or_refused_in_one_line(two: Dataset) -> None:
 @pytest.mark.exhaustive
 def test_a_condition_that_is_played_is_driven_alike(two: Dataset) -> None:
     @settings(max_examples=60)
-    @given(drawn=conditions())
-    def holds(drawn: tuple[str, list[str]]) -> None:
-        frozen = allowed(*drawn, two)
+    @given(typed=conditions())
+    def holds(typed: Typed) -> None:
+        frozen = played(typed, two)
         if frozen is None or frozen.points[0].elsewhere:
             return
         live = spec("swarm-tiny", frozen.points, (0,), prompt="v12", first_seed=two.manifest.seed)
@@ -165,3 +204,11 @@ def test_a_condition_that_is_played_is_driven_alike(two: Dataset) -> None:
             assert place in late or steps == expected[place]
 
     holds()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("profile", ["6g", "mode2"])
+def test_two_settings_go_together_or_a_line_names_both(two: Dataset, profile: str) -> None:
+    for one, other in combinations(sorted(SETTINGS), 2):
+        for value, beside in product(SETTINGS[one], SETTINGS[other]):
+            played(Typed(profile, {one: value, other: beside}), two)

@@ -99,24 +99,6 @@ def test_plans_of_agents_are_of_each_pair_and_no_helper_model_is_asked(tmp_path:
         assert rates[point.name] == pytest.approx(np.mean(means))
 
 
-@pytest.mark.parametrize(
-    ("condition", "says"),
-    [
-        ("6g:content=plan", "consensus is 'linear'; it must be yield-by-time"),
-        ("6g:consensus=auction", "content is 'intent'; it must be plan where consensus is auction"),
-        (PLAN + "auction,on_demand=true", "on_demand is True"),
-        (PLAN + "auction,messages=blind", "messages is 'blind'"),
-        (
-            PLAN + "auction,attack=liar+injection",
-            "attack is 'injection'; it must be liar",
-        ),
-    ],
-)
-def test_what_plans_go_without_is_refused_in_one_line(condition: str, says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        named_point(condition)
-
-
 def test_an_ego_alone_has_nobody_whose_plan_it_hears() -> None:
     with pytest.raises(UserError, match="content plan needs several agents"):
         live_spec_of(points=(named_point(PLAN + "auction"),))
@@ -192,10 +174,3 @@ def test_a_round_that_ends_after_the_window_is_not_heard_and_none_begins_after_i
     never = acted(point.changed(rounds=3, window_s=first_s))
     assert never.messages.tolist() == [2, 2, 2]
     assert never.latency_s == pytest.approx(first_s)
-
-
-def test_rounds_are_of_plans_alone() -> None:
-    with pytest.raises(UserError, match="rounds is 2; it must be 1 where content is intent"):
-        named_point("6g:rounds=2")
-    with pytest.raises(UserError, match="rounds is 4; it must be a whole number from 1 to 3"):
-        named_point(PLAN + "auction,rounds=4")

@@ -123,28 +123,6 @@ def test_batches_and_a_stop_change_nothing(tmp_path: Path) -> None:
     assert 0 < len(rest.asked) < len(asked)
 
 
-@pytest.mark.parametrize(
-    ("condition", "says"),
-    [
-        (
-            f"{READS},defence=schema",
-            "defence is 'schema'; it must be left out where content is plan",
-        ),
-        (
-            f"{READS},round_trip_s=0.1,rounds=2",
-            "rounds is 2; it must be 1 where the ego's model runs in a cloud",
-        ),
-        (
-            "6g:consensus=ego-prompt,content=objects",
-            "intent, plan, text or both where consensus is ego-prompt",
-        ),
-    ],
-)
-def test_what_reading_plans_goes_without_is_refused(condition: str, says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        named_point(condition)
-
-
 def test_who_cannot_read_plans_is_refused() -> None:
     with pytest.raises(UserError, match="prompt v12 cannot show plans; use --prompt v13"):
         spec(READS, prompt="v12")

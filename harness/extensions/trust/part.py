@@ -108,7 +108,9 @@ class Guard(Part, frozen=True, kw_only=True):
             where = f"where content is {point.ask.content}"
             allowed = f"attacks of one share {where}, as the same vehicles do all"
         elif point.has_fusion_call and not all(attack.by_scene for attack in attacks):
-            allowed = "one that needs no past and adds no voices where the ego is asked twice"
+            asks = "consensus" if point.fusion.consensus == EGO_PROMPT else "content"
+            where = f"where {asks} is {point.setting(asks)}, which asks the ego twice"
+            allowed = f"one that needs no past and adds no voices {where}"
         if allowed:
             raise wrong("attack", self.attack, allowed)
 

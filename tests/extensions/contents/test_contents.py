@@ -590,36 +590,3 @@ def test_a_stranger_who_names_two_attacks_at_once_gets_both(
         for text in ("shift:offset_m=6+hide", "shift:offset_m=6&hide")
     )
     assert twice.graphs == apart.graphs
-
-
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("6g:content=word", "unknown content 'word'"),
-        (
-            "6g:content=objects,consensus=ego-prompt",
-            "it must be intent, plan, text or both where",
-        ),
-        ("6g:content=objects,attack=liar", "it must be absent, ghost, hide, shift or left out"),
-        ("6g:attack=ghost", "where content is intent, which holds no objects"),
-        ("6g:content=oracle,attack=hide", "it must be absent or left out"),
-        (
-            "6g:content=objects,attack=ghost:share=1/3+hide:share=1",
-            "attacks of one share where content is",
-        ),
-        ("6g:content=both,attack=liar+ghost:share=1", "attacks of one share where content is both"),
-        (
-            "mode2:content=both,edge=fusion",
-            "none or relay where content is both: a unit has no model",
-        ),
-        (
-            "6g:content=objects,round_trip=us-drive",
-            "left out where content is objects, which asks twice",
-        ),
-    ],
-)
-def test_what_does_not_go_together_is_one_line(text: str, wrong: str) -> None:
-    with pytest.raises(UserError) as error:
-        named_point(text)
-    assert wrong in str(error.value)
-    assert "\n" not in str(error.value)

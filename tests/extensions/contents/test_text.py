@@ -180,27 +180,6 @@ def test_a_run_is_read_as_it_was_asked(few: Dataset, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("point", "wrong"),
-    [
-        (
-            "attack=liar",
-            "it must be injection, absent or left out where content is text",
-        ),
-        (
-            "defence=schema,consensus=ego-prompt",
-            "it must be quoted or left out where content is text",
-        ),
-        ("edge=fusion", "none or relay where content is text, which holds no intents"),
-    ],
-)
-def test_what_words_alone_cannot_do_is_one_line(point: str, wrong: str) -> None:
-    with pytest.raises(UserError) as error:
-        named_point(f"its-g5:content=text,{point}")
-    assert wrong in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("model", "prompt", "answer", "wrong"),
     [
         ("proxy", "v11", "json", "proxy is no language model and cannot fuse messages"),

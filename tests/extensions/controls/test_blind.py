@@ -257,5 +257,3 @@ def test_a_fusion_call_has_the_blind_helpers_messages(
 
 def test_only_a_point_with_a_channel_asks_the_blind() -> None:
     assert named_point("single-local:messages=blind").question == PLAIN
-    with pytest.raises(UserError, match="messages is 'shuffled'; it must be blind or own where"):
-        named_point("6g:content=oracle,messages=shuffled")

@@ -112,10 +112,6 @@ def test_what_the_deadline_expects_is_what_the_channel_does_on_average(profile, 
     ("point", "says"),
     [
         (
-            "6g:schedule=always,threshold=0.5",
-            "it must be left out where schedule is always, which has none",
-        ),
-        (
             "6g:schedule=margin,threshold=-1",
             "threshold is -1.0; it must be a finite number, 0 or more",
         ),
