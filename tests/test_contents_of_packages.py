@@ -152,21 +152,23 @@ def shown(**parts: Any) -> Call:
 def test_what_a_content_says_of_itself_is_checked(
     content: Content, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = SimpleNamespace(value="packages:MINE", load=lambda: content)
+    package = type("Package", (), {"name": "by-hand"})
+    entry = SimpleNamespace(value="packages:MINE", load=lambda: content, dist=package)
     monkeypatch.setattr(CONTENTS, "_entries", lambda: {"mine": entry})
     with pytest.raises(UserError) as error:
         CONTENTS["mine"]
-    assert str(error.value).startswith("plug-in 'mine' (swarmdrive.contents) fails (")
+    named = "plug-in 'mine' (swarmdrive.contents) of package by-hand fails ("
+    assert str(error.value).startswith(named)
     assert told in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def of(content: Content) -> OperatingPoint:
+def of(content: Content, name: str = "mine") -> OperatingPoint:
     radio = SimpleNamespace(encoding="json")
     return cast(
         OperatingPoint,
         SimpleNamespace(
-            content=content, radio=radio, physical=None, ask=SimpleNamespace(content="mine")
+            content=content, radio=radio, physical=None, ask=SimpleNamespace(content=name)
         ),
     )
 
@@ -271,6 +273,6 @@ def test_an_obstacle_is_one_line_or_none() -> None:
 
 
 def test_the_papers_own_goes_through_no_door() -> None:
-    point = of(OfIntent())
+    point = of(OfIntent(), "intent")
     assert door.able(point, SAID, None) is SAID
     assert door.bits(point, SAID) is SAID.payload_bits

@@ -10,8 +10,14 @@ import pytest
 
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, kept_of, named_point
-from harness.coordination.parts import Kept, Part, Question
-from harness.coordination.parts_of_packages import after_call, prepared, sources, spoken
+from harness.coordination.parts import PACKAGES_PARTS, Kept, Part, Question
+from harness.coordination.parts_of_packages import (
+    SpeakerOfPart,
+    after_call,
+    obstacle,
+    prepared,
+    sources,
+)
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
 from harness.radio.channel import Draws
@@ -34,9 +40,14 @@ def written(given: Any) -> Any:
 
 
 def of_part(hook: str, act: Callable[..., Any]) -> Part:
-    kind: Any = type("Mine", (Part,), {hook: lambda self, *given: act(*given)}, frozen=True)
-    made: Part = kind()
-    return made
+    return made(**{hook: lambda self, *given: act(*given)})
+
+
+def made(**members: Any) -> Part:
+    kind: Any = type("Mine", (Part,), members, frozen=True)
+    PACKAGES_PARTS[kind] = "part mine of package by-hand"
+    part: Part = kind()
+    return part
 
 
 @dataclass
@@ -63,7 +74,7 @@ def test_a_part_prepares_intents_and_nothing_else(act: Callable[..., Any], says:
     before = intents()
     with pytest.raises(UserError) as error:
         prepared(of_part("before", act), before)
-    assert str(error.value).startswith("part Mine fails (")
+    assert str(error.value).startswith("part mine of package by-hand fails (")
     assert says in str(error.value)
     assert np.array_equal(before.own, intents().own, equal_nan=True)
 
@@ -94,8 +105,8 @@ def test_a_part_may_turn_intents_round_and_an_answer_that_failed_stays_so() -> N
 )
 def test_a_speaker_says_nothing_of_the_egos(act: Callable[..., Any], says: str) -> None:
     with pytest.raises(UserError) as error:
-        spoken(Speaks(act), intents(), DRAWS, PLACES, PLACES)
-    assert str(error.value).startswith("speaker Speaks fails (")
+        SpeakerOfPart(made(), Speaks(act)).said(intents(), DRAWS, PLACES, PLACES)
+    assert str(error.value).startswith("part mine of package by-hand fails (")
     assert says in str(error.value)
 
 
@@ -133,7 +144,7 @@ def test_the_last_word_on_a_call_is_a_policy(act: Callable[..., Any], says: str)
 @pytest.mark.parametrize(
     ("hook", "act", "says"),
     [
-        ("check", lambda: next(iter(())), "part Mine fails (StopIteration at"),
+        ("check", lambda: next(iter(())), "part mine of package by-hand fails (StopIteration at"),
         ("kept", lambda: {"x": {"../y": Kept(1)}}, "../y to keep is no plain name"),
         ("kept", lambda: {"..": {"y": Kept(1)}}, ".. to keep is no plain name"),
         ("kept", lambda: {"x": {"y": Kept(object())}}, "Encoding objects of type object"),
@@ -163,8 +174,18 @@ def test_a_part_that_fails_as_a_run_begins_is_one_line(
 def test_what_a_part_says_of_itself_is_asked_behind_the_door(
     hook: str, value: Any, ask: Callable[[OperatingPoint], Any]
 ) -> None:
-    kind = type("Mine", (Part,), {hook: value}, frozen=True)
     point = named_point("6g:tau=0.5")
-    object.__setattr__(point, "more", (kind(),))
-    with pytest.raises(UserError, match=r"^part Mine fails \("):
+    object.__setattr__(point, "more", (made(**{hook: value}),))
+    with pytest.raises(UserError, match=r"^part mine of package by-hand fails \("):
         ask(point)
+
+
+def test_an_obstacle_is_one_line_or_none() -> None:
+    def told(said: Any) -> str | None:
+        return obstacle(of_part("obstacle", lambda *_: said), cast(Any, None), cast(Any, None))
+
+    assert told("a\nb\x1b[31m" + 1000 * "!") == "a b\\x1b[31m" + 288 * "!" + "…"
+    assert told(None) is None
+    for said in ("", " \n", 5, ["x"]):
+        with pytest.raises(UserError, match=r"^part mine of package by-hand fails .* no text, and"):
+            told(said)

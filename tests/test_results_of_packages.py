@@ -4,7 +4,8 @@ copied.
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import wraps
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -17,12 +18,15 @@ from harness.coordination.consensus import Fused, Messages
 from harness.coordination.coordinate import _by_rule
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
+from harness.radio import constant
 from harness.radio.channel import Broadcast, Delivery, Draws, Links
-from harness.radio.profiles import CHANNELS
-from harness.radio.wrapped import broadcast, delivered
+from harness.radio.profiles import CHANNELS, NO_CHANNEL
+from harness.radio.wrapped import Wrapped, broadcast, delivered
+from harness.radio.wrapped import is_ours as wrapped_is_ours
 from harness.world import scenarios
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import Building
+from harness.world.world import World
 
 P = np.full((2, 2), 0.5)
 HEARD = np.ones((2, 1), dtype=bool)
@@ -241,6 +245,7 @@ def test_what_a_scenario_returns_is_held_to_what_it_must_be(
         (replace(SCENARIO, parameters=cast(Any, 5)), "its parameters are no Parameters"),
         (replace(SCENARIO, description=""), "its description is no text"),
         (replace(SCENARIO, words={"task": cast(Any, 5)}), "its words hold what is no text"),
+        (replace(SCENARIO, world=World), "it has a world of its own; register an environment"),
         (replace(SCENARIO, one_sided=cast(Any, 5)), "one_sided is no text"),
         (replace(SCENARIO, dials=("zork",)), "its dial 'zork' is no parameter"),
         (replace(SCENARIO, actions=()), "its actions are (), and not SLOWER, IDLE, FASTER, with"),
@@ -252,11 +257,13 @@ def test_what_a_scenario_returns_is_held_to_what_it_must_be(
 def test_what_a_scenario_says_of_itself_is_checked(
     scenario: Scenario, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = SimpleNamespace(value="packages:MINE", load=lambda: scenario)
+    package = type("Package", (), {"name": "by-hand"})
+    entry = SimpleNamespace(value="packages:MINE", load=lambda: scenario, dist=package)
     monkeypatch.setattr(scenarios.PLUG_INS, "_entries", lambda: {SCENARIO.name: entry})
     with pytest.raises(UserError) as error:
         scenarios.PLUG_INS[SCENARIO.name]
-    named = f"plug-in '{SCENARIO.name}' (swarmdrive.scenarios) fails (ValueError: "
+    plug_in = f"plug-in '{SCENARIO.name}' (swarmdrive.scenarios) of package by-hand"
+    named = f"{plug_in} fails (ValueError: "
     assert str(error.value).startswith(named)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
@@ -284,6 +291,27 @@ def test_a_scenario_is_the_same_behind_its_door_and_one_here_has_none() -> None:
     assert again.road() is SCENARIO.road()
     spawns: tuple[Spawn, ...] = SCENARIO.layout(1, SCENARIO.parameters).spawns
     assert spawns == LAYOUT.spawns
+    for name in scenarios._files():
+        here = scenarios.get(name)
+        for function in (here.road, here.layout, here.cleared, here.seats):
+            assert type(function).__module__ != "harness.world.scenario_of_package", name
+
+
+def test_what_only_states_that_it_is_ours_has_a_door() -> None:
     here = scenarios.get("all-way-crossing")
-    for function in (here.road, here.layout, here.cleared, here.seats):
-        assert type(function).__module__ != "harness.world.scenario_of_package"
+
+    @wraps(here.cleared)
+    def everywhere(*given: Any) -> Any:
+        return 5
+
+    wrapped = replace(here, name="mine", cleared=everywhere)
+    with pytest.raises(UserError, match=r"^scenario mine fails \(ValueError: cleared of type int"):
+        wrapped.cleared(np.zeros((1, 1, 2)), np.array([["s"]]), here.parameters)
+    named = {"__module__": constant.Radio.__module__}
+    ours, hidden = replace(NO_CHANNEL), replace(NO_CHANNEL)
+    object.__setattr__(hidden, "deliver", lambda links, draws: 5)
+    stated = type("Radio", (constant.Radio,), named)(**asdict(NO_CHANNEL))
+    around = type("Around", (Wrapped,), {})(CHANNELS["mode4"])
+    assert wrapped_is_ours(ours)
+    for channel in (hidden, stated, around):
+        assert not wrapped_is_ours(channel)

@@ -13,7 +13,7 @@ from harness.cli.options import as_command
 from harness.cli.progress import bar
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
-from harness.core.strangers import is_ours, worded
+from harness.core.strangers import worded
 from harness.runs.exports import EXPORTS, Export, Option, options_of
 
 # Words of the command's own options.
@@ -181,7 +181,8 @@ def command(
                 for flag, value in typed.items()
                 if own.get(flag) is further[flag]
             }
-            with bar(format.doing), worded(f"format {option}", built_in=is_ours(format)):
+            built_in = EXPORTS.is_ours(option.removeprefix("--"))
+            with bar(format.doing), worded(f"format {option}", built_in):
                 wrote: object = format.write(source, file, dataset, **rest)
                 if not (isinstance(wrote, Path) and wrote.exists()):
                     raise ValueError("it wrote no file")

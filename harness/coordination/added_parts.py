@@ -3,9 +3,10 @@
 import sys
 from collections.abc import Collection, Mapping
 
-from harness.coordination.parts import Part
+from harness.coordination.parts import PACKAGES_PARTS, Part
 from harness.core.errors import UserError, printable
 from harness.core.extensions import added
+from harness.core.plugins import is_ours, package_of
 from harness.core.strangers import aside, worded
 
 GROUP = "swarmdrive.parts"
@@ -20,11 +21,13 @@ def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
     kinds: dict[str, type[Part]] = {}
     settings = set(taken)
     for name, entry in added(GROUP).items():
-        what = f"part {printable(name)} of an extension"
+        what = f"part {printable(name)} of package {package_of(entry)}"
         try:
             with worded(what, door=aside):
                 kind = entry.load()
                 _check(what, kind, settings)
+                if not is_ours(entry):
+                    PACKAGES_PARTS[kind] = what
                 kind()  # its defaults are allowed
         except UserError as error:
             print(f"harness: {error}; all else works", file=sys.stderr)

@@ -11,6 +11,7 @@ plan, which costs no further inference.
 
 import re
 from collections.abc import Sequence
+from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from harness.coordination.encodings import intent_bits
@@ -18,7 +19,6 @@ from harness.coordination.intents import Intents
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins
-from harness.core.strangers import is_ours
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -145,6 +145,8 @@ class Contents(Plugins[Content]):
         """Raise ValueError for a package's content that says of itself what does not go."""
         if not NAME.fullmatch(name) or name == WHOLE:
             raise ValueError("its name is no plain word")
+        if name in _own_calls():
+            raise ValueError("a call that ships has its name")
         holds, needs, call = plugin.holds, plugin.needs, plugin.call
         if not isinstance(holds, frozenset) or not holds or not holds <= set(KINDS):
             raise ValueError(f"holds is no frozenset of {', '.join(KINDS)}")
@@ -161,7 +163,7 @@ class Contents(Plugins[Content]):
             return
         if not isinstance(call, Call):
             raise ValueError("its call is no Call")
-        if not is_ours(call) and call.name != name:
+        if call.name != name:
             raise ValueError(f"its call is named {printable(repr(call.name))}")
         if bool(call.in_graph) == bool(call.in_words):
             raise ValueError("its call shows what was heard in the graph or in words, one of both")
@@ -177,6 +179,18 @@ CONTENTS = Contents(
         PLAN: OfPlan(),
     },
 )
+
+
+@cache
+def _own_calls() -> frozenset[str]:
+    """Return the names of the calls of contents that ship; no package's has one of them."""
+    contents = [CONTENTS[name] for name in CONTENTS if CONTENTS.is_ours(name)]
+    return frozenset(content.call.name for content in contents if content.call)
+
+
+def is_ours(call: Call) -> bool:
+    """Return whether a call is of a content that ships."""
+    return call.name in _own_calls()
 
 
 def of_any_model() -> list[str]:

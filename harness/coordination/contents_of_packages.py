@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import json
 
-from harness.coordination.contents import Call, Content
+from harness.coordination.contents import CONTENTS, Call, Content, is_ours
 from harness.coordination.intents import Intents
 from harness.core.arrays import Bools, Floats, Ints, check_shape, numbers, read_only
 from harness.core.config import LONGEST_S
 from harness.core.errors import printable
-from harness.core.strangers import is_ours, worded
+from harness.core.plugins import line_or_none
+from harness.core.strangers import worded
 from harness.world.scene_graph import SceneGraph
 
 if TYPE_CHECKING:
@@ -34,21 +35,16 @@ MOST_CHARACTERS = 10_000  # of a helper's words
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
     """Return why a condition's content cannot be played in a run; None if it can."""
     content = point.content
-    if is_ours(content):
+    if CONTENTS.is_ours(point.ask.content):
         return content.obstacle(point, run)
     with worded(_of(point)):
-        said = content.obstacle(point, run)
-        if said is None:
-            return None
-        if not isinstance(said, str) or not said.strip():
-            raise ValueError(f"an obstacle that is no text, and not None: {printable(repr(said))}")
-        return printable(_line(said), 300)
+        return line_or_none(content.obstacle(point, run), "an obstacle")
 
 
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
     """Return what helpers intend, of whom only those are valid that can send the content."""
     content = point.content
-    if is_ours(content):
+    if CONTENTS.is_ours(point.ask.content):
         return content.able(point, intents, senders)
     with worded(_of(point)):
         made = content.able(point, read_only(intents), read_only(senders))
@@ -74,7 +70,7 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
 def bits(point: "OperatingPoint", intents: Intents) -> Floats:
     """Return the size of each helper's reply by its condition's content, `(..., H)`."""
     content, encoding, headers = point.content, point.radio.encoding, point.physical is not None
-    if is_ours(content):
+    if CONTENTS.is_ours(point.ask.content):
         return content.bits(encoding, intents, headers)
     with worded(_of(point)):
         given = content.bits(encoding, read_only(intents), headers)

@@ -12,7 +12,15 @@ import msgspec
 from msgspec import structs
 
 from harness.coordination.added_parts import added_parts
-from harness.coordination.contents import CONTENTS, INTENTS, KINDS, PLANS, Call, Content
+from harness.coordination.contents import (
+    CONTENTS,
+    INTENTS,
+    KINDS,
+    PLANS,
+    Call,
+    Content,
+    is_ours,
+)
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
 from harness.coordination.parts import (
@@ -33,7 +41,7 @@ from harness.coordination.parts import (
     worded_part,
     wrong,
 )
-from harness.coordination.parts_of_packages import prepared
+from harness.coordination.parts_of_packages import prepared, speaker_of
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
@@ -44,7 +52,6 @@ from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import OfExtension, part_of, setting_of_extension
 from harness.core.pairs import pairs
-from harness.core.strangers import is_ours
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
 from harness.radio.networks import Network, network
@@ -562,9 +569,7 @@ class OperatingPoint:
     def speaker(self) -> Speaker:
         """Return what says to the channel what vehicles intend, in one walk."""
         for part in self.more:
-            with worded_part(part):
-                speaker = part.speaker()
-            if speaker:
+            if speaker := speaker_of(part):
                 return speaker
         return Honest()
 

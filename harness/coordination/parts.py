@@ -21,7 +21,7 @@ from harness.core.config import LONGEST_S, Seconds, description
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.plugins import Plugins
-from harness.core.strangers import is_ours, worded
+from harness.core.strangers import worded
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 
@@ -233,9 +233,18 @@ class Part(Struct, frozen=True, kw_only=True):
         return intents
 
 
+# What messages call the parts that packages add, by class; whose class is not here is none of them.
+PACKAGES_PARTS: dict[type[Part], str] = {}
+
+
+def is_ours(part: Part) -> bool:
+    """Return whether no package has added a part."""
+    return type(part) not in PACKAGES_PARTS
+
+
 def worded_part(part: Part) -> AbstractContextManager[None]:
     """Let a part act: what fails in a package's is one line, a UserError."""
-    return worded(f"part {type(part).__name__}", built_in=is_ours(part))
+    return worded(PACKAGES_PARTS.get(type(part), ""), built_in=is_ours(part))
 
 
 @contextmanager

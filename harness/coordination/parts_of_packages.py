@@ -5,12 +5,13 @@ So a part moves no condition but its own, in it nothing but what its hook is for
 line, a UserError.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Part, worded_part
+from harness.coordination.parts import Part, RunFacts, is_ours, worded_part
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.arrays import (
     Bools,
@@ -21,8 +22,19 @@ from harness.core.arrays import (
     numbers,
     read_only,
 )
-from harness.core.strangers import is_ours, worded
+from harness.core.plugins import line_or_none
 from harness.radio.channel import Draws
+
+if TYPE_CHECKING:
+    from harness.coordination.operating_point import OperatingPoint
+
+
+def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
+    """Return why a part cannot be played in a run; None if it can."""
+    if is_ours(part):
+        return part.obstacle(point, run)
+    with worded_part(part):
+        return line_or_none(part.obstacle(point, run), "an obstacle")
 
 
 def prepared(part: Part, intents: Intents) -> Intents:
@@ -39,26 +51,38 @@ def prepared(part: Part, intents: Intents) -> Intents:
         return replace(intents, own=own, helpers=helpers)
 
 
-def spoken(
-    speaker: Speaker, truth: Intents, draws: Draws, episode: Ints, seed: Ints
-) -> SentIntents:
-    """Return what a part's speaker says; nothing of the ego's is another's to say."""
-    if is_ours(speaker):
-        return speaker.said(truth, draws, episode, seed)
-    with worded(f"speaker {type(speaker).__name__}"):
-        sent = speaker.said(read_only(truth), read_only(draws), read_only(episode), read_only(seed))
-        now = sent.intents
-        for name, before, after in (
-            ("intent", truth.own, now.own),
-            ("place", truth.distance_m[:, 0], now.distance_m[:, 0]),
-            ("time", truth.inference_s[:, 0], now.inference_s[:, 0]),
-        ):
-            if not np.array_equal(before, after, equal_nan=True):
-                raise ValueError(f"it changes the ego's {name}")
-        check_shape("attackers", sent.attackers, now.valid.shape)
-        answered = now.valid if now.unasked is None else now.valid & ~now.unasked
-        check_distributions("intents", now.helpers, answered)
-    return sent
+@dataclass(frozen=True)
+class SpeakerOfPart:
+    """The door to a package's speaker: nothing of the ego's is another's to say."""
+
+    part: Part  # whose it is
+    speaker: Speaker
+
+    def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
+        given = (read_only(truth), read_only(draws), read_only(episode), read_only(seed))
+        with worded_part(self.part):
+            sent = self.speaker.said(*given)
+            now = sent.intents
+            for name, before, after in (
+                ("intent", truth.own, now.own),
+                ("place", truth.distance_m[:, 0], now.distance_m[:, 0]),
+                ("time", truth.inference_s[:, 0], now.inference_s[:, 0]),
+            ):
+                if not np.array_equal(before, after, equal_nan=True):
+                    raise ValueError(f"it changes the ego's {name}")
+            check_shape("attackers", sent.attackers, now.valid.shape)
+            answered = now.valid if now.unasked is None else now.valid & ~now.unasked
+            check_distributions("intents", now.helpers, answered)
+        return sent
+
+
+def speaker_of(part: Part) -> Speaker | None:
+    """Return what says to the channel what vehicles intend; None if they do."""
+    with worded_part(part):
+        speaker = part.speaker()
+    if speaker is None or is_ours(part):
+        return speaker
+    return SpeakerOfPart(part, speaker)
 
 
 def sources(part: Part, episode: Ints, seed: Ints) -> Ints:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from harness.core import formats
 from harness.core.errors import UserError, printable
-from harness.core.plugins import Plugins, entries, is_ours
+from harness.core.plugins import Added, Plugins, entries, is_ours
 from harness.core.strangers import worded
 
 GROUP = "swarmdrive.extensions"
@@ -172,15 +172,13 @@ def added(group: str) -> Mapping[str, Any]:
     """Return the entry points of the plug-ins of a group, such as `swarmdrive.rules`,
     that extensions add.
     """
-    from importlib.metadata import EntryPoint
-
     if group == GROUP:
         return {}
-    kind = group.rpartition(".")[2]
+    kind, declared = group.rpartition(".")[2], entries(GROUP)
     by_name: dict[str, Any] = {}
     for extension in extensions().values():  # those that ship come first
         for name, place in extension.adds.get(kind, {}).items():
-            by_name.setdefault(name, EntryPoint(name, place, group))
+            by_name.setdefault(name, Added(place, declared[extension.name].dist))
     return by_name
 
 

@@ -4,6 +4,7 @@ import os
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -16,6 +17,7 @@ T = TypeVar("T")
 Said = TypeVar("Said")
 # whether a value is one that a plug-in may state, and which are, in words
 Allowed = tuple[Callable[[Any], bool], str]
+OURS = "swarmdrive-harness"  # the name of this distribution
 LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
@@ -66,8 +68,34 @@ def _all_entries(path: tuple[str, ...]) -> Any:
 
 
 def is_ours(entry: Any) -> bool:
-    """Return whether an entry point is of this distribution, whose names nobody else's replace."""
-    return str(entry.value).startswith("harness.")
+    """Return whether an entry point is of this distribution, whose names nobody else's replace.
+
+    A package's may name an object of the harness's: who has the entry point decides.
+    """
+    return str(entry.value).startswith("harness.") and _name_of(entry.dist) == OURS
+
+
+def package_of(entry: Any) -> str:
+    """Return the package that has an entry point, for messages."""
+    return printable(_name_of(getattr(entry, "dist", None)) or "of no name")
+
+
+@cache  # a distribution reads its metadata at each look
+def _name_of(distribution: Any) -> str:
+    return str(getattr(distribution, "name", "") or "")
+
+
+@dataclass(frozen=True)
+class Added:
+    """An object that an extension adds, as an entry point of the package that has the extension."""
+
+    value: str  # its place, `module:name`
+    dist: Any  # the package's distribution
+
+    def load(self) -> Any:
+        from importlib.metadata import EntryPoint
+
+        return EntryPoint("", self.value, "").load()
 
 
 @cache
@@ -85,6 +113,18 @@ def texts(said: Any, what: str = "its answer") -> list[str]:
     if isinstance(said, str) or not all(isinstance(text, str) for text in each):
         raise TypeError(f"{what} holds what is no text")
     return ["".join((text,)) for text in each]
+
+
+def line_or_none(said: Any, what: str) -> str | None:
+    """Return a package's text as a plain one of one line, 300 characters at most; None as it is.
+
+    Raises ValueError, which names `what` it is, for what is no text, or an empty one.
+    """
+    if said is None:
+        return None
+    if not isinstance(said, str) or not said.strip():
+        raise ValueError(f"{what} that is no text, and not None: {printable(repr(said))}")
+    return printable(" ".join("".join((said,)).split()), 300)
 
 
 class Failed(UserError):
@@ -135,6 +175,11 @@ class Plugins(Mapping[str, T], Generic[T]):
         from harness.core.extensions import shipped
 
         return name in self.built_in or name in shipped(self.group)
+
+    def of_package(self, name: str) -> str:
+        """Return what messages call a package's plug-in, whose package they name."""
+        package = package_of(self._entries()[name])
+        return f"plug-in {printable(name)!r} ({self.group}) of package {package}"
 
     def usable(self) -> dict[str, T]:
         loaded = resources.each(self, self.__getitem__)
@@ -197,7 +242,7 @@ class Plugins(Mapping[str, T], Generic[T]):
                 raise UserError(
                     f"{what} has {field} {printable(repr(value))}; allowed: {allowed}; {repair}"
                 )
-        with worded(f"plug-in {printable(name)!r} ({self.group})", is_ours(entry), aside):
+        with worded(self.of_package(name), is_ours(entry), aside):
             self.check(name, plugin)
         return plugin
 

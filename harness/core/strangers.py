@@ -15,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
+from typing import Any
 
 from harness.core.errors import UserError, printable
 from harness.core.process import Stop
@@ -83,8 +84,25 @@ def aside(what: str) -> Iterator[None]:
 
 
 def is_ours(thing: object) -> bool:
-    """Return whether a thing's class is the harness's own, and no package's."""
-    return type(thing).__module__.startswith("harness.")
+    """Return whether a thing acts by the harness's own code: its class is one that a module of the
+    harness has, and nothing that the thing has hides a member of it.
+
+    What a class states of its module anybody can write.
+    """
+    kind = type(thing)
+    hides = [name for name in getattr(thing, "__dict__", ()) if callable(getattr(kind, name, None))]
+    return is_in_harness(kind) and not hides
+
+
+def is_in_harness(named: Any) -> bool:
+    """Return whether a class or function is the one of its name in a module of the harness."""
+    module = str(getattr(named, "__module__", ""))
+    if not module.startswith("harness."):
+        return False
+    found: object = sys.modules.get(module)
+    for name in str(getattr(named, "__qualname__", "")).split("."):
+        found = getattr(found, name, None)
+    return found is named
 
 
 @contextmanager

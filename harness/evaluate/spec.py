@@ -13,10 +13,9 @@ from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
-from harness.coordination import contents_of_packages
+from harness.coordination import contents_of_packages, parts_of_packages
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
-from harness.coordination.parts import worded_part
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
@@ -309,9 +308,7 @@ class Spec:
         if obstacle := contents_of_packages.obstacle(point, self):
             return obstacle
         for part in point.more:
-            with worded_part(part):
-                obstacle = part.obstacle(point, self)
-            if obstacle:
+            if obstacle := parts_of_packages.obstacle(part, point, self):
                 return obstacle
         return None
 

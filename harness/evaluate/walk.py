@@ -19,7 +19,7 @@ from harness.coordination.exchange import Exchange, exchange, needed
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.parts import PLAIN, Question
-from harness.coordination.parts_of_packages import sources, spoken
+from harness.coordination.parts_of_packages import sources
 from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents
@@ -229,7 +229,7 @@ def _steps(
         for point, due_here in due.items():
             own = heard(point, answers, due_here)
             speaker, draws = speakers[point], due_here.draws
-            said[point] = spoken(speaker, own, draws, due_here.episode, due_here.seed)
+            said[point] = speaker.said(own, draws, due_here.episode, due_here.seed)
             sent[point] = exchange(point, said[point].intents, said[point].draws)
             ties_here = tie_draws(draws, ties)
             fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)

@@ -51,8 +51,10 @@ def innermost(channel: Channel) -> Channel:
 
 
 def is_ours(channel: Channel) -> bool:
-    """Return whether a channel's model is the harness's own, and no package's."""
-    return strangers.is_ours(innermost(channel))
+    """Return whether a channel's model, and what wraps it, are the harness's own."""
+    if not strangers.is_ours(channel):
+        return False
+    return not isinstance(channel, Wrapped) or is_ours(channel.channel)
 
 
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:

@@ -16,7 +16,7 @@ from msgspec import convert
 
 from harness.core.arrays import Bools, Floats, Texts, check_shape, read_only
 from harness.core.errors import printable
-from harness.core.strangers import worded
+from harness.core.strangers import is_in_harness, worded
 from harness.world.fields import Kind, Number, Part, VehicleId
 from harness.world.parameters import BOUNDS
 from harness.world.road import Ground, PathKey, Road
@@ -90,8 +90,7 @@ def put_doors(scenario: Scenario) -> None:
 
 def is_ours(function: Callable[..., Any]) -> bool:
     """Return whether a function, or that of a partial one, is the harness's own."""
-    module = getattr(getattr(function, "func", function), "__module__", None)
-    return str(module).startswith("harness.") and not isinstance(function, _Door)
+    return is_in_harness(getattr(function, "func", function))
 
 
 def _own(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -40,9 +40,8 @@ class Names:
 def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A format of a package, and two whose names are taken or no option's."""
     added = {"names-of": Names(), "csv": Names(), "no name": Names()}
-    monkeypatch.setattr(EXPORTS, "built_in", added)
     monkeypatch.setattr(EXPORTS, "_loaded", dict(added))
-    monkeypatch.setattr(EXPORTS, "_entries", dict)
+    monkeypatch.setattr(EXPORTS, "_entries", lambda: added)
     reload(export)  # which looks for formats as it is imported
     yield
     monkeypatch.undo()

@@ -535,10 +535,10 @@ def test_a_package_adds_a_part_of_a_condition(tmp_path: Path, two_path: Path) ->
 
 PARTS = "from harness.coordination.parts import Ask, Part\nclass Own(Part, frozen=True):\n    "
 BROKEN_PARTS = {
-    "ODD = 3": "part odd of an extension is no subclass of Part; repair its package",
+    "ODD = 3": "part odd of package by-hand is no subclass of Part; repair its package",
     f"{PARTS}tau_nats: float = 0.0\nODD = Own": "has setting tau_nats, which another part has",
     f"{PARTS}own: float = 0.0\nODD = Own": "stands behind '', which is no setting",
-    "ODD = 1 / 0": "part odd of an extension fails (ZeroDivisionError: division by zero at",
+    "ODD = 1 / 0": "part odd of package by-hand fails (ZeroDivisionError: division by zero at",
 }
 
 

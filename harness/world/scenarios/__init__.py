@@ -39,11 +39,13 @@ class PackagesScenarios(Plugins[Scenario]):
             raise ValueError("its words hold what is no text")
         if not isinstance(plugin.one_sided, str | None):
             raise ValueError("one_sided is no text, and not None")
+        if plugin.world is not None:
+            raise ValueError("it has a world of its own; register an environment, and name env:ID")
         actions = plugin.actions
         if not isinstance(actions, tuple) or len(set(actions)) < len(actions):
             raise ValueError("its actions are no tuple, or one is there twice")
         needed = environment.KNOWN_ACTIONS
-        if not plugin.is_environment and not {*needed} <= {*actions} <= {*needed, *FURTHER}:
+        if not {*needed} <= {*actions} <= {*needed, *FURTHER}:
             allowed = f"{', '.join(needed)}, with or without {' and '.join(FURTHER)}"
             raise ValueError(f"its actions are {printable(repr(actions))}, and not {allowed}")
         for dial in plugin.dials:

@@ -17,7 +17,6 @@ so neither is first more often; ids tell nobody's place.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -104,7 +103,7 @@ def road(own: str = EGO) -> Road:
         paths[approach, route] = path
     meetings = crossings(paths, ego)
     at, ego_path = meetings["left", "straight"], paths[ego]
-    beyond_goal = cleared_from(own)(ego_path.points[:, None], np.array(ego[0]), None)
+    beyond_goal = cleared(own, ego_path.points[:, None], np.array(ego[0]), None)
     goal_m = float(ego_path.arc_m[beyond_goal.argmax()])
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     sectors = {}
@@ -127,19 +126,15 @@ def road(own: str = EGO) -> Road:
     )
 
 
-def cleared_from(own: str) -> Callable[[Floats, Texts, Any], Bools]:
+def cleared(own: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
     """Return whether an agent from an arm has left the ring,
     past the next entry and who enters there.
     """
     turned_rad, edge_m = math.pi / 2 * ARMS.index(own), PLACE.ring_m + LANE_WIDTH_M / 2
-
-    def cleared(xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
-        x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
-        at_rad = (np.arctan2(y, x) + turned_rad + math.pi) % (2 * math.pi) - math.pi
-        beyond = (-math.pi / 2 < at_rad) & (at_rad < PLACE.ring_rad(3))
-        return np.asarray(beyond & (np.hypot(x, y) > edge_m))
-
-    return cleared
+    x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
+    at_rad = (np.arctan2(y, x) + turned_rad + math.pi) % (2 * math.pi) - math.pi
+    beyond = (-math.pi / 2 < at_rad) & (at_rad < PLACE.ring_rad(3))
+    return np.asarray(beyond & (np.hypot(x, y) > edge_m))
 
 
 @cache
@@ -147,7 +142,7 @@ def seats() -> dict[PathKey, Seat]:
     """Return the seats of those from the west and the east."""
     seats = {}
     for arm in "we":
-        mine = replace(SCENARIO, road=partial(road, arm), cleared=cleared_from(arm))
+        mine = replace(SCENARIO, road=partial(road, arm), cleared=partial(cleared, arm))
         names = {key_of(a, leaves): key_of(a, leaves, arm) for a in ARMS for leaves in (2, 3)}
         seats[key_of(arm, 2)] = Seat(mine, names)
     return seats
@@ -212,7 +207,7 @@ SCENARIO = Scenario(
     parameters=Parameters(),
     road=road,
     layout=layout,
-    cleared=cleared_from(EGO),
+    cleared=partial(cleared, EGO),
     dials=SHARED,
     seats=seats,
     words={
