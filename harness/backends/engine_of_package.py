@@ -7,23 +7,28 @@ one line, a UserError.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from harness.backends.base import Backend, Completion, Request
+from harness.backends.base import Backend, Completion, Request, Served, forget
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
+from harness.core.plugins import line_or_none, texts
 from harness.core.strangers import worded
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
+    from harness.runs.records import Latency
 
+N = TypeVar("N", None, int)
 SILENT = "the engine gives no reason"
+MOST_REQUESTS = 100_000  # at once, or in one batch
+UNSTATED = object()
 
 
 class EngineOfPackage:
-    """Check what the backend of a package's engine answers;
+    """Check what the backend of a package's engine answers, and what it says of itself;
     all other attributes are passed on to that backend.
     """
 
@@ -67,8 +72,70 @@ class EngineOfPackage:
             plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(identity))
             return plain
 
+    @property
+    def window(self) -> int:
+        return self._number("window", 0)
+
+    @property
+    def batch_size(self) -> int | None:
+        return self._number("batch_size", None)
+
+    @property
+    def doubt(self) -> str | None:
+        with worded(self._what):
+            return line_or_none(getattr(self._backend, "doubt", None), "a doubt")
+
+    @property
+    def several(self) -> Sequence[str]:
+        with worded(self._what):
+            return texts(getattr(self._backend, "several", ()), "several")
+
+    def served(self) -> list[Served]:
+        with worded(self._what):
+            taken: Any = getattr(self._backend, "served", list)()
+            return [convert(dict(vars(each)), Served, f"{self._what}, served") for each in taken]
+
+    def rendered(self, requests: Sequence[Request]) -> list[str]:
+        with worded(self._what):
+            backend: Any = self._backend
+            prompts = texts(backend.rendered([_copy(each) for each in requests]), "rendered")
+            if len(prompts) != len(requests):
+                raise ValueError(f"it renders {len(prompts)} of {len(requests)} requests")
+            for prompt in prompts:
+                prompt.encode()  # which no lone surrogate lets itself be
+            return prompts
+
+    def latency(self) -> "Latency":
+        from harness.runs.records import Latency  # imported here because it is slow
+
+        with worded(self._what):
+            backend: Any = self._backend
+            stated = msgspec.json.encode(backend.latency())
+            return convert(msgspec.json.decode(stated), Latency, f"{self._what}, latency")
+
+    def forget(self) -> None:
+        with worded(self._what):
+            forget(self._backend)
+
+    def _number(self, name: str, unstated: N) -> int | N:
+        """Return a number of requests that a backend states.
+        Raises UserError for what is none.
+        """
+        with worded(self._what):
+            number = getattr(self._backend, name, unstated)
+            if number is unstated:
+                return unstated
+            if type(number) is not int or not 0 <= number <= MOST_REQUESTS:
+                shown = printable(repr(number))
+                raise ValueError(f"{name} {shown} is no number of requests, 0 to {MOST_REQUESTS}")
+            return number
+
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
+        with worded(self._what):
+            found = getattr(self._backend, name, UNSTATED)
+        if found is UNSTATED:
+            raise AttributeError(name)
+        return found
 
 
 def _copy(request: Request) -> Request:

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from harness.backends.base import AnswerMode, Backend
 from harness.backends.engine_of_package import EngineOfPackage
 from harness.core import extras
+from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
-from harness.core.strangers import strangers, worded
+from harness.core.strangers import aside, strangers, worded
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -133,7 +134,18 @@ BUILT_IN: Mapping[str, Registration] = {
 }
 
 
-ENGINES: Plugins[Registration] = Plugins("swarmdrive.backends", Registration, BUILT_IN)
+class Engines(Plugins[Registration]):
+    """All engines, by name. A package's registration is checked, and copied."""
+
+    def _load(self, name: str) -> Registration:
+        stated = super()._load(name)
+        what = self.of_package(name)
+        with worded(what, door=aside):
+            fields = {**vars(stated), "capabilities": dict(vars(stated.capabilities))}
+            return convert(fields, Registration, what)
+
+
+ENGINES = Engines("swarmdrive.backends", Registration, BUILT_IN)
 
 
 def registration(engine: str) -> Registration:
@@ -204,6 +216,12 @@ def import_object(place: str) -> Any:
     return getattr(import_module(module), name)
 
 
+def asked(card: "Card", place: str) -> Any:
+    """Return what a function of a card's engine at `module:name` says of the card."""
+    with worded(f"engine {printable(card.engine)}", built_in=card.engine in BUILT_IN):
+        return import_object(place)(card)
+
+
 def missing_package(engine: str) -> str | None:
     """Return the first package that an engine needs and that is not installed; None if all are."""
     packages = registration(engine).packages
@@ -228,7 +246,9 @@ def locate(card: "Card") -> Path:
     """Return where the weights of a card lie for its engine.
     Raises UserError if they are not found.
     """
-    where: Path = import_object(registration(card.engine).finds)(card)
+    where = asked(card, registration(card.engine).finds)
+    if not isinstance(where, Path):
+        raise UserError(f"engine {printable(card.engine)} finds no path; repair its package")
     return where
 
 
@@ -238,5 +258,7 @@ def processor_tokens(card: "Card") -> int | None:
     """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None
-    tokens: int = import_object(sees)(card)
+    tokens = asked(card, sees)
+    if type(tokens) is not int or tokens < 0:
+        raise UserError(f"engine {printable(card.engine)} counts no tokens; repair its package")
     return tokens

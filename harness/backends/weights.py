@@ -14,8 +14,8 @@ from harness.backends.adapters import find_adapter
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
 from harness.backends.registry import (
+    asked,
     capabilities,
-    import_object,
     locate,
     missing_package,
     registration,
@@ -183,7 +183,7 @@ def pull(card: Card) -> Path:
     engine, where = registration(card.engine), locate(card)
     check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
-        import_object(engine.prepares)(card)
+        asked(card, engine.prepares)
     return where
 
 

@@ -5,15 +5,17 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from msgspec import structs
 from packaged import register
 
 from harness.backends import cards, registry
-from harness.backends.base import MOST_CHARS, Completion, Request
+from harness.backends.base import MOST_CHARS, Completion, Request, Served
 from harness.backends.engine_of_package import SILENT, EngineOfPackage
 from harness.core.errors import UserError
+from harness.runs.records import Latency
 
 MODULE = """
 from dataclasses import replace
@@ -28,12 +30,14 @@ ECHO = replace(
 BARE = Registration(
     "echoing:opened", Capabilities(), packages={"no_such_module": "a-package"}, install="pip install it"
 )
+WIDE = replace(CAUTIOUS, answers="many")
 """
 ENTRIES = """[swarmdrive.backends]
 echo = echoing:ECHO
 bare = echoing:BARE
 gone = no_such_module:ECHO
 odd = echoing:answer
+wide = echoing:WIDE
 """
 CARD = """engine = "echo"
 description = "Slows down where it sees a conflict"
@@ -63,7 +67,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_card_names_it_and_it_is_listed_and_run(
     project: Path, small_path: Path, harness: Callable[..., tuple[int, str, str]]
 ) -> None:
-    assert list(registry.ENGINES) == [*registry.BUILT_IN, "bare", "echo", "gone", "odd"]
+    assert list(registry.ENGINES) == [*registry.BUILT_IN, "bare", "echo", "gone", "odd", "wide"]
     _, out, _ = harness("model", "list", "--json")
     [listed] = [card for card in json.loads(out) if card["name"] == "echo-1"]
     assert (listed["engine"], listed["missing"]) == ("echo", None)
@@ -139,6 +143,58 @@ def test_answers_that_cannot_be_are_one_line(answers: Callable[[Request], Any], 
         EngineOfPackage(Engine(answers), PROXY).complete([REQUEST])
 
 
+LONE = "\udc80"
+LATENCY = Latency("declared", "mine", 0.1, 0.1, 0.1)
+ODD_FACTS = [
+    (fact, odd)
+    for fact, odds in {
+        "window": (-1, 1.5, True, math.nan, "4", 10**30, None),
+        "batch_size": (-1, "8", 10**30),
+        "doubt": (5, "", b"x"),
+        "several": ("http://a", 5, [5]),
+        "served": (5, lambda: 5, lambda: [5], lambda: [Served("a", cast(Any, 5))]),
+        "latency": (
+            None,
+            lambda: 5,
+            lambda: structs.replace(LATENCY, ego_s=math.nan),
+            lambda: structs.replace(LATENCY, ego_s=-1.0),
+            lambda: structs.replace(LATENCY, ego_s=1e300),
+            lambda: structs.replace(LATENCY, ego_s=None),
+        ),
+        "rendered": (
+            None,
+            lambda given: 5,
+            lambda given: [],
+            lambda given: [5],
+            lambda given: [LONE],
+        ),
+        "forget": (lambda: 1 / 0,),
+        "chat": (property(lambda engine: 1 / 0),),
+    }.items()
+    for odd in (*odds, property(lambda engine: 1 / 0))
+]
+
+
+@pytest.mark.parametrize(("fact", "odd"), ODD_FACTS)
+def test_what_an_engine_says_of_itself_is_asked_behind_the_door(fact: str, odd: Any) -> None:
+    given = staticmethod(odd) if callable(odd) else odd
+    engine: Any = EngineOfPackage(type("Odd", (Engine,), {fact: given})(stopped), PROXY)
+    asked = ([REQUEST],) if fact == "rendered" else ()
+    with pytest.raises(UserError, match=r"^engine proxy(, [a-z]+)?(: | fails \()") as error:
+        getattr(engine, fact)(*asked)
+    assert "\n" not in str(error.value)
+
+
+def test_an_engine_that_says_nothing_of_itself_has_what_is_usual() -> None:
+    engine = EngineOfPackage(Engine(stopped), PROXY)
+    assert (engine.window, engine.batch_size, engine.doubt) == (0, None, None)
+    assert (engine.several, engine.served(), getattr(engine, "chat", 5)) == ([], [], 5)
+    engine.forget()
+    said = {"served": lambda engine: [Served("a", "b")], "latency": lambda engine: LATENCY}
+    engine = EngineOfPackage(type("Said", (Engine,), {**said, "window": 3})(stopped), PROXY)
+    assert (engine.window, engine.latency(), engine.served()) == (3, LATENCY, [Served("a", "b")])
+
+
 def test_what_it_does_to_requests_and_answers_stays_its_own() -> None:
     def greedy(request: Request) -> list[Completion]:
         request.messages[0]["content"] = "other"  # type: ignore[index]
@@ -177,6 +233,10 @@ def test_an_identity_that_is_none_is_one_line() -> None:
         (
             ('"echo"', '"odd"'),
             "plug-in 'odd' .*: echoing:answer is of type function and no Registration",
+        ),
+        (
+            ('"echo"', '"wide"'),
+            "plug-in 'wide' .* of package by-hand: answers = 'many'; allowed: a whole number",
         ),
     ],
 )
