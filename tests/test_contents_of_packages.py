@@ -30,6 +30,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, calls, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene
+from harness.prompts import versions
 
 # A list of what is within some metres, which costs a bit for each of them.
 GLANCE = """
@@ -168,7 +169,11 @@ def of(content: Content, name: str = "mine") -> OperatingPoint:
     return cast(
         OperatingPoint,
         SimpleNamespace(
-            content=content, radio=radio, physical=None, ask=SimpleNamespace(content=name)
+            content=content,
+            radio=radio,
+            physical=None,
+            has_fusion_call=True,
+            ask=SimpleNamespace(content=name),
         ),
     )
 
@@ -257,6 +262,8 @@ def test_what_a_call_shows_is_a_graph_of_the_egos_or_a_line(small: Dataset) -> N
         call = shown(graphs=lambda self, scenario, cases, taken=taken: [taken])
         assert door.graphs(call, small.scenario, [cast(Any, case)]) == [taken]
     assert door.words(shown(words=lambda self, text: f"{text}\n!"), "Go") == "Go !"
+    with pytest.raises(UserError, match=r"^content mine fails .* surrogates not allowed"):
+        door.words(shown(words=lambda self, text: "\udcff"), "Go")
     with pytest.raises(UserError, match="words of type int"):
         door.words(shown(words=lambda self, text: 1), "Go")
     with pytest.raises(UserError, match=r"^content mine fails .* words of 10001 characters"):
@@ -264,12 +271,18 @@ def test_what_a_call_shows_is_a_graph_of_the_egos_or_a_line(small: Dataset) -> N
 
 
 def test_an_obstacle_is_one_line_or_none() -> None:
-    point, run = of(made(obstacle=lambda self, point, run: run)), cast(Any, "a\nb\x1b[31m")
-    assert door.obstacle(point, run) == "a b\\x1b[31m"
-    assert door.obstacle(point, cast(Any, None)) is None
+    run = cast(Any, SimpleNamespace(agents=[SimpleNamespace(prompt=versions.load("v2"))]))
+
+    def told(said: Any, **parts: Any) -> str | None:
+        return door.obstacle(of(made(obstacle=lambda *_: said, **parts)), run)
+
+    assert told("a\nb\x1b[31m") == "a b\\x1b[31m"
+    assert told(None) is None
     for said in ("", " \n", 5, ["x"]):
         with pytest.raises(UserError, match="an obstacle that is no text, and not None"):
-            door.obstacle(point, cast(Any, said))
+            told(said)
+    words = told(None, call=shown(in_words=True))
+    assert words == "prompt v2 cannot show words without an intent; use --prompt v11 or v12"
 
 
 def test_the_papers_own_goes_through_no_door() -> None:

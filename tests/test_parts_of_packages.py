@@ -10,16 +10,19 @@ import pytest
 
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, kept_of, named_point
-from harness.coordination.parts import PACKAGES_PARTS, Kept, Part, Question
+from harness.coordination.parts import PACKAGES_PARTS, PLAIN, Kept, Part, Question
 from harness.coordination.parts_of_packages import (
     SpeakerOfPart,
     after_call,
+    change_by,
     obstacle,
     prepared,
+    shown,
     sources,
 )
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
+from harness.dataset.load import Dataset, Scene
 from harness.radio.channel import Draws
 
 P = np.full((2, 2), 0.5)
@@ -178,6 +181,55 @@ def test_what_a_part_says_of_itself_is_asked_behind_the_door(
     object.__setattr__(point, "more", (made(**{hook: value}),))
     with pytest.raises(UserError, match=r"^part mine of package by-hand fails \("):
         ask(point)
+
+
+MESSAGE = {"intent": [0.25, 0.75], "evidence": "Clear.", "confidence": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda m: None, "'NoneType' object has no attribute 'keys'"),
+        (lambda m: {"intent": m["intent"]}, "it adds members to a message, or leaves some out"),
+        (lambda m: {**m, "zork": 1}, "it adds members to a message, or leaves some out"),
+        (lambda m: {**m, "confidence": "high"}, "it gives confidence of type str"),
+        (lambda m: {**m, "evidence": 5}, "it gives evidence of type int"),
+        (lambda m: {**m, "evidence": "\ud800"}, "surrogates not allowed"),
+        (lambda m: {**m, "intent": [0.5]}, "an intent of shape (1,), not (2,)"),
+        (lambda m: {**m, "intent": [np.nan, 1.0]}, "an intent that are no distributions"),
+        (lambda m: {**m, "intent": [2.0, -1.0]}, "an intent that are no distributions"),
+        (lambda m: {**m, "intent": object()}, "Encoding objects of type object"),
+    ],
+)
+def test_what_a_part_does_to_messages_is_held_to_what_a_message_is(
+    act: Callable[..., Any], says: str
+) -> None:
+    class Alters:
+        adds = False
+
+        def message(self, message: Any, actions: Any) -> Any:
+            return act(message)
+
+    change = change_by(type(made(change=lambda text: Alters())), "zork")
+    assert change is not None
+    with pytest.raises(UserError) as error:
+        change.message(MESSAGE, ("GO", "STAY"))
+    assert str(error.value).startswith("part mine of package by-hand fails (")
+    assert says in str(error.value)
+
+
+def test_what_a_part_asks_helpers_is_a_graph_of_the_helpers(small: Dataset) -> None:
+    class Asks(Question):
+        def shown(self, graph: Any) -> Any:
+            return "a graph"
+
+    question = Asks("mine")
+    made(questions=(question,))
+    scene: Scene = small.scenes(small.courses())[0]
+    graph = scene.graphs[scene.viewers[1]]
+    with pytest.raises(UserError, match=r"^part mine of .* no graph of the helper's"):
+        shown(question, graph)
+    assert shown(PLAIN, graph) is graph
 
 
 def test_an_obstacle_is_one_line_or_none() -> None:

@@ -3,10 +3,11 @@
 import sys
 from collections.abc import Collection, Mapping
 
-from harness.coordination.parts import PACKAGES_PARTS, Part
+from harness.coordination.contents import NAME
+from harness.coordination.parts import PACKAGES_PARTS, Part, Question
 from harness.core.errors import UserError, printable
 from harness.core.extensions import added
-from harness.core.plugins import is_ours, package_of
+from harness.core.plugins import is_ours, package_of, texts
 from harness.core.strangers import aside, worded
 
 GROUP = "swarmdrive.parts"
@@ -44,5 +45,10 @@ def _check(what: str, kind: object, taken: Collection[str]) -> None:
         raise UserError(
             f"{what} has setting {lost[0]}, which another part has; give it another name"
         )
+    texts((*kind.controls, *kind.controls.values()), "controls")
+    texts((*kind.usual, *kind.usual.values()), "usual")
+    for question in kind.questions:
+        if not isinstance(question, Question) or not NAME.fullmatch(question.name):
+            raise ValueError("questions hold what is no Question with a plain word for its name")
     if kind.behind not in taken:
         raise UserError(f"{what} stands behind {printable(kind.behind)!r}, which is no setting")

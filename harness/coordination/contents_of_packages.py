@@ -34,7 +34,11 @@ MOST_CHARACTERS = 10_000  # of a helper's words
 
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
     """Return why a condition's content cannot be played in a run; None if it can."""
-    content = point.content
+    content, prompt = point.content, run.agents[0].prompt
+    if point.has_fusion_call and content.call and content.call.in_words and not prompt.shows_words:
+        return (
+            f"prompt {prompt.version} cannot show words without an intent; use --prompt v11 or v12"
+        )
     if CONTENTS.is_ours(point.ask.content):
         return content.obstacle(point, run)
     with worded(_of(point)):
@@ -91,7 +95,10 @@ def graphs(
         given = list(call.graphs(scenario, cases))
         if len(given) != len(cases):
             raise ValueError(f"{len(given)} graphs of {len(cases)} cases")
-        return [_graph(*each) for each in zip(given, cases, strict=True)]
+        graphs = []
+        for graph, case in zip(given, cases, strict=True):
+            graphs.append(None if graph is None else graph_like(graph, case.own, "the ego's"))
+        return graphs
 
 
 def words(call: Call, evidence: str) -> str:
@@ -104,22 +111,21 @@ def words(call: Call, evidence: str) -> str:
             raise ValueError(f"words of type {type(said).__name__}")
         if len(line := _line(said)) > MOST_CHARACTERS:
             raise ValueError(f"words of {len(line)} characters, more than {MOST_CHARACTERS}")
+        line.encode()  # which no lone surrogate lets itself be
         return line
 
 
-def _graph(given: object, case: "Heard") -> SceneGraph | None:
+def graph_like(given: object, own: SceneGraph, whose: str) -> SceneGraph:
     """Return a graph that a package gave as one that a file may have.
 
-    Raises ValueError or TypeError unless it is the ego's of this case, or None.
+    Raises ValueError or TypeError unless it is of the same viewer, role, step and ego as its `own`.
     """
-    if given is None:
-        return None
     if not isinstance(given, SceneGraph):
-        raise TypeError("it returns what is no graph of the ego's")
-    graph, own = json.decode(json.encode(given), type=SceneGraph), case.own
+        raise TypeError(f"it returns what is no graph of {whose}")
+    graph = json.decode(json.encode(given), type=SceneGraph)
     for name in ("viewer", "role", "step", "ego"):
         if getattr(graph, name) != getattr(own, name):
-            raise ValueError(f"it returns what is no graph of the ego's, whose {name} is another")
+            raise ValueError(f"it returns what is no graph of {whose}, whose {name} is another")
     return graph
 
 

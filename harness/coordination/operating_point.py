@@ -41,7 +41,7 @@ from harness.coordination.parts import (
     worded_part,
     wrong,
 )
-from harness.coordination.parts_of_packages import prepared, speaker_of
+from harness.coordination.parts_of_packages import change_by, prepared, speaker_of
 from harness.coordination.precedence import Precedence
 from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
@@ -113,7 +113,7 @@ def change_of(text: str) -> Change:
     Raises UserError for one that no part does.
     """
     for kind in more_parts().values():
-        if change := kind.change(text):
+        if (change := change_by(kind, text)) is not None:
             return change
     raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
 
@@ -132,7 +132,7 @@ def calls() -> Mapping[str, Call]:
 
 
 def _changes_messages(text: str) -> bool:
-    return any(kind.change(text) for kind in more_parts().values())
+    return any(change_by(kind, text) is not None for kind in more_parts().values())
 
 
 @cache

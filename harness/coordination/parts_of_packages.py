@@ -5,13 +5,25 @@ So a part moves no condition but its own, in it nothing but what its hook is for
 line, a UserError.
 """
 
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import json
 
+from harness.coordination.contents_of_packages import graph_like
 from harness.coordination.intents import Intents
-from harness.coordination.parts import Part, RunFacts, is_ours, worded_part
+from harness.coordination.parts import (
+    PACKAGES_PARTS,
+    Change,
+    Part,
+    Question,
+    RunFacts,
+    is_ours,
+    worded_part,
+)
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.arrays import (
     Bools,
@@ -23,7 +35,9 @@ from harness.core.arrays import (
     read_only,
 )
 from harness.core.plugins import line_or_none
+from harness.core.strangers import worded
 from harness.radio.channel import Draws
+from harness.world.scene_graph import SceneGraph
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -104,6 +118,60 @@ def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floa
     with worded_part(part):
         after = part.after_call(read_only(fused), read_only(intents), read_only(heard))
         return _distributions("policies", after, fused)
+
+
+@dataclass(frozen=True)
+class ChangeOfPart:
+    """The door to what a package's part does to messages."""
+
+    what: str  # the part, in messages
+    change: Change
+
+    @property
+    def adds(self) -> bool:
+        with worded(self.what):
+            return bool(self.change.adds)
+
+    def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
+        with worded(self.what):
+            own: dict[str, Any] = json.decode(json.encode(message))
+            changed: dict[str, Any] = json.decode(
+                json.encode(self.change.message(copy.deepcopy(own), actions))
+            )
+            if changed.keys() != own.keys():
+                raise ValueError("it adds members to a message, or leaves some out")
+            for name, value in changed.items():
+                kinds = (str, type(None)) if name == "evidence" else (type(own[name]),)
+                if type(value) not in kinds:
+                    raise TypeError(f"it gives {name} of type {type(value).__name__}")
+            if changed["intent"] != own["intent"]:
+                intent = numbers("an intent", np.array(changed["intent"], float), (len(actions),))
+                check_distributions("an intent", intent, np.array(True))
+            return changed
+
+    def graph(self, graph: SceneGraph, scenario: Any, scene: Any) -> SceneGraph:
+        with worded(self.what):
+            changed = self.change.graph(graph, scenario, scene)
+            return graph_like(changed, graph, "the sender's")
+
+
+def change_by(kind: type[Part], text: str) -> Change | None:
+    """Return what a kind of part does to a message by a text; None if it is no such text."""
+    what = PACKAGES_PARTS.get(kind)
+    if what is None:
+        return kind.change(text)
+    with worded(what):
+        change = kind.change(text)
+    return None if change is None else ChangeOfPart(what, change)
+
+
+def shown(question: Question, graph: SceneGraph) -> SceneGraph:
+    """Return the scene graph that a question shows of a helper's own."""
+    for kind, what in PACKAGES_PARTS.items():
+        if question in kind.questions:
+            with worded(what):
+                return graph_like(question.shown(graph), graph, "the helper's")
+    return question.shown(graph)
 
 
 def _distributions(name: str, after: object, before: Floats) -> Floats:

@@ -11,6 +11,7 @@ from harness.backends.base import Request
 from harness.backends.base import Role as AskedRole
 from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN, Question
+from harness.coordination.parts_of_packages import shown
 from harness.core.arrays import Bools, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import heard_in, key_of, messages_of
@@ -48,7 +49,7 @@ def requests(
             of_ego = not place
             if (of_ego and question != PLAIN) or (asked is not None and place not in asked):
                 continue
-            graph, index = question.shown(scene.graphs[viewer]), spec.agent(scene.place(place))
+            graph, index = shown(question, scene.graphs[viewer]), spec.agent(scene.place(place))
             agent = agents[index]
             image = picture(spec, index, scene, viewer, question.pictured) if sees else None
             yield blank(index, graph.role).alike(

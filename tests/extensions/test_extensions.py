@@ -538,6 +538,9 @@ BROKEN_PARTS = {
     "ODD = 3": "part odd of package by-hand is no subclass of Part; repair its package",
     f"{PARTS}tau_nats: float = 0.0\nODD = Own": "has setting tau_nats, which another part has",
     f"{PARTS}own: float = 0.0\nODD = Own": "stands behind '', which is no setting",
+    f"{PARTS}controls = {{'a': 5}}\nODD = Own": "controls holds what is no text",
+    f"{PARTS}usual = {{5: 'a'}}\nODD = Own": "usual holds what is no text",
+    f"{PARTS}questions = ('zork',)\nODD = Own": "questions hold what is no Question",
     "ODD = 1 / 0": "part odd of package by-hand fails (ZeroDivisionError: division by zero at",
 }
 

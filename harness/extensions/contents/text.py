@@ -9,7 +9,6 @@ from harness.core.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
-    from harness.coordination.parts import RunFacts
 
 
 class SaysWords(Call):
@@ -24,15 +23,6 @@ class OfText(Content):
 
     holds = frozenset((WORDS,))
     call = SaysWords()
-
-    def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        prompt = run.agents[0].prompt
-        if point.has_fusion_call and not prompt.shows_words:
-            return (
-                f"prompt {prompt.version} cannot show words without an intent; use --prompt v11 "
-                "or v12"
-            )
-        return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
         return intents.with_words()
