@@ -242,8 +242,9 @@ class Plugins(Mapping[str, T], Generic[T]):
                 raise UserError(
                     f"{what} has {field} {printable(repr(value))}; allowed: {allowed}; {repair}"
                 )
-        with worded(self.of_package(name), is_ours(entry), aside):
-            self.check(name, plugin)
+        if not self.is_ours(name):
+            with worded(self.of_package(name), door=aside):
+                self.check(name, plugin)
         return plugin
 
     def check(self, name: str, plugin: T) -> None:
