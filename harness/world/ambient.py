@@ -15,7 +15,7 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Ambient:
-    """One kind of light and weather."""
+    """Describe one kind of light and weather by its effect on cameras and rendered pictures."""
 
     camera_m: float  # distance up to which a camera tells class, indicator and brake lamps
     fades_m: float  # distance over which contrast falls to 1/e
@@ -38,5 +38,5 @@ AMBIENTS = {
 
 
 def sun_rad(episode_seed: int) -> float:
-    """Return the bearing of a low sun in an episode; it depends on the seed only."""
+    """Return the bearing of a low sun (rad, in the road's frame), drawn by the layout seed."""
     return float(noise.uniforms((1,), "sun", episode_seed)[0]) * radians(360.0)

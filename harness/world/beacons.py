@@ -56,8 +56,9 @@ ROUNDING_S = 1e-9
 
 
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
-    """Return the newest beacon of the sender that the receiver has;
-    None if it knows the truth instead.
+    """Return the newest beacon of `sender` that `receiver` has at the state's time.
+
+    None if there is none, as under perfect knowledge or of the receiver itself.
     """
     heard = [b for b in state.beacons if b.sender == sender and receiver in b.heard_by]
     return max(
@@ -66,14 +67,18 @@ def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
 
 
 def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
-    """Return the sender's state as the receiver estimates it;
-    the truth for itself or perfect knowledge.
+    """Return the sender's state as the receiver estimates it from the last beacon that it has.
+
+    The true state if it has none, as under perfect knowledge or of itself.
     """
     return estimated(state.vehicle(sender), last_heard(state, sender, receiver), state.time_s)
 
 
 def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> VehicleState:
-    """Return a vehicle's state as it is estimated from a beacon of it; the truth without one."""
+    """Return a vehicle's state, extrapolated from its beacon to `time_s` at constant speed.
+
+    The true state if `beacon` is None.
+    """
     if beacon is None:
         return vehicle
     travelled_m = beacon.speed_mps * (time_s - beacon.time_s)
@@ -87,8 +92,9 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 
 
 def lead_in(p: Parameters, poses: Floats) -> Floats:
-    """Extrapolate the poses at the start, (V, 4),
-    back to the first beacon at constant speed, (F, V, 4).
+    """Extrapolate poses at the start back in time at constant speed, to when beacons begin.
+
+    `poses` are x, y, heading and speed, (V, 4); the result is (F, V, 4), the start last.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz
@@ -106,13 +112,13 @@ def broadcast(
     first_frame: int,
     loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons that matter after some more frames:
-    the last ones received, and those under way.
+    """Return the beacons of the ego and its helpers that are still needed after some frames.
 
-    The ego is the first of the `radios`; it and a helper hear each other. `poses` are x, y, heading
-    and speed of each in each frame, (F, V, 4), from `first_frame` on; 0 is the start. `loss` gives
-    for one of these frames, counted from 0, the probability that a beacon is lost on the link to
-    each helper, `(H,)`.
+    These are the last one that each receiver has, and those on the air. `before` are those needed
+    until now. The ego is the first of the ids `radios`; it and each helper hear each other. `poses`
+    are x, y, heading and speed, (F, V, 4), from `first_frame` on; the episode starts with frame 0.
+    `loss` returns, for one of these F frames, the probability to lose a beacon on the link to each
+    helper, (H,).
     """
     kept: list[Beacon] = []
     for place, sender in enumerate(radios):
@@ -136,10 +142,10 @@ def announced(
     first_frame: int,
     loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons that matter of a sender whom all receivers hear,
-    with poses (F, 4): see `broadcast`.
+    """Return the beacons of one sender that are still needed after some frames: see `broadcast`.
 
-    `loss` gives the probability that a beacon is lost on the link to each receiver.
+    All `receivers` hear it; `poses` are (F, 4). `loss` returns, for one of these F frames, the
+    probability to lose a beacon on the link to each receiver.
     """
     every, heard_by = slice(None), tuple(receivers)
     return tuple(
@@ -274,11 +280,10 @@ def _lead_frames(p: Parameters) -> int:
 def losses(
     p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
 ) -> Callable[[int], Floats]:
-    """Return a function that gives, for a frame,
-    the probability to lose a beacon on each link, `(H,)`.
+    """Return a function from a frame to the probability to lose a beacon on each link, (H,).
 
-    `world` returns the state; a link is from the first of the `radios` to each other; `poses` are
-    x, y, heading and speed of all vehicles in each frame, (F, V, 4).
+    A link is from the first of the ids `radios` to each other one. `world` returns the present
+    state; `poses` are x, y, heading and speed of all its vehicles, (F, V, 4). Frames count from 0.
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:

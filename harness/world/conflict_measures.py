@@ -43,9 +43,7 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """The conflicts of a world's ego since some decision,
-    and what those to come are measured by.
-    """
+    """Hold an agent's least TTC and PET since a decision, and the poses that are still needed."""
 
     ttc_s: float = np.inf  # least time to collision; inf where missing
     pet_s: float = np.inf  # least post-encroachment time; inf where missing
@@ -56,17 +54,17 @@ class Conflicts:
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
-        """Return the same at a decision, since which nothing has happened."""
+        """Return these records with the measures reset, to count from a decision on."""
         return replace(self, ttc_s=np.inf, pet_s=np.inf)
 
     def collided(self) -> "Conflicts":
         return replace(self, ttc_s=0.0, pet_s=0.0)
 
     def recast(self, places: Sequence[int]) -> "Conflicts":
-        """Return the same for other vehicles:
-        each one's place among those before, or -1 for a new one.
+        """Return these records for a changed list of vehicles.
 
-        Where a vehicle was that has left is forgotten.
+        `places` has, for each vehicle now, its index in the list before, or -1 for a new one. The
+        past poses of a vehicle that has left are dropped.
         """
         at = np.array(places)
         trail = (
@@ -79,14 +77,17 @@ class Conflicts:
 
 
 def rounded(measure_s: float) -> float | None:
-    """Return a measure for a record: None where it is missing."""
+    """Return a TTC or PET (s), rounded for a record; None if it is not finite."""
     return round(measure_s, DECIMALS) if np.isfinite(measure_s) else None
 
 
 def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
-    """Return the measures of decisions (n,) as columns of their table, and whether they are short.
+    """Return TTC and PET of n decisions as table columns, and whether each is short.
 
-    They are inf where nothing came near in time, and NaN where nothing was measured.
+    The columns are `ttc_s`, `pet_s`, `short_ttc` and `short_pet`, (n,). The first two are NaN where
+    no vehicle came near. The `short_` ones are 1 below `SHORT_TTC_S` and `SHORT_PET_S`, else 0. The
+    arguments, (n,), are inf where no vehicle came near in time, and NaN where nothing was measured;
+    then all four are NaN.
     """
     ttc_s, pet_s = ttc_s.round(DECIMALS), pet_s.round(DECIMALS)
     return {
@@ -100,11 +101,11 @@ def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
 def observe(
     before: Sequence[Conflicts], poses: Floats, sizes_m: Floats, first_frame: Ints, hz: int
 ) -> list[Conflicts]:
-    """Return the conflicts of each world after some more frames.
+    """Return the conflicts of each of W worlds, updated by some more frames.
 
     `poses` are x, y, heading and speed, (W, frames, vehicles, 4), the ego first, NaN where there is
-    none, and `sizes_m` length and width, (W, vehicles, 2). `first_frame` has the number of each
-    world's first frame, (W,), and `hz` is frames a second.
+    none, and `sizes_m` length and width, (W, vehicles, 2). `first_frame`, (W,), is the number of
+    each world's first frame here, and `hz` is frames a second.
     """
     every = max(1, round(hz / MOMENTS_HZ))
     numbers = first_frame[:, None] + np.arange(poses.shape[1])
@@ -165,11 +166,10 @@ def _measured(
 def times_to_collision(
     poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats
 ) -> Floats:
-    """Return when the outlines of pairs touch if both go straight on, (n,) s; inf for never.
+    """Return the TTC of n pairs of vehicles that drive straight on, (n,) s; inf for never.
 
-    Each has x, y, heading and speed, (n, 4), and length and width, (n, 2). On each axis of either
-    outline, the extents of two that move evenly overlap in one interval; the outlines do in what
-    all four share.
+    `poses` and `others` are x, y, heading and speed, (n, 4), and the sizes length and width, (n,
+    2). The rectangles touch when their extents overlap on all four of their axes.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])

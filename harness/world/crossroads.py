@@ -33,9 +33,11 @@ PRIORITY = {"straight": (1, 3), "left": (0, 2)}
 
 @cache
 def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
-    """Return the intersection for an ego from an arm.
+    """Return the four-way intersection as a `Road`, for an ego from an arm that goes straight.
 
-    Its conflict zone is the centroid of the conflict points of three dangers.
+    Arms are numbered 0 to 3: south, west, north, east. `form` is the version of the scene graphs.
+    The conflict zone is the centroid of three conflict points: with straight traffic from the left
+    and the right, and with oncoming traffic that turns left.
     """
     ways, ego = paths(arm), ("own", "straight")
     # A path that merges into the ego's lane brings no danger here.
@@ -63,7 +65,7 @@ def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
 
 @cache
 def paths(arm: int = 0) -> dict[PathKey, Path]:
-    """Return every path by (approach, route), as an ego from an arm names them."""
+    """Return every path by (approach, route), under the names that an ego from this arm uses."""
     built = {}
     for corner in range(len(APPROACHES)):
         approach = seen_from(arm, corner)
@@ -88,7 +90,10 @@ def paths(arm: int = 0) -> dict[PathKey, Path]:
 
 
 def seen_from(arm: int, other: int) -> str:
-    """Return how an ego from an arm names another arm."""
+    """Return how an ego from `arm` calls arm `other`: `own`, `left`, `oncoming` or `right`.
+
+    Arms are numbered 0 to 3: south, west, north, east.
+    """
     return APPROACHES[(other - arm) % 4]
 
 
@@ -121,7 +126,7 @@ def _approach(path: Path) -> Floats:
 
 @cache
 def network() -> Any:
-    """Return highway-env's own road network."""
+    """Return highway-env's road network of its intersection environment."""
     from highway_env.envs.intersection_env import IntersectionEnv
 
     env = IntersectionEnv.__new__(IntersectionEnv)
@@ -131,9 +136,7 @@ def network() -> Any:
 
 
 def ground(far_m: float) -> Ground:
-    """Return the ground: both roads up to `far_m`,
-    with the centre line and the stop line of each arm.
-    """
+    """Return the drawn ground of both roads up to `far_m` from the centre, with its markings."""
     half = LANE_WIDTH_M
     # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
     angle = np.linspace(np.pi, 1.5 * np.pi, 9)

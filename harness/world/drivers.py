@@ -36,7 +36,11 @@ OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")
 def choose(
     scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None
 ) -> str:
-    """Return a driver's meta-action for the ego's scene graph; only `full-view` reads `truth`."""
+    """Return the meta-action that the reference driver named `driver` takes for the ego.
+
+    `graph` is the ego's scene graph, and `truth` the graph with everything in view and no noise,
+    which only `full-view` reads. Drivers that read neither accept None.
+    """
     [action] = choices(scenario, [(driver, graph, truth)])
     return action
 
@@ -44,9 +48,10 @@ def choose(
 def choices(
     scenario: Scenario, asked: Sequence[tuple[str, SceneGraph | None, SceneGraph | None]]
 ) -> list[str]:
-    """Return the meta-action of each driver for a scene graph of the ego, and the truth.
+    """Return the meta-action of each driver that is asked, as `choose` does for one.
 
-    A driver may also be an action, which is always taken.
+    Each of `asked` has a driver's name, or that of an action that is always taken, the ego's graph
+    and the true graph. Raises ValueError if a driver was not given the graph that it reads.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
     planned = iter(
@@ -56,15 +61,17 @@ def choices(
 
 
 def constant(scenario: Scenario) -> str | None:
-    """Return the action of the driver `constant` in a scenario;
-    None where nobody has measured it.
+    """Return the action that driver `constant` always takes in a scenario, or None if not measured.
+
+    It is the single action that succeeds most on tune layouts (`constants.csv`).
     """
     return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
 
 def open_loop(scenario: Scenario) -> tuple[str, ...] | None:
-    """Return the actions of the driver `open-loop`, from the first;
-    None where nobody has measured them.
+    """Return the fixed actions of driver `open-loop` in a scenario, or None if not measured.
+
+    It is the sequence that succeeds most on tune layouts (`open_loop.csv`).
     """
     return _open_loops().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 

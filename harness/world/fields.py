@@ -19,7 +19,10 @@ VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 
 
 class Closed(Struct, frozen=True, forbid_unknown_fields=True):
-    """A record with these members and no other; its bounds hold where it is read."""
+    """Base class of msgspec records that refuse unknown members when they are decoded from a file.
+
+    The bounds of `Annotated` field types are checked at decoding, too.
+    """
 
     def __getitem__(self, key: str) -> Any:
         """Return a member by its name in a file:

@@ -36,7 +36,7 @@ MOST_PLANS = 8  # that are driven for a layout until one keeps its promise
 
 @dataclass
 class Rehearsal(World):
-    """A world of one agent that keeps a record of where everybody was."""
+    """Simulate one agent alone with the other traffic, and record where all vehicles were."""
 
     agent: int = 0  # the agent's place in the layout
     script: Sequence[str] | None = None  # the actions that it takes; None for all that there are
@@ -52,8 +52,10 @@ class Rehearsal(World):
         self.taken = (*self.taken, action)
 
     def parts(self, step: int) -> list["Rehearsal"]:
-        """Return a world for each action of a step;
-        of those that set the same target one counts.
+        """Return copies of this world, each with one of the actions that are possible at a step.
+
+        Of actions that set the same target only one is tried. This world is the first of the
+        copies.
         """
         calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
         action_to = {self.target_after(action): action for action in calm_last}
@@ -74,9 +76,9 @@ class Rehearsal(World):
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What an agent can do without touching other traffic, the soonest to arrive first."""
+    """Hold the action sequences by which an agent touches no other traffic, soonest first."""
 
-    actions: Sequence[tuple[str, ...]]
+    actions: Sequence[tuple[str, ...]]  # the meta-actions of each of the n sequences
     arrives_s: Floats  # when it reaches its goal, (n,); inf for never
     # x, y and heading after each frame, of it and then of other traffic, (n, F, V, 3)
     poses: Floats
@@ -90,7 +92,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """What all agents of a layout do."""
+    """Hold an action sequence for every agent of a layout."""
 
     actions: Mapping[int, tuple[str, ...]]  # of each agent, by its place
     arrives_s: Mapping[int, float]  # when each reaches its goal; inf for never
@@ -102,17 +104,17 @@ class Plan:
         return sum(min(time_s, NEVER_S) for time_s in self.arrives_s.values())
 
     def turn(self, step: int) -> dict[int, str]:
-        """Return the action of each agent that has one at a step."""
+        """Return each agent's action at a step, by agent index; agents without one are left out."""
         return {agent: taken[step] for agent, taken in self.actions.items() if step < len(taken)}
 
     @property
     def exact(self) -> bool:
-        """Whether no plan is better."""
+        """Whether it is proven that no plan has a smaller sum of arrival times."""
         return self.bound_s >= self.sum_s - 1e-9
 
 
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
-    """Return what each agent of some layouts can do, by a layout's seed and an agent's place."""
+    """Return the action sequences of each agent, by layout seed and then by agent index."""
     starts = [world for seed in seeds for world in rehearsals(scenario, seed)]
     unharmed: list[Rehearsal] = []
     for group in by_scenario(starts):
@@ -140,10 +142,11 @@ def courses(
     able: Mapping[int, Mapping[int, Options]],
     taken: Sequence[tuple[int, Scripts]],
 ) -> list[dict[int, Options]]:
-    """Return the course of each agent that took some actions, by its place, as its only option.
+    """Return what agents did under given actions, one dict per item of `taken`, by agent index.
 
-    `taken` are layouts' seeds, with the actions of each agent;
-    `able` are the `options` of the layouts.
+    An item of `taken` is a layout seed and the actions of each agent by index. A result is an
+    `Options` that holds this one sequence, even if it touches traffic. `able` are the `options` of
+    the layouts.
     """
     layouts: list[list[Rehearsal]] = []
     for seed, scripts in taken:
@@ -169,7 +172,7 @@ def courses(
 
 
 def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
-    """Return a world of each agent of a layout, with the other traffic."""
+    """Return a world for each agent of a layout, in which it is alone with the other traffic."""
     layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
     traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
     worlds = []
@@ -226,19 +229,26 @@ def _never(xy_m: Floats, approaches: object, parameters: object) -> Bools:
 
 @dataclass
 class Search:
-    """A search for the options of all agents that go together and have the least cost."""
+    """Search, by branch and bound, for compatible options of all agents with the least total cost.
+
+    Two options are compatible if the agents and the traffic do not touch (`together`).
+    """
 
     able: Sequence[Options]  # of each agent
-    # choices that do not keep their promise
+    # choices whose plan did not work in the simulator
     unfit: set[tuple[int, ...]] = field(default_factory=set)
+    # by agent, its option and another agent: which options of the other are compatible
     rows: dict[tuple[int, int, int], Bools] = field(default_factory=dict)
-    nodes: int = 0
-    best: tuple[int, ...] | None = None
-    cost_s: float = np.inf
+    nodes: int = 0  # number of partial choices looked at
+    best: tuple[int, ...] | None = None  # one option index per agent; None if there is no choice
+    cost_s: float = np.inf  # cost of `best`
     open_s: float = np.inf  # the least cost that a part which was not searched may have
 
     def run(self) -> None:
-        """Find the best choice; `bound_s` says how good any may be."""
+        """Find the best choice of one option per agent, except those in `unfit`, into `best`.
+
+        Afterwards `bound_s` is a lower bound of the cost of any choice.
+        """
         self.nodes, self.best, self.cost_s, self.open_s = 0, None, np.inf, np.inf
         if all(len(each.actions) for each in self.able):
             self._choose((), 0.0, [np.ones(len(each.actions), dtype=bool) for each in self.able])
@@ -249,7 +259,7 @@ class Search:
 
     @property
     def ended(self) -> bool:
-        """Whether no part that may hold a better choice was left out."""
+        """Whether the search was completed, so that `best` is optimal."""
         return self.open_s >= self.cost_s
 
     def _choose(self, chosen: tuple[int, ...], cost_s: float, left: Sequence[Bools]) -> None:
@@ -287,9 +297,9 @@ class Search:
 
 
 def together(own: Options, n: int, other: Options) -> Bools:
-    """Return which options of another agent go together with the nth of an agent, (n,).
+    """Return which of another agent's n options are compatible with option `n` of an agent, (n,).
 
-    What happens when both have arrived does not count.
+    They are if neither agent touches the other or traffic, in the frames before both have arrived.
     """
     mine, its, frames = own.poses[n : n + 1], other.poses, own.poses.shape[1]
     ends = np.minimum(np.maximum(own.arrives_s[n], other.arrives_s) * own.hz, frames)
@@ -309,10 +319,10 @@ def near(
     margin_m: float,
     counts: Bools,
 ) -> Bools:
-    """Return whether any of some vehicles (1, F, A, 3) comes as near to any of the others (n, F, B,
-    3), (n,).
+    """Return whether any of A vehicles comes within a margin of any of B others, (n,).
 
-    Only frames that count, (n, F), do.
+    `some` are poses x, y, heading (1, F, A, 3), `others` (n, F, B, 3), and the sizes length and
+    width, (A, 2) and (B, 2). Only frames where `counts`, (n, F), is true are compared.
     """
     reach_m = (np.hypot(*sizes_m.T)[:, None] + np.hypot(*their_sizes_m.T)) / 2 + margin_m
     dx, dy = np.moveaxis(some[:, :, :, None, :2] - others[:, :, None, :, :2], -1, 0)
@@ -327,12 +337,11 @@ def near(
 def plans(
     scenario: Scenario, able: Mapping[int, Mapping[int, Options]]
 ) -> tuple[dict[int, tuple[Plan, World]], set[int]]:
-    """Return the best plan for all agents of each layout that keeps its promise,
-    by the layout's seed.
+    """Return the best plan of each layout seed that works in the simulator, and its world.
 
-    `able` are the `options`. With a plan comes the world after all have acted so. Layouts without
-    one are left out; of these, the seeds in which the search did not end, so that there may be one,
-    come last.
+    `able` are the `options`. A plan works if, with all agents together, each arrives when its
+    option says. Seeds without such a plan are left out. Returned second are the seeds whose search
+    was cut off, so that a plan may exist.
     """
     solved, unended = dict[int, tuple[Plan, World]](), set[int]()
     searches = {seed: Search(list(by_agent.values())) for seed, by_agent in able.items()}
@@ -366,9 +375,7 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
-    """Return the world of each layout after all of its agents have acted as planned,
-    by the layout's seed.
-    """
+    """Return the world of each layout after all agents took their planned actions, by seed."""
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
     while going := [world for world in worlds.values() if not world.ended]:
         take_turn(going, [plans_by_seed[world.seed].turn(world.step) for world in going])
@@ -376,7 +383,7 @@ def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, W
 
 
 def kept(plan: Plan, world: World) -> bool:
-    """Return whether all agents of a world have arrived when the plan says, and no others."""
+    """Return whether all agents of a finished world arrived exactly when the plan says."""
     for agent, journey in world.journeys.items():
         outcome, arrives_s = journey.outcome, plan.arrives_s[agent]
         as_planned = (

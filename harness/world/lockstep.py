@@ -37,9 +37,7 @@ AT_ONCE = 128  # more worlds do not fit into the processor's cache
 
 
 def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
-    """Simulate some worlds of one scenario, each until its frame,
-    or until its episode is decided.
-    """
+    """Simulate worlds of one scenario, each until its frame in `until_frames` or its own end."""
     going = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
@@ -126,8 +124,9 @@ def _measure(
 
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of a network as arrays; highway-env computes those that are neither straight nor an
-    arc.
+    """Hold the L lanes of a network as arrays, so that many vehicles are located at once.
+
+    Lanes that are neither straight nor an arc are left to highway-env.
     """
 
     number: dict[Lane, int]  # number of each lane
@@ -145,8 +144,9 @@ class Lanes:
     others: dict[int, Any]  # highway-env's lane of each number that is neither
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return the positions along and to the right of lanes (...), m,
-        like `local_coordinates`.
+        """Return positions along and to the right of lanes (m), (...), as `local_coordinates` does.
+
+        `xy` are positions, (..., 2) m, and `lane` is the number of each one's lane, (...).
         """
         away = xy - self.base[lane]
         along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
@@ -167,7 +167,7 @@ class Lanes:
             yield from zip(*np.nonzero(np.isin(lane, list(self.others))), strict=True)
 
     def heading_at(self, along: Floats, lane: Ints) -> Floats:
-        """Return the heading of lanes (...) at positions along them, rad."""
+        """Return the heading (rad) of lanes (...) at positions (m) along them, (...)."""
         heading = self.heading[lane]
         arcs = self.arc[lane]
         if arcs.any():
@@ -212,7 +212,10 @@ def _lanes(road: Callable[[], Road]) -> Lanes:
 
 
 class Fleet:
-    """The vehicles of some worlds, as arrays (B, V); positions and impacts are (B, V, 2)."""
+    """Hold the vehicles of B worlds, at most V each, as arrays (B, V) that are simulated together.
+
+    Positions and collision impacts are (B, V, 2).
+    """
 
     def __init__(self, worlds: "Sequence[World]") -> None:
         scenario = worlds[0].scenario
@@ -282,7 +285,7 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Keep some worlds."""
+        """Drop the worlds whose entry in `rows`, (B,), is false."""
         self.worlds = [
             world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept
         ]
@@ -292,8 +295,9 @@ class Fleet:
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Write a row back to its world;
-        return the ids of vehicles that had crashed before this frame.
+        """Copy the vehicles of one row back into its world.
+
+        Returns the ids of vehicles that had crashed before the last frame.
         """
         world.frame = int(self.frame[row])
         names = self.lanes.names
@@ -316,8 +320,9 @@ class Fleet:
         return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
 
     def step(self) -> Bools:
-        """Simulate a frame; return in which worlds something happened that `World.judge` must see,
-        (B,).
+        """Simulate one frame; return the worlds in which something may decide an outcome, (B,).
+
+        These are the worlds with a crash, an arrival, an agent off the road, or the time limit.
         """
         self.stood = self.crashed.copy()
         self._act()

@@ -32,20 +32,22 @@ DANGER = "danger"
 
 @dataclass(frozen=True)
 class Draft:
-    """One draw of an episode's start."""
+    """Hold one random draw of an episode's start, not yet checked for who sees the danger."""
 
     layout: Layout  # with the lookouts as helpers, and nobody in the blind seats
-    # the danger of each sector, as it would be; it stands for who has its id
+    # for each sector, the vehicle that would be its danger; it replaces the one with the same id
     phantoms: tuple[Spawn, ...]
-    seats: tuple[Spawn, ...]  # cars in blind seats; empty if the draws name none
+    seats: tuple[Spawn, ...]  # cars that cannot see the danger; empty if the draws name none
 
 
 def placed(
     scenario: Scenario, draft: Callable[[Draws, Any], Draft], seed: int, parameters: Parameters
 ) -> Layout:
-    """Return the layout of a seed, with as many witnesses and radios as the parameters declare.
+    """Return the layout of a seed, with the witnesses and radios that the parameters declare.
 
-    Raises UserError if no draw gives so many witnesses.
+    A witness is a helper that has the danger in sight at the first decision. `draft` makes one
+    random draw; draws are repeated until the vehicles meant to see the danger do, and no others.
+    Raises UserError if none of `MOST_ATTEMPTS` draws fits.
     """
     if parameters.witnesses == "any":
         layout = draft(Draws(scenario.name, seed), parameters).layout
@@ -63,10 +65,11 @@ def placed(
 
 
 def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
-    """Return the number of witnesses that a layout is drawn with; None where none is declared.
+    """Return how many witnesses the layout of a seed has; None if the parameters say `any`.
 
-    `each` goes by the seed, so seeds in a row are balanced and no draw decides. `drawn` has a draw
-    of its own, so the seed's number tells nothing.
+    A witness is a helper that has the danger in sight at the first decision. For `each` it is the
+    seed modulo 4, so that consecutive seeds are balanced; for `drawn` it is a random draw keyed by
+    the seed.
     """
     counts = len(LOOKOUTS) + 1
     if parameters.witnesses == "any":
@@ -79,8 +82,10 @@ def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
 
 
 def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
-    """Return a layout's `witnesses` and `danger_radio` for a row of a table;
-    None where none is declared.
+    """Return the columns `witnesses` (a count) and `danger_radio` (a bool) of a layout's table row.
+
+    `danger` is the sector of the layout's danger. A value is None where the parameters declare
+    none.
     """
     p = scenario.parameters
     radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
@@ -94,8 +99,11 @@ def queue(
     gaps_m: tuple[tuple[float, float], ...],
     speed_mps: tuple[float, float],
 ) -> tuple[Spawn, ...]:
-    """Return cars in blind seats one behind another on the ego's path;
-    gaps are from centre to centre.
+    """Return helper cars lined up behind the ego, from where they cannot see the danger.
+
+    `gaps_m` bounds each uniform gap between centres, from the ego backwards, and `speed_mps` their
+    common speed. `ids` maps the names of `draws.seats` to vehicle ids. Empty if `draws` has no such
+    seats.
     """
     mps, arc_m, cars = draws.between("seats_speed", speed_mps), ego.arc_m, []
     for name, bounds in zip(draws.seats, gaps_m, strict=False):
@@ -105,8 +113,9 @@ def queue(
 
 
 def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = DANGER) -> bool:
-    """Return whether a vehicle that does not help sends beacons:
-    the danger, or another by its id.
+    """Return whether a vehicle that is no helper sends beacons; drawn with `radio_share`.
+
+    `vehicle` is its id; by default it is the layout's danger.
     """
     draw = noise.uniforms((1,), scenario, seed, "radio", vehicle)[0]
     return bool(draw < parameters.radio_share)

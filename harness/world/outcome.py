@@ -29,7 +29,7 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode ended for the ego."""
+    """Describe how an episode ended for one agent (usually the ego), or that it still runs."""
 
     # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
     # `time_out` (never), `late` (too long after the full-view driver) or `off_road`; `running`
@@ -55,9 +55,10 @@ class Outcome:
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
-        """Return this outcome, as `late` if the ego came too long after the full-view `reference`.
+        """Return this outcome, as `late` if the ego came too long after the full-view driver.
 
-        How long is too long depends on whether the layout has a danger (`Parameters.allowance_s`).
+        `reference` is that driver's outcome in the same layout. The allowed delay depends on
+        whether the layout has a `danger` (`Parameters.allowance_s`).
         """
         if (
             not self.success
@@ -75,19 +76,21 @@ class Outcome:
 
 
 class End(Struct, frozen=True, array_like=True):
-    """How an agent's journey ended."""
+    """Describe how one agent's drive in an episode ended."""
 
-    agent: str  # its id
+    agent: str  # the agent's vehicle id
     result: str  # `cleared` if it reached its goal, else how it failed
     time_s: float | None  # when that was decided
     lost_s: float | None  # how much later than alone on the road it arrived; None unless it did
     partner: str | None  # the vehicle that it collided with
-    met: bool  # whether that is another agent
+    met: bool  # whether `partner` is another agent
 
 
 def rating(failure: str, parameters: Parameters) -> Rating | None:
-    """Return the word for an episode that failed like this, empty for a success;
-    None where `limits` is 1.
+    """Return `success`, `late`, `unsafe` or `stuck` for the result of an ended episode.
+
+    `failure` is a failed result such as `collision`, or empty for a success. None if the parameter
+    `limits` is 1, under which outcomes are not put into these words.
     """
     return None if parameters.limits == 1 else RATINGS[failure or "cleared"]
 
@@ -98,7 +101,7 @@ def outline(v: VehicleState) -> Polygon:
 
 
 def striker(ego: VehicleState, other: VehicleState) -> str:
-    """Return whose front bumper was at the point of contact."""
+    """Return whose front bumper made contact: `ego`, `other`, `both` or `neither`."""
     contact = nearest_points(outline(ego), outline(other))[0]
     overlap = outline(ego).intersection(outline(other))
     if not overlap.is_empty:
@@ -114,8 +117,10 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
 
 
 def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path]) -> str:
-    """Return who is at fault: the one behind in a rear-end collision,
-    or else the one with less priority.
+    """Return who is at fault in a collision, `ego` or `other`.
+
+    In a rear-end collision (headings within 45°) it is the one behind, else the one whose path has
+    the lower right of way.
     """
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m

@@ -31,13 +31,16 @@ ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000
 
 
 def frames(latency_s: float, simulation_hz: int) -> int:
-    """Return the number of whole frames that a decision takes."""
+    """Return a latency in whole frames, rounded up."""
     return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters that every scenario has; a scenario adds its own in a subclass."""
+    """Hold the parameters that every scenario has; a scenario adds its own in a subclass.
+
+    Raises UserError if a value is out of bounds.
+    """
 
     # the levels that SLOWER, IDLE and FASTER step through
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
@@ -135,25 +138,28 @@ class Parameters:
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
-        """Return all parameters as plain values;
-        those of `LATER` only if they differ from that value.
+        """Return the parameters by name for a manifest, without those at their value in `LATER`.
+
+        `LATER` has parameters that were added later, each with the value of the earlier behaviour.
         """
         return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 
     @property
     def lag_frames(self) -> int:
-        """`decision_lag_s` in whole frames."""
+        """`decision_lag_s`, the time from seeing to acting, in whole frames."""
         return frames(self.decision_lag_s, self.simulation_hz)
 
     def allowance_s(self, danger: str | None) -> float:
-        """Return how much later than the full-view driver an ego may be,
-        in a layout with this danger.
+        """Return how much later (s) than the full-view driver an ego may arrive and still succeed.
+
+        `danger` is the sector of the layout's danger, or None; less delay is allowed without one.
         """
         return self.delay_allowance_s if danger or self.limits == 1 else self.harmless_allowance_s
 
     def due_frame(self, step: int) -> int:
-        """Return the frame in which a decision is due;
-        after the last decision, that of the time limit.
+        """Return the frame in which decision `step` (from 0) is to be made.
+
+        From `decisions` on, it is the frame of the time limit.
         """
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
         return round(due_s * self.simulation_hz)
@@ -161,8 +167,10 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Witnessed(Parameters):
-    """The parameters of a scenario with lookouts, by default as in `v2v-safety-2`:
-    cooperation can fail.
+    """Hold the parameters of a scenario in which the number of witnesses can be declared.
+
+    A witness is a helper that has the danger in sight at the first decision. The defaults are those
+    of the suite `v2v-safety-2`.
     """
 
     witnesses: str = "each"
@@ -173,7 +181,10 @@ class Witnessed(Parameters):
 
 @dataclass(frozen=True)
 class Shared(Parameters):
-    """The parameters of a scenario whose helpers have goals of their own (`Scenario.seats`)."""
+    """Hold the parameters of a scenario whose helpers have goals of their own (`Scenario.seats`).
+
+    Raises UserError if a value is out of bounds.
+    """
 
     # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them
     # agents. Which ones do belongs to the layout, and those of a lower share are among those of a
@@ -207,8 +218,9 @@ LATER = (
 
 @lru_cache(maxsize=64)
 def beacon_radio(text: str) -> Physical | None:
-    """Return the radio that `beacon_channel` names; None if it is empty.
-    Raises UserError if it is wrong.
+    """Return the radio that the parameter `beacon_channel` names; None if it is empty.
+
+    Raises UserError if there is no such radio or setting, or it has one loss for all links.
     """
     if not text:
         return None

@@ -43,25 +43,29 @@ Point = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """Sequences of actions that the ego may take."""
+    """Hold n sequences of meta-actions that the planner tries."""
 
     first: Sequence[str]  # first action of each, (n,)
     levels: Ints  # levels by which each decision changes the target speed, (n, decisions)
     ends: Ints  # final way, counted to the right from the present one, (n,)
-    calm: Ints  # place of each among all of them, the calmest first, (n,)
+    calm: Ints  # rank of each among all of them, the calmest first, (n,)
     # distance to the right of the way that the ego is on now, (n, steps); None if it stays
     right_m: Floats | None
-    shift: Ints  # number of the motion to the side that each has, (n,)
+    shift: Ints  # index of each one's lateral motion among the distinct ones, (n,)
 
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
-    """The motions of the ego under some sequences; sequences that move it alike share one."""
+    """Hold the ego's predicted motions, each shared by all action sequences that lead to it.
+
+    `travelled_m` and `right_m` are (motions, steps of `STEP_S`); `motion` maps sequences to
+    motions.
+    """
 
     travelled_m: Floats  # distance along the ego's way, (motions, steps)
     # distance to the right of the way that the ego is on now, (motions, steps); None if it stays
     right_m: Floats | None
-    motion: Ints  # number of each sequence's motion, (n,)
+    motion: Ints  # index of the motion to which each sequence leads, (n,)
 
     @cached_property
     def speed_mps(self) -> Floats:
@@ -80,13 +84,13 @@ Start = tuple[float, float, int, tuple[int, int], int]
 
 
 def plan(scenario: Scenario, graph: SceneGraph) -> str:
-    """Return the planner's meta-action for a scene graph."""
+    """Return the meta-action that the reference planner takes, given the ego's scene graph."""
     [action] = plans(scenario, [graph])
     return action
 
 
 def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
-    """Return the planner's meta-action for each scene graph."""
+    """Return the meta-action that the reference planner takes for each scene graph of the ego."""
     p, road = scenario.parameters, scenario.road()
     places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
     beside = [road.beside(own, at_m) for own, at_m in places]
@@ -184,9 +188,7 @@ def _sequences(
 
 
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
-    """Return the levels by which each decision of sequences changes the target speed,
-    (n, decisions).
-    """
+    """Return by how many target speed levels each decision changes the target, (n, decisions)."""
     return _changes(sequences, SPEED)
 
 
@@ -227,12 +229,11 @@ def _rollouts(
 def travelled_m(
     moves: Ints, speeds_mps: Floats, targets_mps: Floats, left: int, parameters: Parameters
 ) -> Floats:
-    """Return the distance travelled (m) from each start by each sequence,
-    (starts, sequences, steps).
+    """Return the distance (m) that the ego travels, (starts, sequences, steps of `STEP_S`).
 
     Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to
-    the present speed, and IDLE keeps the target. `moves` are levels of each decision, (sequences,
-    decisions); a start has a speed and a target speed, and `left` decisions remain.
+    the present speed, and IDLE keeps the target. `moves` are changes of level, (sequences,
+    decisions). `speeds_mps` and `targets_mps` are (starts,), and `left` decisions remain.
     """
     levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
@@ -272,7 +273,7 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 
 @dataclass(frozen=True)
 class Motion:
-    """The assumed motion of another vehicle, and the ego's way on which they may meet."""
+    """Describe the predicted motion of another vehicle, and the ego's path that it may meet."""
 
     way: Path  # the ego's way
     begin_m: float  # the ego's present position on it
@@ -282,8 +283,9 @@ class Motion:
 
 
 def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
-    """Predict the vehicles that the ego could meet:
-    they keep path and speed, and their place in a queue.
+    """Predict, for `steps` steps of `STEP_S`, the motions of vehicles that the ego could meet.
+
+    Vehicles keep path and speed, unless they queue behind another one or are seen to brake.
     """
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph.ego)
@@ -332,10 +334,10 @@ def _travelled_m(other: Arrival, time_s: Floats) -> Floats:
 def least_gap(
     tried: Rollouts, motion: Motion, under_way: Bools | bool = True, within_m: float = 0.0
 ) -> Floats:
-    """Return the smallest gap (m) to another vehicle while the ego is under way, (motions,).
+    """Return the smallest gap (m) to another vehicle for each of the ego's motions, (motions,).
 
-    Below 0 they meet. A gap wider than `within_m` may be infinite,
-    since only moments are looked at in which both are near.
+    A value below 0 is a collision. Only steps where `under_way` is true count, (motions, steps). A
+    gap wider than `within_m` may be given as inf.
     """
     (own, own_reach), (away, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
     (x, y), off_m = _middles(tried, motion.way, motion.begin_m)
@@ -372,8 +374,9 @@ def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
 
 @lru_cache(maxsize=64)
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Return discs that cover a vehicle:
-    their positions on its long axis, shared, and their radius.
+    """Return discs that cover a vehicle: offsets along its axis, (discs,) m, and a radius (m).
+
+    The array is shared and must not be written to.
     """
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count

@@ -39,7 +39,7 @@ UNKNOWN = Regret(np.nan, np.nan, np.nan)
 
 @dataclass(frozen=True)
 class Fate:
-    """How the agents of a layout ended under a policy."""
+    """Describe how the agents of one layout fared under one policy that all of them follow."""
 
     arrived: float  # share of agents that reached their goals
     met: bool  # whether agents collided with each other
@@ -57,7 +57,7 @@ class Fate:
 
     @property
     def trips_s(self) -> float:
-        """When agents reached their goals, in sum; NaN unless all did."""
+        """Sum of the times (s) at which agents reached their goals; NaN unless all of them did."""
         return self.sum_s if self.success else np.nan
 
 
@@ -65,8 +65,10 @@ UNSOLVED = Fate(0.0, False, False, np.inf, np.nan, np.nan)
 
 
 def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> Fate:
-    """Return how the agents of a world that has ended fared;
-    `alone_s` has when each would arrive alone.
+    """Return how the agents of a finished world fared.
+
+    `alone_s` has the time (s) at which each would arrive on an empty road, by its index. `exact`
+    and `cost` are stored as they are.
     """
     agent_ends, worst = ends(world, alone_s), gravest(world.journeys)
     lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in agent_ends])
@@ -85,7 +87,7 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
-    """Drive layouts under every policy; return each layout's fate under each, by its name."""
+    """Drive each layout under every policy; return each seed's `Fate` by policy."""
     drivers = POLICIES[:-1]
     policies = [(seed, driver) for seed in seeds for driver in drivers]
     worlds = [World.start(scenario, seed) for seed, _ in policies]
@@ -111,11 +113,11 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]
 
 
 def best_of(fates: Mapping[str, Fate]) -> Fate:
-    """Return the fate under the joint plan, or under the driver that does better than it.
+    """Return the fate under the joint plan, or under a driver whose summed arrival time is smaller.
 
-    Whoever has more agents arrive does, and then who has the smaller sum of times. A plan leaves
-    out what a driver may do: turns that differ after `joint.HORIZON` decisions, and gaps below
-    `joint.MARGIN_M`.
+    `fates` is keyed by policy. A driver can beat the plan because the search leaves out action
+    sequences that differ after `joint.HORIZON` decisions, and gaps below `joint.MARGIN_M`; then
+    `exact` is False.
     """
     plan = fates[JOINT]
     best = min(fates.values(), key=lambda fate: fate.sum_s)
@@ -125,12 +127,12 @@ def best_of(fates: Mapping[str, Fate]) -> Fate:
 def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Drive every policy through the same layouts;
-    return the `summary` of each, and what `joint` left open.
+    """Drive every policy through the same layouts, and return a dict that compares the policies.
 
-    `unsolved` are the seeds without a joint plan in which all arrive. `inexact` are those in which
-    the plan is the best found and may not be the best: it was not searched to the end, or a driver
-    did better. Raises UserError where agents decide at times of their own.
+    `policies` has the `summary` of each policy by name. `unsolved` lists the seeds without a joint
+    plan in which all agents arrive; `inexact` lists the seeds whose plan may not be optimal, since
+    its search was cut off or a driver did better. Raises UserError if agents do not decide at the
+    same times.
     """
     if len(offsets(scenario)) > 1:
         raise UserError(
@@ -153,12 +155,12 @@ def check(
 
 
 def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[str, Estimate]:
-    """Return figures of a policy over layouts, and beside the `best` plan on the same layouts.
+    """Return estimates of a policy's figures over layouts, by name, with 95 % intervals.
 
-    `anarchy` is the summed time of trips divided by that of the plan, where all arrive under both:
-    the price of anarchy (Koutsoupias and Papadimitriou 1999), of the mean and not of the worst
-    case. Its interval is that of a bootstrap over layouts. `less_than_joint` is the difference of
-    success. The figures of `Regret` are means over layouts.
+    `best` are the fates of the joint plan on the same layouts. `anarchy` is the price of anarchy
+    (Koutsoupias and Papadimitriou 1999) of the mean: the summed arrival times over those of the
+    plan, where all arrive under both, with a bootstrap over layouts. `less_than_joint` is the
+    difference in success. The fields of `Regret` are means over layouts.
     """
 
     def column(rows: Sequence[object], name: str) -> Any:

@@ -83,10 +83,11 @@ RULES: Mapping[str, Callable[[Road, SceneGraph, Conflict], bool]] = {
 
 
 def under(rule: str, scenario: Scenario, graph: SceneGraph) -> SceneGraph:
-    """Return a graph of the ego in which others keep a rule.
+    """Return the ego's scene graph, changed as if others obeyed a right-of-way rule.
 
-    It is without the conflicts with those who give way to the ego. Those to whom it gives way come
-    at their speed, and also at the highest, and also a little later: they need not mind the ego.
+    `rule` is a key of `RULES`. Conflicts with vehicles that must give way are dropped. For a
+    vehicle that goes first, copies are added in which it comes faster and later, so that a planner
+    leaves it room. Vehicles that keep no rule stay as they are.
     """
     p, road = scenario.parameters, scenario.road()
     top_mps, conflicts = p.target_speeds_mps[-1], list[Conflict]()

@@ -25,10 +25,10 @@ BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `su
 
 
 def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, str]]:
-    """Return the meta-action of each world's driver for each of its agents under way,
-    by their places.
+    """Return, for each world, the meta-action that its driver takes for each agent, by agent index.
 
-    The worlds are of one scenario.
+    Agents whose drive has ended are left out. `drivers` has one name per world; all worlds are of
+    one scenario.
     """
     deciding: list[Place] = []
     for n, world in enumerate(worlds):
@@ -64,17 +64,16 @@ def _graphs(
 
 
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
-    """Let each world's driver take all remaining decisions of each agent;
-    return the ego's outcomes.
+    """Let each world's driver take all remaining decisions; return each ego's outcome.
 
-    The worlds are of one scenario.
+    `drivers` has one name per world; all worlds are of one scenario, and are driven in place.
     """
     turns(worlds, drivers)
     return [world.outcome for world in worlds]
 
 
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
-    """Do what `finish` says; return each world's actions of each agent, by its place."""
+    """Drive worlds to their ends as `finish` does; return each world's actions by agent index."""
     scripts: list[dict[int, list[str]]] = []
     for world in worlds:
         scripts.append({agent: [] for agent in world.journeys})
@@ -89,8 +88,10 @@ def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, lis
 
 
 def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:
-    """Let the agents of each world act, by their places, after the lag,
-    and simulate to the next decision.
+    """Apply each agent's action after the decision lag, and simulate to the next decision.
+
+    `actions` has, for each world, the meta-action of each agent by its index. The worlds are of one
+    scenario.
     """
     p = worlds[0].scenario.parameters
     lockstep.advance(worlds, [p.due_frame(world.step) + p.lag_frames for world in worlds])
@@ -103,14 +104,15 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
-    """Drive one whole episode; the outcome is not yet compared with the full-view driver's time."""
+    """Drive one episode with a reference driver; the outcome is not yet judged for being `late`."""
     [outcome] = finish([World.start(scenario, seed)], [driver])
     return outcome
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
-    """Drive episodes with every driver;
-    one that clears too long after the full-view driver is `late`.
+    """Drive each seed's episode with every driver of `DRIVERS`; return outcomes by driver.
+
+    An outcome is `late` if that driver cleared too long after the full-view driver.
     """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     outcomes = finish(worlds, DRIVERS * len(seeds))
@@ -139,7 +141,10 @@ def in_chunks(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> list[T]:
-    """Return what comes of some layouts, so many of which are driven together, on workers."""
+    """Return `drives(seeds)` in order, computed by workers in chunks of `together` layout seeds.
+
+    `progress` is called with the number of seeds of each finished chunk.
+    """
     chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
     # all but the last have one size, so the order of completion is no matter
     sizes = iter([len(chunk) for chunk in chunks])
@@ -156,7 +161,7 @@ def in_chunks(
 def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Drive every reference driver through the same episodes; return the `summary` of each."""
+    """Drive every reference driver through the same episodes; return each one's `summary`."""
     seeds = range(seed, seed + episodes)
     layouts = drive_apart(scenario, seeds, workers, progress)
     dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
@@ -168,10 +173,11 @@ def check(
 
 
 def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
-    """Return rates of results (Wilson, n is episodes), collisions by fault, and crashes of others.
+    """Return rates of each result with Wilson intervals, and counts of collisions and crashes.
 
-    Where some episodes are `dangerous` and some are not, also success in either,
-    and the mean of both.
+    Keys are `success`, `collision`, `late`, `time_out`, `off_road`, `ego_at_fault`,
+    `other_at_fault` and `other_crashes`. `dangerous` says which episodes hold a danger; if some do
+    and some do not, success is also given as `dangerous`, `harmless` and their mean `balanced`.
     """
     rates: dict[str, Estimate] = {}
     for result in ("cleared", "collision", "late", "time_out", "off_road"):

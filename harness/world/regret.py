@@ -19,7 +19,11 @@ from harness.world.outcome import ROUNDING_S
 
 @dataclass(frozen=True)
 class Regret:
-    """What the first decisions of a layout's agents cost; NaN where there is nothing to judge."""
+    """Hold what the first decisions of a layout's agents cost; NaN where none could arrive.
+
+    A cost is how much later (s) an agent can arrive at the soonest after its decisions than before,
+    if all others do what they did.
+    """
 
     best_decisions: float  # share of decisions after which an agent can arrive as soon as before
     # share of agents after one of whose decisions they could no longer arrive, but before it
@@ -28,10 +32,11 @@ class Regret:
 
 
 def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regret:
-    """Return what decisions of a layout's agents cost.
+    """Return how far the decisions of a layout's agents fell short of each one's best response.
 
-    `able` is what each can do and `courses` the one that each took, by its place.
-    Decisions count while their agent can still arrive.
+    Both arguments are keyed by the agent's index among the vehicles: `able` has all action
+    sequences that it could have taken, `courses` the single one that it took. The others are held
+    to what they did. A decision counts only while its agent can still reach its goal.
     """
     delays, spent_s = list[Floats](), list[float]()
     for agent, options in able.items():
@@ -50,11 +55,11 @@ def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regre
 
 
 def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floats:
-    """Return when an agent can arrive at the soonest,
-    before its first decision and after each one, in s.
+    """Return when an agent can arrive at the soonest, before and after each of k decisions.
 
-    inf for never. The decisions are the first `HORIZON` of its course.
-    How it went on is one of its options.
+    The result has shape (k + 1,), in s. Entry i assumes the agent's first i actual decisions; inf
+    means never. `able` are its possible action sequences, `course` the one that it took, and
+    `others` the courses of the other agents, which are held fixed. k is at most `HORIZON`.
     """
     arrives_s = np.where(passes(able, others), able.arrives_s, np.inf)
     course_s = np.where(passes(course, others), course.arrives_s, np.inf)
@@ -68,7 +73,10 @@ def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floa
 
 
 def passes(able: Options, others: Sequence[Options]) -> Bools:
-    """Return with which options an agent touches none of some others before it arrives, (n,)."""
+    """Return which of an agent's n options touch no other agent before it reaches its goal, (n,).
+
+    Each of `others` holds one option: the course that this other agent took.
+    """
     frame = np.arange(1, able.poses.shape[1] + 1)
     under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
     free = np.ones(len(able.actions), dtype=bool)

@@ -32,7 +32,7 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """One path along the road, in sections, each of which is a lane of highway-env."""
+    """Describe one path along the road, in consecutive sections, each a lane of highway-env."""
 
     approach: str  # where it comes from
     route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
@@ -59,8 +59,8 @@ class Path:
     ) -> "Path":
         """Build a path along the middle of consecutive lanes of highway-env.
 
-        Only the part of a lane within `reach_m` of the origin of the road's frame counts,
-        but at least one point.
+        `roles` names each lane as scene graphs do. Only the part of a lane within `reach_m` of the
+        origin (`origin_m` in highway-env's frame) counts, but at least one point.
         """
         middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
@@ -86,7 +86,7 @@ class Path:
 
     @cached_property
     def headings_rad(self) -> Floats:
-        """Direction of travel at each point, (n,)."""
+        """Direction of travel at each point (rad, from +x towards +y), (n,)."""
         along = np.gradient(self.points, axis=0)
         heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
@@ -105,28 +105,27 @@ class Path:
 
     @cached_property
     def uneven_m(self) -> float:
-        """Largest distance of a point from where it would be if all were as far apart as the first
-        two.
-        """
+        """Largest deviation (m) of a point's arc length from equal spacing of all points."""
         return float(np.abs(self.arc_m - self.arc_m[1] * np.arange(len(self.arc_m))).max())
 
     @cached_property
     def kink_rad(self) -> float:
-        """Largest change of the heading from one point to the next."""
+        """Largest change of the heading (rad) from one point to the next."""
         return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
 
     # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene
     # share most.
     @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
-        """Return arc length (m), unsigned lateral offset (m) and heading (rad) of the nearest
-        point.
+        """Project a position on the path: arc length (m), unsigned lateral offset (m), heading.
+
+        The heading (rad) is that of the path there.
         """
         arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
         return arc, lateral, heading
 
     def project_all(self, x_m: Floats, y_m: Floats) -> Floats:
-        """Return what `project` does for points (n,), as (3, n)."""
+        """Project n positions on the path as `project` does; arc, offset and heading, (3, n)."""
         if self._step is None:
             nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
         else:
@@ -160,12 +159,12 @@ class Path:
 
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
-        """Return the position (m, m) and the heading (rad) at an arc length."""
+        """Return x (m), y (m) and heading (rad) of the path at an arc length."""
         x, y, heading = self.places(np.array(arc_m))
         return float(x), float(y), float(heading)
 
     def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return x (m), y (m) and heading (rad) at arc lengths (...), as `at` does."""
+        """Return x (m), y (m) and heading (rad) of the path at arc lengths (...), each (...)."""
         x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
         return (
             x,
@@ -174,7 +173,7 @@ class Path:
         )
 
     def points_at(self, arc_m: Floats) -> Floats:
-        """Return the positions (n, 2) m at arc lengths (n,)."""
+        """Return positions on the path, (n, 2) m, at arc lengths (n,)."""
         return np.stack(self.places(arc_m)[:2], axis=-1)
 
     def section(self, arc_m: float) -> int:
@@ -200,7 +199,7 @@ def _within(points: Floats, reach_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """The point where another path meets the ego's."""
+    """Describe the point where another path meets the ego's."""
 
     x_m: float  # position, m to the east
     y_m: float  # position, m to the south
@@ -212,7 +211,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Ground:
-    """The parts of a road that pictures show, in m to the east and to the *north*."""
+    """Hold what pictures show of a road's ground, in m to the east and to the *north*."""
 
     # edges of the surface, (n, 2) each: the outer one, and those of islands
     outlines: tuple[Floats, ...]
@@ -224,7 +223,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Road:
-    """A road, and what matters on it for the ego."""
+    """Describe a road with all of its paths, and which of its places matter to the ego."""
 
     # description in frozen records: texts, and numbers with their unit in the name
     facts: Mapping[str, str | float]
@@ -253,14 +252,14 @@ class Road:
     ground: Callable[[float], Ground] | None = None
 
     def ground_within(self, far_m: float) -> Ground:
-        """Return the ground for a picture that reaches so many metres from the origin."""
+        """Return the ground for a picture that reaches `far_m` from the origin on each side."""
         return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
-        """Return the way that the ego is on, `own`,
-        and those to its `left` and `right` if there are any.
+        """Return the keys of the ego's paths side by side: `key` as `own`, its `left` and `right`.
 
-        With an arc length, only ways that are in a separate lane at that place.
+        A side without a path is left out. With an arc length, so is one whose path shares the lane
+        there.
         """
         if key not in self.ways:
             return {"own": key}
@@ -277,9 +276,7 @@ class Road:
         }
 
     def project(self, keys: Sequence[PathKey], x_m: Floats, y_m: Floats) -> Floats:
-        """Return what `Path.project` does for points, each on a path of its own, all (n,),
-        as (3, n).
-        """
+        """Project n positions, each on the path of its own key; arc, offset and heading, (3, n)."""
         projected, places = np.empty((3, len(keys))), defaultdict[PathKey, list[int]](list)
         for n, key in enumerate(keys):
             places[key].append(n)
@@ -289,8 +286,9 @@ class Road:
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
-        """Sections (path and number) that several paths of one approach share;
-        an indicator tells which.
+        """Sections, as path key and section number, whose lane several paths of one approach share.
+
+        There, only a vehicle's indicator tells which of these paths it will take.
         """
         of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
         for key, path in self.paths.items():
@@ -306,20 +304,21 @@ class Road:
 
     @cached_property
     def zone_arc_m(self) -> float:
-        """Arc length at which the ego's path passes the conflict zone."""
+        """Arc length (m) of the ego's path at the point nearest to the conflict zone."""
         return self.ego_path.project(*self.zone_m)[0]
 
     @cached_property
     def watched(self) -> Floats:
-        """The points of all sectors in order, (points, 2) m."""
+        """The watched points of all sectors, one after another, (points, 2) m."""
         return np.concatenate(list(self.sectors.values()))
 
 
 def paths_along(
     network: Any, ways: Mapping[PathKey, tuple[Sequence[Lane], Sequence[str], int]]
 ) -> dict[PathKey, Path]:
-    """Build paths by approach and route, each of consecutive lanes,
-    with their roles and its right of way.
+    """Build the paths of a network by key (approach, route).
+
+    Each is given as consecutive lanes, the role of each lane, and the path's right of way.
     """
     return {
         key: Path.along(network, *key, lanes, roles, priority)
@@ -328,7 +327,7 @@ def paths_along(
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
-    """Find where paths of other approaches first meet the ego's, by approach and route."""
+    """Return where paths of other approaches first meet the ego's path, by path key."""
     own = paths[ego]
     meetings = {}
     for key, path in paths.items():
@@ -347,9 +346,9 @@ def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Cros
 
 
 def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple[int, int]]) -> Any:
-    """Build a network of highway-env from straight lanes along x.
+    """Build a network of highway-env from straight lanes parallel to the x axis.
 
-    A lane is given by its two nodes, its begin, end and y in metres, and its line types.
+    A lane is given by its two nodes, its begin, end and y in metres, and its two line types.
     """
     from highway_env.road.lane import StraightLane
     from highway_env.road.road import RoadNetwork
@@ -365,11 +364,10 @@ def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple
 def to_the_left(
     begin: tuple[float, float], end: tuple[float, float], width_m: float
 ) -> tuple[Any, Any]:
-    """Build a shift to the left from two arcs of highway-env,
-    the first to the left and the second back.
+    """Build a lane shift to the left from two arcs: one that turns left, and one that turns back.
 
-    Both ends (metres) head east, and the end lies farther north. Unlike those of highway-env's
-    `SineLane`, the arcs' longitudinal coordinate is their length.
+    `begin` and `end` are x and y in m; both ends head east, and `end` lies farther north. Unlike
+    highway-env's `SineLane`, an arc's longitudinal coordinate is its true length.
     """
     from highway_env.road.lane import CircularLane, LineType
 
@@ -385,7 +383,7 @@ def to_the_left(
 
 
 def lanes_of(network: Any) -> dict[Lane, Any]:
-    """Return highway-env's lanes by their index."""
+    """Return the lanes of a highway-env network by their index: two nodes and a number."""
     lanes: dict[Lane, Any] = {}
     for begin, following in network.graph.items():
         for end, beside in following.items():
@@ -394,9 +392,7 @@ def lanes_of(network: Any) -> dict[Lane, Any]:
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
-    """Build the ground of highway-env's lanes up to `far_m`:
-    their surface, and the lines within it.
-    """
+    """Build the ground of all lanes within `far_m` of the origin: surface, and lines within it."""
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
     strips = []

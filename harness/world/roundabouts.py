@@ -24,7 +24,7 @@ NAMES = ("own", "right", "oncoming", "left")
 
 @dataclass(frozen=True)
 class Roundabout:
-    """The sizes of a roundabout around the origin, and what follows from them."""
+    """Describe a one-lane roundabout with four arms around the origin."""
 
     ring_m: float  # radius of the middle of the ring's lane
     entry_m: float  # radius of the arcs by which cars enter and leave
@@ -33,22 +33,22 @@ class Roundabout:
 
     @property
     def arc_y_m(self) -> float:
-        """Where the south arm's arcs begin."""
+        """How far south of the centre (m) the south arm's entry and exit arcs begin."""
         return math.sqrt((self.ring_m + self.entry_m) ** 2 - (self.beside_m + self.entry_m) ** 2)
 
     @property
     def touch_rad(self) -> float:
-        """Where on the ring the south entry joins it."""
+        """Angle on the ring (rad, from +x towards +y) at which the south arm's entry joins it."""
         return math.atan2(self.arc_y_m, self.beside_m + self.entry_m)
 
     def ring_rad(self, node: int) -> float:
-        """Return the angle of the ring's nth node; angles fall the way cars go round."""
+        """Return the angle (rad) of the nth junction of `RING`; it decreases along the traffic."""
         exits = self.touch_rad if node % 2 == 0 else math.pi / 2 - self.touch_rad
         return exits - math.pi / 2 * (node // 2)
 
     @cache  # noqa: B019 there are few, and they are never freed
     def network(self) -> Any:
-        """Build a ring with four arms of highway-env's lanes, which meet; its own ring has gaps."""
+        """Build highway-env's `RoadNetwork` of the ring and its four arms, without gaps."""
         from highway_env.road.lane import CircularLane, LineType, StraightLane
         from highway_env.road.road import RoadNetwork
 
@@ -89,10 +89,10 @@ class Roundabout:
     def path(
         self, approach: str, route: str, begin: str, end: str, priority: int, own: str = ARMS[0]
     ) -> Path:
-        """Build the path from the arm of `begin`, by the ring,
-        to the arm of `end` (arms by first letter).
+        """Build the path of `approach` and `route` from arm `begin` round the ring to arm `end`.
 
-        Sections are named as an agent from the arm `own` sees them.
+        Arms are `s`, `e`, `n` or `w`. Lane names in the path are relative to an agent that comes
+        from the arm `own`.
         """
         first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
         if last <= first:  # once more past the node where the ring's list begins
@@ -105,8 +105,9 @@ class Roundabout:
         return Path.along(self.network(), approach, route, lanes, roles, priority)
 
     def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
-        """Return three boxes (west, north, east, south) whose corners lie on a circle around the
-        origin.
+        """Return three boxes (west, north, east, south; m) that together approximate a disc.
+
+        Their corners lie on the circle around the origin.
         """
         boxes = []
         for degrees in (22.5, 45.0, 67.5):
@@ -117,7 +118,10 @@ class Roundabout:
 
 
 def name_of(arm: str, own: str) -> str:
-    """Return the name of an arm for an agent from the arm `own`."""
+    """Return how an agent from arm `own` calls `arm`: `own`, `right`, `oncoming` or `left`.
+
+    Arms are given as `s`, `e`, `n` or `w`.
+    """
     return NAMES[(ARMS.index(arm) - ARMS.index(own)) % len(ARMS)]
 
 

@@ -17,8 +17,9 @@ from harness.world.state import Building, Kind, Part
 
 @dataclass(frozen=True)
 class Draws:
-    """Random draws of one layout. Each quantity has its own,
-    so one parameter does not change another's.
+    """Draw the random quantities of one layout, each keyed by its name and the layout seed.
+
+    So a parameter that changes one quantity leaves the draws of all others as they are.
     """
 
     scenario: str
@@ -34,11 +35,10 @@ class Draws:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def ids(self, names: Collection[str]) -> dict[str, str]:
-        """Draw ids, after those of the ego and three helpers,
-        so that an id tells nothing about its vehicle.
+        """Draw vehicle ids from `v5` on for `names` and `seats`, keyed by these names.
 
-        Absent vehicles have ids, too, so a gap between two ids tells nothing either;
-        so have `seats`.
+        Ids are shuffled, and absent vehicles get one too, so neither an id nor a gap between two
+        tells anything about a vehicle. The ego and the helpers have `v1` to `v4`.
         """
         names = (*names, *self.seats)
         order = noise.generator(self.scenario, self.seed, "ids").permutation(len(names)).tolist()
@@ -47,7 +47,7 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """One vehicle at the start of an episode."""
+    """Describe one vehicle at the start of an episode."""
 
     id: str  # `v1`, `v2`, …
     kind: Kind  # class of vehicle
@@ -64,7 +64,7 @@ class Spawn:
 
 @dataclass(frozen=True)
 class Layout:
-    """The start of one episode."""
+    """Hold the start of one episode: its vehicles, its buildings and its danger."""
 
     spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
@@ -79,8 +79,10 @@ class Layout:
         danger_id: str,
         buildings: Iterable[Building] = (),
     ) -> "Layout":
-        """Return a layout with vehicles in the order of their ids;
-        without a danger nobody is `danger_id`.
+        """Return a layout with the vehicles in the order of their ids.
+
+        `danger` is the sector of the dangerous vehicle `danger_id`; if it is None the layout has no
+        danger, and the id is ignored.
         """
         order = sorted(spawns, key=lambda spawn: int(spawn.id[1:]))
         return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
@@ -88,11 +90,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class Seat:
-    """The view of an agent that is not the ego:
-    a scene in which it is, on the same network and in its frame.
+    """Describe the scenario as an agent other than the ego plays it: with that agent as the ego.
 
-    The scenario has the same name and actions, and whatever parameters the shared one has;
-    road, goal and words are the agent's.
+    The road network, name, actions and parameters are the shared scenario's; road, goal and prompt
+    words are the agent's own.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
@@ -101,7 +102,10 @@ class Seat:
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario. The registry pickles it as its name and its parameters."""
+    """Describe one scenario: its road, layouts, goal, actions, parameters and words for prompts.
+
+    Pickled by name and parameters, so it must be found by name in the registry.
+    """
 
     name: str  # its name for users, and in manifests and frozen states
     description: str  # text whose first line is `Scenario <name>: <summary>`
@@ -144,16 +148,12 @@ class Scenario:
 
     @property
     def is_environment(self) -> bool:
-        """Whether an environment simulates the episodes;
-        then the harness knows no layout and no danger.
-        """
+        """Whether a highway-env environment runs the episodes; it declares no layout or danger."""
         return self.world is not None
 
     @property
     def prompt_words(self) -> dict[str, str]:
-        """Texts for prompts: `words`, and the `speeds` that actions step through,
-        the highest first.
-        """
+        """Texts for prompts by name: `words`, and `speeds`, the target speeds in m/s."""
         speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
         return {**self.words, "speeds": speeds}
 

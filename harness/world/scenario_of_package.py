@@ -77,7 +77,11 @@ class _SeatsDoor(_Door):
 
 
 def put_doors(scenario: Scenario) -> None:
-    """Put every function of a scenario that is a package's behind a door."""
+    """Replace the functions of another package's scenario, in place, by checking wrappers.
+
+    The wrappers (of `road`, `layout`, `cleared` and `seats`) raise a one-line UserError that names
+    the scenario when the function fails or returns something invalid.
+    """
     what = f"scenario {printable(scenario.name)}"
     for name, door in (("road", _RoadDoor), ("cleared", _ClearedDoor), ("seats", _SeatsDoor)):
         function = getattr(scenario, name)
@@ -89,7 +93,7 @@ def put_doors(scenario: Scenario) -> None:
 
 
 def is_ours(function: Callable[..., Any]) -> bool:
-    """Return whether a function, or that of a partial one, is the harness's own."""
+    """Return whether a function, or the one inside a `partial`, is the harness's own."""
     return is_in_harness(getattr(function, "func", function))
 
 

@@ -20,7 +20,7 @@ BY_BEACON = ("v2x",)  # the source of a vehicle that is known by its beacons alo
 
 
 class Viewer(Closed, frozen=True):
-    """The viewer itself."""
+    """Describe the vehicle whose knowledge the graph holds."""
 
     speed_mps: Number
     lane: str
@@ -29,12 +29,12 @@ class Viewer(Closed, frozen=True):
 
 
 class Ego(Closed, frozen=True):
-    """The ego, in the viewer's frame."""
+    """Describe the ego as the viewer knows it, in the viewer's frame."""
 
     id: VehicleId
     speed_mps: Number
     target_speed_mps: Number
-    age_s: Number
+    age_s: Number  # age of the beacon that this is known from; 0 if it is the truth
     zone_m: Number
     forward_m: Number
     left_m: Number
@@ -42,7 +42,7 @@ class Ego(Closed, frozen=True):
 
 
 class Node(Closed, frozen=True):
-    """A vehicle that the viewer's sensors report, or that sends beacons out of their sight."""
+    """Describe a vehicle that the viewer's sensors report, or that it knows only by beacons."""
 
     id: VehicleId
     type: Literal["vehicle", "car", "van", "truck"]
@@ -53,53 +53,54 @@ class Node(Closed, frozen=True):
     range_rate_mps: Number | None
     lane: str
     indicator: str | None
-    sensors: tuple[str, ...]
+    sensors: tuple[str, ...]  # sensors that report it; `v2x` if only its beacons do
     braking: bool | UnsetType | None = UNSET
 
 
 class Point(Closed, frozen=True):
-    """A place in the viewer's frame."""
+    """Describe a position in the viewer's frame."""
 
     forward_m: Number
     left_m: Number
 
 
 class EgoArrival(Closed, frozen=True):
-    """How far the ego is from a conflict; no time where it stands."""
+    """Hold how far the ego is from the conflict point; the time is None if it stands."""
 
-    arc_m: Number
-    time_s: Number | None
+    arc_m: Number  # distance to go along the path; negative once past
+    time_s: Number | None  # time to get there at the present speed
 
 
 class Arrival(EgoArrival, frozen=True):
-    """How far another vehicle is from a conflict, how fast it is,
-    and whether it is seen to brake.
-    """
+    """Hold how far another vehicle is from the conflict point, and its speed and brake lamps."""
 
     speed_mps: Number
     braking: bool | UnsetType | None = UNSET
 
 
 class Conflict(Closed, frozen=True):
-    """A vehicle whose path meets the ego's: the one it is on, or one beside, `lane`."""
+    """Describe where another vehicle's path meets the ego's path, or one to which it may change."""
 
     vehicle: VehicleId = field(name="with")
-    sector: str
-    route: str
+    sector: str  # approach of the other vehicle's path
+    route: str  # route of the other vehicle's path
     point: Point
     ego: EgoArrival
     other: Arrival
     kind: Meeting | UnsetType = UNSET
-    lane: Side | UnsetType = UNSET
+    lane: Side | UnsetType = UNSET  # which of the ego's paths it concerns; `own` is the present one
 
     @property
     def meets(self) -> bool:
-        """Whether the paths cross or merge; else both are on one."""
+        """Whether the paths cross or merge, rather than run along the same lane."""
         return self.kind in (UNSET, "crossing", "merging")
 
 
 class Sector(Closed, frozen=True):
-    """How much of a sector is in sight, and what hides the rest."""
+    """Describe how much of one direction that danger can come from is in the viewer's sight.
+
+    `by` has the ids of the vehicles and buildings that hide the rest.
+    """
 
     sector: str
     seen_share: Number
@@ -108,7 +109,7 @@ class Sector(Closed, frozen=True):
 
 
 class SceneGraph(Closed, frozen=True):
-    """What one viewer knows."""
+    """Hold what one viewer knows of a scene."""
 
     viewer: VehicleId
     role: Role
@@ -121,12 +122,12 @@ class SceneGraph(Closed, frozen=True):
 
     @property
     def sensed(self) -> tuple[Node, ...]:
-        """The vehicles that its sensors report."""
+        """Nodes of the vehicles that the viewer's sensors report, not those known by beacons."""
         return tuple(node for node in self.nodes if node.sensors != BY_BEACON)
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Ids of the vehicles that its sensors report."""
+        """Ids of the vehicles that the viewer's sensors report."""
         return tuple(node.id for node in self.sensed)
 
     @property
@@ -136,20 +137,19 @@ class SceneGraph(Closed, frozen=True):
 
     @property
     def all_in_sight(self) -> tuple[Sector, ...]:
-        """Its sectors as whoever sees all of each would list them."""
+        """The graph's sectors as a viewer that sees all of each would list them."""
         return tuple(Sector(sector.sector, 1.0, False, ()) for sector in self.sectors)
 
     def blinded(self) -> "SceneGraph":
-        """Return the graph of a viewer without sensors,
-        who knows only itself and the ego's beacon.
+        """Return the graph as a viewer without sensors has it: no vehicles, and no sector in sight.
+
+        It keeps the viewer itself and the ego, which is known by its beacon.
         """
         unseen = tuple(Sector(sector.sector, 0.0, True, ()) for sector in self.sectors)
         return msgspec.structs.replace(self, nodes=(), conflicts=(), sectors=unseen)
 
     def plain(self) -> dict[str, Any]:
-        """Return what templates read: mappings and lists without the members that are not in the
-        file.
-        """
+        """Return the graph as dicts and lists for templates, without members that are `UNSET`."""
         plain: dict[str, Any] = msgspec.to_builtins(self, order="sorted")
         for node in plain["nodes"]:
             node["sensors"] = list(node["sensors"])

@@ -19,15 +19,17 @@ from harness.world.state import VehicleState, WorldState
 
 
 def agent_share(scenario: Scenario) -> float:
-    """Return the share of the vehicles beside the ego that decide;
-    0 where only an ego has a goal.
+    """Return the probability that a vehicle that could decide for itself is an agent (ego aside).
+
+    0 in scenarios where only the ego has a goal.
     """
     return getattr(scenario.parameters, "agent_share", 0.0)
 
 
 def refuse_agents(scenario: Scenario, what: str) -> None:
-    """Raise UserError if vehicles beside the ego decide in a scenario,
-    and in `what` the ego alone does.
+    """Raise UserError if vehicles other than the ego decide in a scenario.
+
+    `what` names, for the message, the operation that allows one deciding ego only.
     """
     if share := agent_share(scenario):
         raise UserError(
@@ -38,10 +40,10 @@ def refuse_agents(scenario: Scenario, what: str) -> None:
 
 @lru_cache(maxsize=64)
 def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
-    """Return the seats of a scenario by the path that an agent is on;
-    none if only the ego has a goal.
+    """Return the `Seat` of each agent that is not the ego, by the path on which it starts.
 
-    Their scenarios have its parameters.
+    A seat is the scenario with that agent as its ego; it has the parameters of `scenario`. Empty if
+    only the ego has a goal.
     """
     seats = scenario.seats() if scenario.seats else {}
     p = scenario.parameters
@@ -51,11 +53,11 @@ def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
 
 
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
-    """Return the places of a layout's agents, the ego's first,
-    and the layout with those who are none.
+    """Return the layout, and the indices in it of the agents: the vehicles that decide.
 
-    With a share of 0, helpers decide nothing, but answer.
-    With a greater one, whoever could be an agent and is none is other traffic.
+    The ego comes first. If `agent_share` is 0 the ego is the only agent and the layout is
+    unchanged. Otherwise agents are drawn by the layout seed, and a vehicle that could be one and
+    was not drawn becomes traffic (`other`).
     """
     share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
@@ -75,14 +77,20 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
 
 
 def offsets(scenario: Scenario) -> list[int]:
-    """Return how many frames after a common clock an agent may decide, ascending."""
+    """Return by how many frames agents' decisions may lag the common clock, ascending.
+
+    [0] unless the parameter `clock` is `apart`: then multiples of a quarter of the decision period.
+    """
     p = scenario.parameters
     quarters = range(4) if getattr(p, "clock", "together") == "apart" else range(1)
     return [round(quarter * p.decision_period_s * p.simulation_hz / 4) for quarter in quarters]
 
 
 def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
-    """Return how many frames after a common clock an agent of a layout decides, by its place."""
+    """Return the offset of one agent's decision times from the common clock, in frames.
+
+    It is drawn by the layout `seed` and the agent's index among the vehicles.
+    """
     times = offsets(scenario)
     if len(times) == 1:
         return 0
@@ -92,12 +100,12 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
 
 
 def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
-    """Return the seat of an agent that is not the ego."""
+    """Return the `Seat` of an agent other than the ego; KeyError if its path has none."""
     return seats_of(scenario)[vehicle.approach, vehicle.route]
 
 
 def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
-    """Return the places at which each scenario stands, in the order in which they come first."""
+    """Return the positions in the sequence at which each scenario occurs, by first occurrence."""
     places: dict[Scenario, list[int]] = {}
     for n, scenario in enumerate(scenarios):
         places.setdefault(scenario, []).append(n)
@@ -105,8 +113,10 @@ def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
 
 
 def seated(scenario: Scenario, state: WorldState, agent: int) -> WorldState:
-    """Return a state as it is for an agent, by its place:
-    it is the ego, and the ego is a helper.
+    """Return a state as one agent sees it: this agent is the ego, and the ego a helper.
+
+    `agent` is its index among the vehicles, not 0. Vehicles are reordered, the agent first, and
+    paths renamed as its scenario names them.
     """
     names = seat_of(scenario, state.vehicles[agent]).names
 

@@ -24,11 +24,12 @@ def site(
     units: Collection[Unit] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
-    """Return the links at some decision points, (n, ...), with those of roadside units.
+    """Return the radio links from the ego to each helper in n states, as arrays (n, ...).
 
-    Each point is a state with the ids of the ego and its helpers, in this order. An antenna is at
-    the centre of its vehicle. If a building and a vehicle stand between two antennas, the building
-    counts. Units have their positions from `zone_m`, the centroid of the conflict zone.
+    Each of the n `points` is a state with the ids of its ego and helpers, the ego first. Antennas
+    are at vehicle centres; if a building and a vehicle both block a link, the building counts.
+    `units` are roadside units, which add links to the ego and helpers; their positions are relative
+    to `zone_m`, the centre of the conflict zone (m).
     """
     states = [state for state, _ in points]
     viewers: list[list[VehicleState]] = []
@@ -86,8 +87,9 @@ def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tup
 
 
 def corner(a: VehicleState, b: VehicleState) -> Floats:
-    """Return the distances of two vehicles to the crossing of their headings' lines, (2,) m;
-    NaN if none.
+    """Return the distances (m) of vehicles `a` and `b` to where their straight courses cross, (2,).
+
+    NaN if their headings are within 30° of parallel.
     """
     sine = np.sin(b.heading_rad - a.heading_rad)
     if abs(sine) < np.sin(LEAST_ANGLE_RAD):

@@ -48,9 +48,9 @@ class _OnRoute:
 
 
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
-    """Keeps its route, and its speed unless it would run into the vehicle ahead in its lane.
+    """A vehicle that keeps its route and speed, but brakes for a slower one ahead in its lane.
 
-    It brakes by itself if its layout says so.
+    It also brakes at a fixed time if its layout says so (`Spawn.brakes_at_s`).
     """
 
     braking_mps2 = 4.0
@@ -71,13 +71,13 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
 
 
 class Van(Traffic):
-    """High enough to hide vehicles before or behind it."""
+    """A van in traffic, high enough to hide the vehicles before or behind it."""
 
     LENGTH, WIDTH = SIZES_M["van"]
 
 
 class Truck(Traffic):
-    """Long and wide enough to hide a car behind it."""
+    """A truck in traffic, long and wide enough to hide a car behind it."""
 
     LENGTH, WIDTH = SIZES_M["truck"]
 
@@ -86,21 +86,21 @@ KINDS = {"car": Traffic, "van": Van, "truck": Truck}
 
 
 class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
-    """Follows a target speed within physical limits (highway-env's own controller has no limit)."""
+    """A vehicle that decides: it follows a target speed within limits of acceleration."""
 
     limits_mps2 = (-8.0, 3.0)
     # the lanes that it may change between, and their routes
     ways: Mapping[Lane, str] = MappingProxyType({})
 
     def act(self, action: str | None = None) -> None:
-        """Drive on, or take a meta-action; changing lane changes the route."""
+        """Take a meta-action, or just drive on if None; a lane change changes the route."""
         super().act(action)
         route = self.ways.get(self.target_lane_index, self.spawn.route)
         if route != self.spawn.route:
             self.spawn, self.route = replace(self.spawn, route=route), [self.target_lane_index]
 
     def on_state_update(self) -> None:
-        """Set the lane to the nearest of its ways."""
+        """Set the vehicle's lane to the nearest one of those between which it may change."""
         super().on_state_update()
         if self.ways:
             self.lane_index = min(self.ways, key=self._off_m)
@@ -115,8 +115,9 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
 
 
 def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
-    """Return highway-env's road with a layout's vehicles on it, the ego first;
-    agents by their place.
+    """Return a highway-env road with the layout's vehicles on it, in order, the ego first.
+
+    `agents` are the indices of the vehicles that decide.
     """
     road, static = new_road(scenario), scenario.road()
     for n, spawn in enumerate(layout.spawns):
@@ -139,9 +140,7 @@ def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)
 
 
 def copied(road: Any) -> Any:
-    """Return a road with copies of its vehicles;
-    attributes that are written in place are copied, too.
-    """
+    """Return a copy of a highway-env road that can be simulated without changing the original."""
     new = copy(road)
     new.vehicles = [copy(v) for v in road.vehicles]
     for v in new.vehicles:
@@ -150,7 +149,7 @@ def copied(road: Any) -> Any:
 
 
 def new_road(scenario: Scenario) -> Any:
-    """Return highway-env's road without vehicles."""
+    """Return a highway-env road of the scenario, without vehicles."""
     return Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
 
 
@@ -163,7 +162,11 @@ def vehicle_on(
     heading: float,
     agent: bool,
 ) -> ControlledVehicle:
-    """Create a vehicle on a section of its path; an `agent` follows a target speed."""
+    """Create a highway-env vehicle on the given section of its path, at a position and heading.
+
+    `position` is in m in highway-env's frame, `heading` in rad. If `agent` is true it takes actions
+    and follows a target speed, else it is traffic.
+    """
     p, static = scenario.parameters, scenario.road()
     route = list(static.paths[spawn.approach, spawn.route].lanes)
     start = position, heading, spawn.speed_mps, route[section]
@@ -182,7 +185,7 @@ def vehicle_on(
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """Return a spawn for a vehicle in the middle of an episode, as if it began there."""
+    """Return a spawn at a vehicle's present position and speed, as if it began there."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
     plans = (begun.brakes_at_s, begun.brakes_mps2, begun.brakes_to_mps) if begun else ()
@@ -192,8 +195,10 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
 def state_of(
     v: ControlledVehicle, lamps: bool = False, origin_m: tuple[float, float] = (0.0, 0.0)
 ) -> VehicleState:
-    """Return a vehicle's state, rounded to the micrometre,
-    since the last bits depend on the machine.
+    """Return the state of a highway-env vehicle, with positions from `origin_m`.
+
+    Numbers are rounded to `DECIMALS`, since the last bits depend on the machine. Brake lamps are
+    reported only if `lamps` is true.
     """
     s = v.spawn
     numbers = (*(v.position - origin_m), v.heading, v.speed)

@@ -24,12 +24,12 @@ HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 
 
 def indicator(route: str) -> str:
-    """Return what the turn indicator of a vehicle on a route shows."""
+    """Return what the turn indicator of a vehicle on this route shows: `left`, `right` or `off`."""
     return route if route in ("left", "right") else "off"
 
 
 class VehicleState(Closed, frozen=True, omit_defaults=True):
-    """One vehicle at one moment, in the frame of `harness.world.road`."""
+    """Describe one vehicle at one moment, in the frame of `harness.world.road` (y to the south)."""
 
     id: VehicleId  # `v1`, `v2`, … by spawn order; the ego is `v1`
     kind: Kind  # class of vehicle, which fixes its size
@@ -79,8 +79,10 @@ def rectangle(
     length_m: float | Floats,
     width_m: float | Floats,
 ) -> Floats:
-    """Return the corners of rectangles (...), (..., 4, 2) m:
-    front left first, then clockwise from above.
+    """Return corners of rectangles, (..., 4, 2) m: front left first, then clockwise from above.
+
+    The arguments are centres, headings (from +x towards +y), lengths and widths, each of shape
+    (...).
     """
     cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
     along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
@@ -90,9 +92,10 @@ def rectangle(
 
 
 def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
-    """Return a lower bound of the gap between pairs of rectangles, (n,) m, by separating axes.
+    """Return a lower bound of the gap between n pairs of rectangles, (n,) m, by separating axes.
 
-    Each has x, y and heading, (n, 3), and length and width, (n, 2).
+    A negative value means that they overlap. `poses` and `others` are x, y and heading, (n, 3); the
+    sizes are length and width, (n, 2).
     """
     dx, dy = (others - poses)[:, :2].T
     apart = np.full(len(poses), -np.inf)
@@ -110,7 +113,7 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
 
 
 class Building(Closed, frozen=True):
-    """An axis-parallel box that blocks sight, by the positions of its walls in metres."""
+    """Describe an axis-parallel box that blocks sight, by the coordinates of its walls in m."""
 
     id: Annotated[str, Meta(pattern="^b[1-9]$")]
     west_m: Number
@@ -125,7 +128,7 @@ class Building(Closed, frozen=True):
 
 
 class Beacon(Closed, frozen=True, omit_defaults=True):
-    """A vehicle's message about itself, with its errors: see `harness.world.beacons`."""
+    """Describe one broadcast of a vehicle's pose and speed, like a CAM or BSM, with errors."""
 
     sender: VehicleId  # id of the vehicle
     time_s: Number  # when it was sent, since the start of the episode; negative before the start
@@ -145,7 +148,7 @@ class Beacon(Closed, frozen=True, omit_defaults=True):
 
 
 class WorldState(Closed, frozen=True):
-    """The state of everything, seen or not."""
+    """Hold the full state of an episode at one moment, whether or not any vehicle sees it."""
 
     scenario: str  # name of the scenario
     episode_seed: Seed  # seed of the episode's layout
@@ -162,12 +165,12 @@ class WorldState(Closed, frozen=True):
 
     @property
     def ego(self) -> VehicleState:
-        """The vehicle that decides."""
+        """The ego: the vehicle whose decisions are evaluated, always the first."""
         return self.vehicles[0]
 
     @property
     def helpers(self) -> tuple[VehicleState, ...]:
-        """The vehicles that may be asked, in spawn order."""
+        """The vehicles that the ego may ask for messages, in spawn order."""
         return tuple(v for v in self.vehicles if v.part == "helper")
 
     def vehicle(self, vehicle_id: str) -> VehicleState:
@@ -179,16 +182,18 @@ class WorldState(Closed, frozen=True):
 
 
 class Snapshot(Closed, frozen=True):
-    """What the simulator needs beyond the state to go on from here."""
+    """Hold what the simulator needs besides a `WorldState` to continue the episode exactly."""
 
-    frame: Count
-    sections: tuple[Count, ...]
-    speed_index: Count
+    frame: Count  # number of frames simulated so far
+    sections: tuple[Count, ...]  # section of its path that each vehicle is in
+    speed_index: Count  # index of the ego's target speed
 
 
 class ActionsTaken(Closed, frozen=True):
-    """What leads an environment from its seed to here again:
-    the frame and the name of each action.
+    """Hold the frame and name of every action so far, from which an environment is replayed to now.
+
+    An environment of highway-env cannot be restored from a state, so its episode is simulated
+    again.
     """
 
     frame: Count

@@ -18,9 +18,10 @@ W = TypeVar("W", bound=World)
 
 
 def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
-    """Return when each agent of some layouts would reach its goal alone on the road, in s.
+    """Return when each agent would reach its goal with the road to itself, in s.
 
-    By a layout's seed and an agent's place. It keeps the speed that it aims at in the beginning.
+    The result is keyed by layout seed, then by the agent's index among the vehicles. The agent
+    keeps its initial target speed; one that does not arrive gets the scenario's time limit.
     """
     worlds: dict[tuple[int, int], World] = {}
     for seed in seeds:
@@ -39,7 +40,7 @@ def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float
 
 
 def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
-    """Return worlds by their scenario: such that can be simulated together."""
+    """Return worlds grouped by scenario: those of one group can be simulated together."""
     groups: dict[Scenario, list[W]] = {}
     for world in worlds:
         groups.setdefault(world.scenario, []).append(world)
@@ -49,8 +50,9 @@ def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
 def on_seat(
     scenario: Scenario, layout: Layout, agent: int, others: Sequence[int] = ()
 ) -> tuple[Scenario, Layout]:
-    """Return an agent's own scenario,
-    and the layout in it with nobody but the agent and some others.
+    """Return the scenario with an agent as its ego, and the layout as that scenario names it.
+
+    The layout holds only this agent, first, and `others` (indices among the layout's vehicles).
     """
     spawns = [layout.spawns[n] for n in (agent, *others)]
     if not agent:
@@ -65,8 +67,9 @@ def on_seat(
 
 
 def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
-    """Return how each agent of a world that has ended fared;
-    `alone_s` has when each would arrive alone.
+    """Return how each agent of a finished world ended, in the order of `world.journeys`.
+
+    `alone_s` has the time (s) at which each would arrive on an empty road, by its index.
     """
     ids = {agent: world.vehicles[agent].spawn.id for agent in world.journeys}
     agent_ends = []
@@ -79,10 +82,10 @@ def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
 
 
 def gravest(journeys: Mapping[int, Journey]) -> int | None:
-    """Return the place of the agent whose failure is the episode's:
-    the gravest, and of those the first.
+    """Return the index of the agent with the worst failure, or None if no agent has failed.
 
-    None if nobody has failed.
+    Collision is worse than leaving the road, which is worse than a time-out; of equals the earliest
+    counts, then the lowest index.
     """
     failures: list[tuple[int, float, int]] = []
     for agent, journey in journeys.items():

@@ -33,7 +33,7 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class Journey:
-    """What has become of one agent of an episode so far."""
+    """Hold what has happened to one agent of an episode so far."""
 
     outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
     hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
@@ -41,12 +41,13 @@ class Journey:
     conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to it in time
 
     def anew(self) -> "Journey":
-        """Return the same at a decision, counting only what happens from here on."""
+        """Return this record with outcome and counts reset, to count from a decision on."""
         return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
 
     def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
-        """Record some frames: its speed before the first and in each,
-        its least gap so far, its conflicts.
+        """Record F frames: the agent's speeds, its least gap so far (m), and its conflicts so far.
+
+        `speeds_mps` is (F + 1,), from the frame before; `hz` is frames a second.
         """
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
         self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
@@ -58,7 +59,7 @@ class Journey:
 
 @dataclass
 class World:
-    """One episode in the simulator."""
+    """Simulate one episode: its vehicles, its agents' records and its clock."""
 
     scenario: Scenario  # the episode's scenario
     seed: int  # seed of the episode's layout
@@ -76,7 +77,7 @@ class World:
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
-        """Start an episode in this kind of world."""
+        """Start the episode of a layout seed in this class of world; `World.start` chooses it."""
         layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
         road = populated(scenario, layout, agents)
         world = cls(scenario, seed, layout, road, journeys={agent: Journey() for agent in agents})
@@ -86,7 +87,7 @@ class World:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions by name, the most careful first."""
+        """Names of the meta-actions that agents choose from, the most careful first."""
         return self.scenario.actions
 
     @property
@@ -106,12 +107,12 @@ class World:
 
     @property
     def journey(self) -> Journey:
-        """What has become of the ego."""
+        """The record of the ego."""
         return self.journeys[0]
 
     @property
     def ended(self) -> bool:
-        """Whether the episode is decided for all of its agents."""
+        """Whether the outcome of every agent is decided."""
         return all(journey.outcome.ended for journey in self.journeys.values())
 
     def branch(self) -> "World":
@@ -138,14 +139,12 @@ class World:
     def thaw(
         cls, scenario: Scenario, state: WorldState, snapshot: Snapshot | ActionsTaken
     ) -> "World":
-        """Restore the world that `state` and `snapshot` were taken from,
-        if its episode was undecided.
-        """
+        """Restore the world from which `state` and `snapshot` were taken, its episode undecided."""
         return (scenario.world or World).resumed(scenario, state, snapshot)
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
-        """Do what `thaw` says, in this kind of world."""
+        """Restore a world of this class; `World.thaw` chooses the class."""
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot.sections, strict=True):
             spawn = spawn_of(scenario, layout, v)
@@ -175,7 +174,7 @@ class World:
         )
 
     def state(self, agent: int = 0) -> WorldState:
-        """Return the present state, as it is for an agent: in its own eyes it is the ego."""
+        """Return the present state as the agent with this index sees it: with itself as the ego."""
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
         target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
         state = WorldState(
@@ -187,10 +186,9 @@ class World:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
 
     def act(self, action: str) -> None:
-        """Take an action by name after the scenario's lag,
-        and simulate until the next decision is due.
+        """Take an action after the decision lag, and simulate to the time of the next decision.
 
-        After the scenario's last decision, the action is held until the episode is decided.
+        After the last decision it simulates until the episode is decided.
         """
         p = self.scenario.parameters
         self.advance(p.due_frame(self.step) + p.lag_frames)
@@ -198,7 +196,7 @@ class World:
         self.advance(p.due_frame(self.step))
 
     def decide(self, action: str) -> None:
-        """Take an action unless the episode is decided, and count the decision."""
+        """Let the ego take an action unless its episode is decided, and count the decision."""
         if not self.outcome.ended:
             self.take(action)
         self.step += 1
@@ -208,12 +206,12 @@ class World:
         self.vehicles[agent].act(action)
 
     def target(self, agent: int = 0) -> Target:
-        """Return an agent's route and target speed level."""
+        """Return an agent's route and the index of its target speed among the scenario's."""
         vehicle = self.vehicles[agent]
         return vehicle.spawn.route, int(vehicle.speed_index)
 
     def target_after(self, action: str, agent: int = 0) -> Target:
-        """Return the target that an agent would have if it took an action now."""
+        """Return the `target` that an agent would have after an action, without taking it."""
         vehicle = self.vehicles[agent]
         kept = dict(vars(vehicle))
         self.take(action, agent)
@@ -222,7 +220,7 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until a frame, or until the episode is decided."""
+        """Simulate until a frame number, or until the episode is decided."""
         lockstep.advance([self], [until_frame])
 
     def passed(self, poses: Floats) -> None:
@@ -278,14 +276,14 @@ class World:
         return {"partner": partner.id, "striker": striker(itself, partner), "fault": at_fault}
 
     def seat(self, agent: int) -> Scenario:
-        """Return the scenario as it is for an agent."""
+        """Return the scenario in which the agent with this index is the ego."""
         if not agent:
             return self.scenario
         return seat_of(self.scenario, self.vehicles[agent].spawn).scenario
 
     @property
     def answering(self) -> list[int]:
-        """Places of the vehicles that answer questions: the ego, its helpers, and agents."""
+        """Indices of the vehicles that can be asked for an intent: the ego, helpers and agents."""
         return [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
 
     def _cleared(self, agent: int) -> bool:
@@ -301,7 +299,10 @@ class World:
         return bool(seat.scenario.cleared(xy_m[[agent]], np.array([approach]), p))
 
     def judge(self, standing: Set[str]) -> None:
-        """Decide what the last frame has decided; `standing` had crashed before, by id."""
+        """Set the outcome of each agent by what happened in the last frame.
+
+        `standing` has the ids of vehicles that had crashed before it.
+        """
         p = self.scenario.parameters
         places = {n: v for n, v in enumerate(self.vehicles) if n not in self.journeys}
         crashed = {v.spawn.id for v in places.values() if v.crashed and v.spawn.id not in standing}

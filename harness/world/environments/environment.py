@@ -30,41 +30,41 @@ KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers a
 
 
 def named(env: str, config: Any = None) -> str:
-    """Return an environment's scenario name, from its id and the changes of its configuration."""
+    """Return the scenario name of a gymnasium id such as `merge-v0`, with changes of its config."""
     return f"{PREFIX}{env}" + (f"{CHANGES}{canonical_json(config)}" if config else "")
 
 
 def split(text: str) -> tuple[str, str | None]:
-    """Split a text into the name and settings such as `decisions=5`, which may follow the id."""
+    """Split a scenario text into the name and its settings such as `decisions=5`, or None."""
     head, config, changes = text.partition(CHANGES)
     name, _, settings = head.rpartition(":")
     return (name + config + changes, settings) if "=" in settings else (text, None)
 
 
 def joined(name: str, settings: Sequence[str]) -> str:
-    """Add settings to a scenario's name; the inverse of `split`."""
+    """Add settings such as `decisions=5` to a scenario's name; the inverse of `split`."""
     head, config, changes = name.partition(CHANGES)
     return ":".join([head, *([",".join(settings)] if settings else [])]) + config + changes
 
 
 def shown(name: str) -> str:
-    """Return a name for use in messages."""
+    """Return a scenario's name, shortened and made printable, for messages."""
     return printable(name, 80)
 
 
 def allow(name: str) -> None:
-    """Let a name that the user typed import its module,
-    in this process and in those that it starts.
+    """Allow importing the module that an environment's name refers to, here and in subprocesses.
 
-    A name from a file, such as a dataset's manifest or a run's, is never given to this function.
+    Only for names that the user typed: a name from a file such as a manifest must not be given.
     """
     if module := module_of(name):
         os.environ[IMPORTS] = ",".join([*_allowed(), module])
 
 
 def module_of(name: str) -> str:
-    """Return the module that an environment's name has imported;
-    empty for one of highway-env's own.
+    """Return the module that gymnasium imports for this environment, such as `my_envs`.
+
+    Empty for an environment of highway-env itself.
     """
     return _id_and_changes(name)[0].rpartition(":")[0]
 
@@ -108,7 +108,10 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def reset(name: str, seed: int) -> Any:
-    """Return an environment at the start of a seed's episode. Raises UserError if there is none."""
+    """Return a new environment, reset to a seed.
+
+    Raises UserError if there is none, it fails, or its ego cannot be driven by meta-actions.
+    """
     env = _create(name)
     _constants().restore()
     try:
@@ -148,9 +151,7 @@ def _only_drivable(name: str, env: Any) -> None:
 
 
 def hittable(thing: Any) -> bool:
-    """Return whether others can run into a vehicle or an object of highway-env:
-    not into a ghost.
-    """
+    """Return whether a vehicle or object of highway-env can collide with others."""
     return bool(thing.collidable and thing.solid)
 
 
@@ -197,7 +198,7 @@ def _create(name: str) -> Any:
 
 
 def raised(error: Exception) -> str:
-    """Describe an error that a user's code raised."""
+    """Return the type and message of an error that a user's code raised, for a message."""
     return f"{type(error).__name__}: {printable(error)}"
 
 
@@ -224,15 +225,16 @@ def _merged(default: Any, value: Any) -> Any:
 
 
 def config(name: str) -> dict[str, Any]:
-    """Return an environment's whole configuration."""
+    """Return an environment's whole configuration, with changes, as JSON-like values."""
     text = json.dumps(_create(name).config, default=str)
     whole: dict[str, Any] = json.loads(text, parse_constant=str)
     return whole
 
 
 def meta_actions(name: str, env: Any) -> Any:
-    """Return the type of the ego's actions.
-    Raises UserError unless they are meta-actions of speed.
+    """Return the action type of an environment's ego.
+
+    Raises UserError unless it is `DiscreteMetaAction` with at least SLOWER, IDLE and FASTER.
     """
     from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 
@@ -254,7 +256,10 @@ def meta_actions(name: str, env: Any) -> Any:
 
 
 def numbered(env: Any, kind: Any, action: str) -> Any:
-    """Encode an action for the environment's `step`; other controlled vehicles take IDLE."""
+    """Return the value that stands for an action in `env.step`; other agents of it take IDLE.
+
+    `kind` is the ego's action type.
+    """
     if kind is env.action_type:
         return kind.actions_indexes[action]
     idle = [each.actions_indexes["IDLE"] for each in env.action_type.agents_action_types[1:]]
@@ -280,15 +285,16 @@ def lane_of(v: Any) -> Lane:
 
 @dataclass(frozen=True)
 class Constants:
-    """Class constants of highway-env's vehicles, such as IDM's gaps,
-    which some environments overwrite.
+    """Hold the class constants of highway-env's vehicles, which some environments overwrite.
+
+    `values` is keyed by class and name.
     """
 
     values: Mapping[tuple[type, str], Any]
 
     @classmethod
     def now(cls) -> "Constants":
-        """Return the constants as they are in this process."""
+        """Return the constants as they are now in this process."""
         from highway_env.vehicle import behavior, controller, kinematics
 
         values: dict[tuple[type, str], Any] = {}
@@ -301,7 +307,7 @@ class Constants:
         return cls(values)
 
     def restore(self) -> None:
-        """Set all constants to these values."""
+        """Set all class constants back to the held values."""
         for (kind, key), value in self.values.items():
             if vars(kind)[key] is not value:
                 setattr(kind, key, value)

@@ -14,10 +14,10 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 
 
 def examine(scenario: Scenario, seed: int) -> None:
-    """Raise UserError unless equal seeds give equal traffic, also for copies and frame by frame.
+    """Raise UserError unless a highway-env environment simulates a seed reproducibly.
 
-    Some decisions are simulated by the environment's own `step`, twice,
-    and frame by frame by copies of copies.
+    Drives IDLE, FASTER and SLOWER twice by the environment's own `step`, and once frame by frame in
+    deep copies; the poses and speeds of all vehicles must agree at every decision.
     """
     name = shown(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))

@@ -28,7 +28,10 @@ HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the midd
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """The parameters of an environment."""
+    """Hold the parameters of a highway-env environment as a scenario.
+
+    Raises UserError if `decisions` or `helpers` is not from 1 to 9.
+    """
 
     braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
     acceleration_mps2: float = 20.0
@@ -45,15 +48,13 @@ class Parameters(Common):
 
     @property
     def goal_s(self) -> float:
-        """Time in which the ego would reach its goal at its first target speed;
-        it defines the goal.
-        """
+        """Time (s) that the ego needs to its goal at its first target speed; it fixes the goal."""
         return (self.decisions + AFTER) * self.decision_period_s
 
 
 @dataclass(frozen=True)
 class Place:
-    """The properties of an environment that are the same for every seed."""
+    """Hold the properties of a highway-env environment that are the same for every seed."""
 
     routes: Routes  # the paths of its network
     ends: Mapping[Lane, tuple[float, ...]]  # where the network's lanes begin and end, m
@@ -64,12 +65,12 @@ class Place:
 
 
 def first_target_mps(ego: Any) -> float:
-    """Return the ego's target speed, or the highest possible one if that is 0."""
+    """Return the initial target speed of a highway-env ego (m/s), or its highest if that is 0."""
     return float(ego.target_speed) or float(max(ego.target_speeds))
 
 
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
-    """Return where a network's lanes begin and end, m."""
+    """Return where each lane of a network begins and ends: x, y, x, y in m, by lane index."""
     ends = {}
     for index, lane in lanes_of(network).items():
         points = np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3)
@@ -79,7 +80,10 @@ def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
 
 @lru_cache(maxsize=16)
 def place(name: str) -> Place:
-    """Return the properties that are the same for every seed, from seed 0."""
+    """Return what is the same for every seed of an environment, found by resetting it to seed 0.
+
+    Raises UserError if there is no such environment, or its frequencies do not fit.
+    """
     env = reset(name, 0)
     ego, network = env.vehicle, env.road.network
     available = environment.meta_actions(name, env).actions.values()

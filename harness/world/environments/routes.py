@@ -27,7 +27,10 @@ TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the ri
 
 @dataclass(frozen=True)
 class Routes:
-    """A network's paths."""
+    """Hold all paths through a highway-env network, by key (start node, name of the route).
+
+    `ways` has the keys of each route's parallel paths, from left to right.
+    """
 
     network: Any  # highway-env's network
     # paths by approach (the node where they begin) and route (where they go, and on which lane)
@@ -35,8 +38,10 @@ class Routes:
     ways: dict[Route, tuple[PathKey, ...]]  # the paths of each route from left to right
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
-        """Return the roads that a vehicle in a lane will take by highway-env's rule and its plan,
-        if any.
+        """Return the roads that a vehicle in `lane` will take, from its present one on.
+
+        It follows highway-env's rule for the next lane; `plan` is the vehicle's planned route, or
+        None.
         """
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
@@ -49,8 +54,10 @@ class Routes:
         return tuple(streets)
 
     def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
-        """Return the paths that a vehicle in this lane may be on,
-        those that best match its route first.
+        """Return the keys of the paths that contain `lane`, best match first.
+
+        The best match shares most roads with the vehicle's route. `plan` is its planned route, or
+        None.
         """
         ahead = self.ahead(lane, plan)
         on_lane = [key for key, path in self.paths.items() if lane in path.lanes]
@@ -70,11 +77,10 @@ def routes(
     origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
 ) -> Routes:
-    """Build every path of a network, as far as it lies within `reach_m` of the origin of the paths'
-    frame.
+    """Build every path through a network, cut to within `reach_m` of `origin_m`, the new origin.
 
-    A route on a ring begins at the road `begin`.
-    Raises UserError, with the environment's `name`, if there are more than MOST_ROUTES routes.
+    A route on a ring begins at the road `begin`. Raises UserError, with the environment's `name`,
+    if there are more than `MOST_ROUTES` routes.
     """
     every = list(_routes(name, network, begin))
     labels = _labels(network, every)

@@ -41,7 +41,7 @@ MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 @dataclass
 class EnvironmentWorld(World):
-    """One episode in an environment."""
+    """Simulate one episode in an environment of highway-env."""
 
     env: Any = None  # highway-env's environment
     # highway-env's class constants as this environment wants them
@@ -56,8 +56,9 @@ class EnvironmentWorld(World):
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """Start a seed's episode. Raises UserError if its road or the ego's way differs from seed
-        0's.
+        """Start a seed's episode.
+
+        Raises UserError if its road, or the path on which the ego starts, differs from seed 0's.
         """
         name, env = scenario.name, reset(scenario.name, seed)
         here, ego = place(name), env.vehicle
@@ -134,7 +135,7 @@ class EnvironmentWorld(World):
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> ActionsTaken:
-        """Return the actions so far, since equal actions from the start lead to equal worlds."""
+        """Return the actions so far: replayed from the start, they lead to the same world."""
         return ActionsTaken(self.frame, tuple(self.taken))
 
     def take(self, action: str, agent: int = 0) -> None:
@@ -144,7 +145,7 @@ class EnvironmentWorld(World):
         self._place(self.everybody[0])
 
     def target(self, agent: int = 0) -> Target:
-        """Return the lane and the speed that the ego aims at."""
+        """Return the ego's target lane, as text with its target speed, and the speed's index."""
         ego = self.everybody[0]
         aim = *lane_of(ego), round(float(ego.target_speed), DECIMALS)
         return " ".join(map(str, aim)), int(ego.speed_index)
@@ -292,10 +293,10 @@ def _apart_m(first: Any, second: Any) -> float:
 
 @lru_cache(maxsize=16)
 def scenario(name: str) -> Scenario:
-    """Make a scenario of an environment. Raises UserError if there is none, or it lacks something.
+    """Return an environment of highway-env as a scenario, by its name `env:ID`.
 
-    The harness knows neither an environment's layout nor a danger,
-    and the environment says who has cleared.
+    It has no layout and no danger, and the environment decides when the goal is reached. Raises
+    UserError if there is no such environment, or it lacks something needed.
     """
     here = place(name)
     where = here.road.ego[1].partition(" lane ")[0]

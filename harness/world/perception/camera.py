@@ -76,8 +76,10 @@ class Frame(Image):
         self.owners, self.ids = owners, ids
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
-        """Return each object's bounding boxes in either half:
-        left, top, right and bottom (exclusive).
+        """Return bounding boxes of each visible object, by id: left, top, right, bottom in pixels.
+
+        Right and bottom are exclusive. An object has one box for each half of the picture that
+        shows it.
         """
         half, boxes = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
         for place, name in enumerate(self.ids):
@@ -94,8 +96,9 @@ class Frame(Image):
 def frame(
     scenario: Scenario, state: WorldState, viewer_id: str, size_px: tuple[int, int] = SIZE_PX
 ) -> Frame:
-    """Render the cameras of one vehicle, in a picture of this width and height;
-    the height is even.
+    """Render the front and rear cameras of one vehicle as one picture, the front above the rear.
+
+    `size_px` is width and height; the height is even.
     """
     width, height = size_px
     viewer = state.vehicle(viewer_id)
@@ -117,8 +120,9 @@ def frame(
 
 @dataclass(frozen=True, eq=False)
 class Sight(Image):
-    """A frame that is rendered when its pixels are read, and not stored;
-    it is pickled as its pixels.
+    """A picture of a vehicle's cameras that is rendered when its pixels are read.
+
+    It holds the state instead of pixels, but is pickled as its pixels.
     """
 
     scenario: Scenario
@@ -128,7 +132,7 @@ class Sight(Image):
 
     @property
     def frame(self) -> Frame:
-        """The picture with whose each pixel is."""
+        """The rendered picture, with the owner of each pixel."""
         return _drawn(self.scenario, self.state, self.viewer_id, self.size_px)
 
     @property
@@ -144,7 +148,7 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 
 @dataclass(frozen=True)
 class Box:
-    """A vehicle or building as a box."""
+    """Describe a vehicle or building as a box with painted walls."""
 
     name: str  # id
     corners: Floats  # corners, (4, 2) m
@@ -154,7 +158,7 @@ class Box:
 
 
 def focal_px(width: int) -> float:
-    """Return the focal length of a camera whose pictures are `width` pixels wide."""
+    """Return the focal length, in pixels, of a camera whose pictures are `width` pixels wide."""
     return width / 2 / math.tan(HALF_FIELD_RAD)
 
 

@@ -23,7 +23,7 @@ ALIGNED = float(np.cos(ALIGNED_RAD))
 
 
 class Seat(Struct, frozen=True):
-    """Where a viewer sits: its position, and the cosine and sine of its heading."""
+    """Hold the pose of a viewer, from which positions are converted into its frame."""
 
     x_m: float
     y_m: float
@@ -31,13 +31,13 @@ class Seat(Struct, frozen=True):
     sin: float
 
     def relative(self, x_m: float, y_m: float) -> Point:
-        """Return a position in the viewer's frame."""
+        """Return a position (m, in the road's frame) in the viewer's frame, rounded to 0.1 m."""
         dx, dy = x_m - self.x_m, y_m - self.y_m
         return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
 
 
 class Place(Struct, frozen=True):
-    """Where on the road a vehicle is."""
+    """Describe where on the road's paths a vehicle is."""
 
     # arc length, and heading there, on each path to which it is nearer than ON_PATH_M
     near: Mapping[PathKey, tuple[float, float]]
@@ -45,13 +45,13 @@ class Place(Struct, frozen=True):
 
     @property
     def arc_m(self) -> float:
-        """Arc length on the path that it follows."""
+        """Arc length (m) on the path that the vehicle follows; only if it follows one."""
         assert self.key is not None
         return self.near[self.key][0]
 
 
 class Encounter(Struct, frozen=True):
-    """A vehicle on a path, as a viewer knows it, beside the ego as that viewer knows it."""
+    """Pair another vehicle with the ego, both as one viewer knows them."""
 
     seat: Seat  # the viewer's
     d: Detection  # the vehicle
@@ -61,32 +61,32 @@ class Encounter(Struct, frozen=True):
     has_lamps: bool  # whether vehicles have brake lamps
 
     def arrival(self, arc_m: float, time_s: float | None) -> Arrival:
-        """Return how far the vehicle is from a conflict, with its speed and its brake lamps."""
+        """Return the vehicle's distance and time to a conflict point, its speed and brake lamps."""
         braking = self.d.braking if self.has_lamps else UNSET
         return Arrival(tenths(arc_m), time_s, tenths(self.d.speed_mps), braking)
 
     @property
     def key(self) -> PathKey:
-        """The vehicle's path."""
+        """Key (approach, route) of the path that the vehicle follows."""
         assert self.place.key is not None
         return self.place.key
 
     @property
     def own(self) -> PathKey:
-        """The ego's path."""
+        """Key (approach, route) of the ego's path."""
         return self.ego.approach, self.ego.route
 
 
 def tenths(value: float) -> float:
-    """Round to one decimal; adding zero turns -0.0, which means nothing to a reader, into 0.0."""
+    """Round to one decimal, with 0.0 in place of -0.0."""
     return round(float(value), 1) + 0.0
 
 
 def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
-    """Return where vehicles are, each on the path that it seems to follow.
+    """Return where each detected vehicle is on the road, and which path it seems to follow.
 
-    That is the nearest that fits its heading and indicator;
-    of equally good paths, the road's first one.
+    That is the nearest path that fits its heading and turn indicator; of equally good ones, the
+    first of the road.
     """
     poses = []
     for d in detections:
@@ -120,7 +120,7 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
 
 
 def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]]:
-    """Return the conflicts of each vehicle with the ego."""
+    """Return, for each encounter, the conflicts of its vehicle with the ego's paths."""
     conflicts_of: list[list[Conflict]] = [[] for _ in all_known]
     if road.form == 2:
         for n, conflict in _along(road, all_known):

@@ -33,8 +33,9 @@ AT_ONCE = 32  # the rays of more viewers do not fit into the processor's cache
 def scene_graph(
     scenario: Scenario, state: WorldState, viewer_id: str, left_out: Collection[str] = ()
 ) -> SceneGraph:
-    """Return the scene graph of one vehicle's sensors;
-    ids in `left_out` are treated as undetected.
+    """Return what one vehicle knows of a state by its sensors and by the beacons that it heard.
+
+    Vehicles whose ids are in `left_out` are treated as undetected.
     """
     [graph] = scene_graphs(scenario, [(state, viewer_id)], left_out)
     return graph
@@ -43,7 +44,7 @@ def scene_graph(
 def scene_graphs(
     scenario: Scenario, looks: Sequence[tuple[WorldState, str]], left_out: Collection[str] = ()
 ) -> list[SceneGraph]:
-    """Return the scene graphs of some states, each as the vehicle with an id sees it."""
+    """Return the `scene_graph` of each look: a state, and the id of the vehicle that looks."""
     graphs: list[SceneGraph] = []
     for begin in range(0, len(looks), AT_ONCE):
         some = looks[begin : begin + AT_ONCE]
@@ -53,8 +54,9 @@ def scene_graphs(
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
-    """Return the ego's graph with everything in view and no noise,
-    which only `full-view` may read.
+    """Return the ego's scene graph with every vehicle in view and no noise.
+
+    Only the reference driver `full-view` may read it.
     """
     [graph] = truth_graphs(scenario, [state])
     return graph
@@ -133,7 +135,11 @@ def listed_graphs(
     detected: Sequence[Sequence[Detection]],
     sectors: Sequence[Sequence[Sector]],
 ) -> list[SceneGraph]:
-    """Return the graph of each viewer, of what it detected and of its sectors."""
+    """Return the scene graph of each viewer, given what it detected and how it sees each sector.
+
+    The four sequences are parallel: viewer, its detections, and the sectors that its graph lists.
+    Conflicts with the ego's path are computed here.
+    """
     if not looks:
         return []
     road = scenario.road()

@@ -20,7 +20,7 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """One full turn of rays from a vehicle's centre."""
+    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits."""
 
     bearing_rad: Floats  # direction of each ray in the world frame, (RAYS,)
     range_m: Floats  # distance to the first surface, (RAYS,); inf if there is none
@@ -30,8 +30,9 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What stops the rays of some viewers (v), viewer by viewer:
-    other vehicles in their order, buildings.
+    """Hold the outlines that stop the rays of v viewers, n in all, viewer by viewer.
+
+    A viewer's surfaces are all other vehicles of its state, in their order, then the buildings.
     """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
@@ -42,8 +43,9 @@ class Surfaces:
     corners_m: Floats  # its corners, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
-        """Lay values of the surfaces (n,) out as (v, most surfaces of one);
-        0 or false without a surface.
+        """Return values (n,) of the surfaces as a table (v, most surfaces of a viewer).
+
+        Cells without a surface are 0 or false.
         """
         table = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
         table[self.viewer, self.place] = values
@@ -56,7 +58,7 @@ def turned(angle_rad: Any) -> Any:
 
 
 def surfaces(looks: Sequence[Look]) -> Surfaces:
-    """Return everything that stops a ray of each viewer, except the viewer itself."""
+    """Return the outlines of all vehicles and buildings around each viewer, itself excluded."""
     states = {id(state): state for state, _ in looks}
     vehicles = [
         (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles
@@ -90,11 +92,12 @@ def surfaces(looks: Sequence[Look]) -> Surfaces:
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Intersect rays (r, 2) from a place (2,) with the walls of surfaces (n, 4, 2), all in metres.
+    """Intersect rays from a point with the walls of n rectangles.
 
-    Wall k of a surface goes from its corner k to the next. Returned are the ray parameter, (r, 4n),
-    which is 1 at the target and inf if a wall is not met, and the position along the wall from 0 to
-    1, (r, 4n).
+    The rays go from `origin` (2,) to `targets` (r, 2), and the rectangles are `corners` (n, 4, 2),
+    all in m; wall k goes from corner k to the next. Returned are the ray parameter, (r, 4n), which
+    is 1 at the target and inf if the wall is missed, and the position along the wall from 0 to 1,
+    (r, 4n).
     """
     walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
     return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
@@ -141,7 +144,7 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Where rays may meet surfaces, by ascending number of the surface."""
+    """Hold m possible meetings of a ray with a surface, by ascending number of the surface."""
 
     surface: Ints  # number of the surface, (m,)
     target: Ints  # number of the ray, RAYS for each viewer, (m,)
@@ -152,7 +155,7 @@ class Rays:
 
 
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
-    """Cast rays in all directions from a vehicle."""
+    """Cast `RAYS` rays in all directions from a vehicle's centre, and return what they hit."""
     around = surfaces([(state, viewer)])
     rays = cast(around, np.ones(len(around.place), dtype=bool))
     distance, met = _first(rays.surface, rays.target, rays.t, RAYS)
@@ -163,7 +166,7 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
 
 
 def cast(around: Surfaces, of: Bools) -> Rays:
-    """Cast the rays that may meet the surfaces `of` (n,), from all viewers."""
+    """Cast, from all viewers, the rays that may meet one of the surfaces selected by `of`, (n,)."""
     begin, count = _towards(around)
     surface = np.repeat(np.arange(len(count)), count)
     ray = np.arange(len(surface)) + (begin - np.cumsum(count) + count)[surface]
@@ -180,10 +183,10 @@ def cast(around: Surfaces, of: Bools) -> Rays:
 
 
 def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
-    """Return how many rays of its viewer come to each surface, (n,),
-    if only `solid` ones (n,) stop any.
+    """Return how many of its viewer's rays reach each surface, (n,), if only `solid` ones block.
 
-    Returned is also which surface stops the ray of each meeting, (m,); -1 if none does.
+    `solid` (n,) says which surfaces stop rays. Returned second is, for each meeting of `rays`, the
+    number of the surface that stops its ray, (m,); -1 if none does.
     """
     stops = solid[rays.surface]
     ended = rays.of(stops)
@@ -219,10 +222,9 @@ def _all_round() -> tuple[Floats, Floats]:
 
 
 def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
-    """Return for each viewer and each of the points (k, 2) which surface hides it, (v, k);
-    -1 if it is seen.
+    """Return the number of the surface that hides each point from each viewer, (v, k); -1 if none.
 
-    Surfaces hide nothing where `solid` (n,) is false.
+    `points` are (k, 2) m, the same for all viewers. Only surfaces where `solid` (n,) is true hide.
     """
     surface = np.flatnonzero(solid)
     viewer = around.viewer[surface]
@@ -237,8 +239,9 @@ def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
 
 
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
-    """Return for each of the points (k, 2) the id of what blocks the view of it;
-    None if it is seen.
+    """Return the id of the vehicle or building that hides each point from a viewer; None if seen.
+
+    `points` are (k, 2) m.
     """
     around = surfaces([(state, viewer)])
     met = hidden(around, points, np.ones(len(around.place), dtype=bool))

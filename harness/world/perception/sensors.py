@@ -37,7 +37,7 @@ SENSORS = {
 
 
 class Detection(Struct, frozen=True):
-    """One object as all of a vehicle's sensors together report it, in the world frame."""
+    """Describe one object as all sensors of one vehicle together report it, in the road's frame."""
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
     sensors: tuple[str, ...]  # those of `camera`, `lidar` and `radar` that reported it
@@ -62,12 +62,12 @@ def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> l
 def reports(
     looks: Sequence[Look], around: Surfaces, parameters: Parameters
 ) -> dict[tuple[int, int], Detection]:
-    """Return what sensors report, by the number of the viewer and the vehicle's place among its
-    surfaces.
+    """Return what the sensors of several viewers report, keyed by viewer number and vehicle index.
 
-    Under `perception` 1 a vehicle of which nothing is reported, since too few rays end on it or no
-    sensor reaches so far, hides what is behind it. Under 2 it hides nothing: a vehicle is reported
-    if enough rays come to it past buildings and past vehicles that are reported.
+    `looks` are the viewers, each a vehicle in a state, and `around` is `surfaces(looks)`; the
+    second part of a key is the vehicle's index among its viewer's surfaces. A vehicle that is hit
+    by too few rays or out of range is not reported. Under `parameters.perception` 1 it still hides
+    what is behind it, under 2 it hides nothing.
     """
     nearby: list[list[VehicleState]] = []
     for state, viewer in looks:
@@ -115,8 +115,9 @@ def reports(
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
-    """Return which surfaces (n,) are among pairs of a viewer's number and a place among its
-    surfaces.
+    """Return which of n surfaces are in `pairs`, (n,).
+
+    A pair is a viewer's number and a surface's index among that viewer's surfaces.
     """
     most = max([len(ids) for ids in around.ids], default=0)
     table = np.zeros((len(around.ids), most), dtype=bool)
@@ -134,10 +135,9 @@ def _motion(vehicles: Sequence[VehicleState]) -> Floats:
 def detections(
     pairs: Sequence[tuple[WorldState, VehicleState, VehicleState]], ambient: Ambient
 ) -> list[Detection | None]:
-    """Return what all sensors of a viewer together report of another vehicle in its sight;
-    None if nothing.
+    """Return what the viewer's sensors report of a vehicle, for each pair; None if nothing.
 
-    Each of the `pairs` is a state, a viewer and a vehicle on which enough of its rays end.
+    Each of `pairs` is a state, a viewer, and a vehicle that the viewer has a line of sight to.
     """
     if not pairs:
         return []

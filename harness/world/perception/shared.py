@@ -40,7 +40,7 @@ ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's pla
 
 
 class Heard(NamedTuple):
-    """What the ego of a state sees itself and has heard."""
+    """Hold what the ego sees by itself, and the scene graphs that it got from helpers."""
 
     state: WorldState
     own: SceneGraph  # the ego's graph
@@ -50,7 +50,7 @@ class Heard(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """One object as one sender reports it."""
+    """Describe one object as one sender reports it, with the covariance of its errors."""
 
     detection: Detection  # in the frame of the road
     node: Node | None  # the ego's own node; None in a message
@@ -59,13 +59,15 @@ class Report:
 
     @property
     def spread_m2(self) -> float:
-        """The variance of the position, both axes together."""
+        """Sum of the position's variances along both axes, m²."""
         return float(np.trace(self.place_m2))
 
 
 def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
-    """Return the ego's graph of each case with the objects that messages add,
-    or report more precisely.
+    """Return the ego's scene graph of each case, with the objects that helpers' messages report.
+
+    An object that several report is matched by position and speed (chi-squared test), and the most
+    precise report of it is kept.
     """
     own_ids: list[list[str]] = []  # whose report in the ego's own graph stands
     added: list[list[Detection]] = []  # what messages report
@@ -105,7 +107,10 @@ def _reports(p: Parameters, case: Heard) -> list[Report]:
 
 
 def stated(p: Parameters, state: WorldState, sender: str) -> VehicleState:
-    """Return where a helper's message says that the helper is, with the errors of a beacon."""
+    """Return a helper's state as its message gives it, with the errors of a beacon.
+
+    The true state under perfect knowledge.
+    """
     vehicle = state.vehicle(sender)
     if p.perfect_knowledge:
         return vehicle
@@ -121,10 +126,10 @@ def stated(p: Parameters, state: WorldState, sender: str) -> VehicleState:
 
 
 def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
-    """Return a car that does not exist and is in the ego's way, in a viewer's frame.
+    """Return a car that does not exist, on collision course with the ego, in a helper's frame.
 
-    It comes on the first path that meets the ego's, as far from there as the ego and as fast; where
-    no path does, it stands `STANDS_M` ahead of the ego.
+    It is on the first path that crosses the ego's, as far from there as the ego and as fast;
+    without such a path it stands `STANDS_M` ahead of the ego. `viewer` is the helper's id.
     """
     road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
     path = road.paths[ego.approach, ego.route]

@@ -25,10 +25,10 @@ FURTHER = ("LANE_LEFT", "LANE_RIGHT")  # actions that the simulator knows beside
 
 
 class PackagesScenarios(Plugins[Scenario]):
-    """Scenarios of packages, by name, whose facts are checked where they are loaded."""
+    """Hold the scenarios of installed packages by name; each is checked when it is loaded."""
 
     def check(self, name: str, plugin: Scenario) -> None:
-        """Raise ValueError for a package's scenario that says of itself what does not go."""
+        """Raise ValueError if a package's scenario is inconsistent, such as in name or actions."""
         if plugin.name != name:
             raise ValueError(f"its name is {printable(repr(plugin.name))}")
         if not isinstance(plugin.parameters, Parameters):
@@ -63,8 +63,9 @@ def names() -> tuple[str, ...]:
 
 
 def witnessed() -> tuple[str, ...]:
-    """Return the names of the scenarios here whose layouts have a declared number of witnesses, in
-    order.
+    """Return the built-in scenarios whose layouts can have a declared number of witnesses, sorted.
+
+    A witness is a helper that has the danger in sight at the first decision.
     """
     return tuple(name for name in sorted(_files()) if "witnesses" in get(name).dials)
 
@@ -83,7 +84,7 @@ def get(text: str) -> Scenario:
 
 
 def split(text: str) -> tuple[str, str | None]:
-    """Split what `get` takes into the bare name and the settings; None without any."""
+    """Split a scenario argument such as `NAME:key=value` into name and settings, or None."""
     if text.startswith(environment.PREFIX):
         return environment.split(text)
     name, colon, settings = text.partition(":")
@@ -91,16 +92,18 @@ def split(text: str) -> tuple[str, str | None]:
 
 
 def argument(scenario: Scenario) -> str:
-    """Return the text by which `get` finds a scenario again, whatever its bare name comes to mean.
+    """Return the text by which `get` finds this scenario again, even if its defaults change later.
 
-    It states the settings that differ from the usual, and those that differ between suites.
+    It spells out the settings that differ from the defaults, and those in which suites differ.
     """
     return _spelled(scenario, {*_changed(scenario), *_of_suites(scenario)})
 
 
 def title(scenario: Scenario) -> str:
-    """Return a scenario for people: its name, the settings that differ from its usual,
-    and whose scenes.
+    """Return a scenario's name for people, with its settings that differ from the defaults.
+
+    If its settings are those of a suite (`SUITES`), it ends with `, scenes of` and the suite's
+    name.
     """
     scenes = _of_suites(scenario)
     suites = [suite for suite, of in SUITES.items() if of == scenes]
@@ -165,15 +168,15 @@ def _named(name: str) -> Scenario:
 
 
 def is_here(name: str) -> bool:
-    """Return whether a scenario is in this package."""
+    """Return whether a scenario of this name is built in, rather than another package's."""
     return name in _files()
 
 
 def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
-    """Return a scenario with the parameters that a manifest states.
+    """Return the scenario `name` with the parameters that a dataset's or run's manifest states.
 
-    Raises UserError if the scenario has other parameters here,
-    or one is of another type or out of bounds.
+    Parameters that were added later and are not stated take the value of the earlier behaviour.
+    Raises UserError if one is unknown here, of another type or out of bounds.
     """
     scenario = get(name)
     names = [field.name for field in fields(scenario.parameters)]
@@ -194,7 +197,7 @@ def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:
-    """Restore a pickled scenario."""
+    """Return the scenario that was pickled as this name and these parameters."""
     return replace(get(name), parameters=parameters)
 
 

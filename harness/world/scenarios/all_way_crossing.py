@@ -36,7 +36,7 @@ AHEAD = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `all-way-crossing`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0)  # up to 36 km/h
     speed_mps: float = 10.0  # of every agent at the start
@@ -60,7 +60,7 @@ class Parameters(Shared):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -118,13 +118,20 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(arm: int, xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the centre of an ego from an arm is far enough behind the junction's exit."""
+    """Return whether the ego's centre is past the crossing, for each world, (...).
+
+    `arm` is the number of the ego's arm (south, west, north, east), and `xy_m` are the centres of
+    all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(xy_m[..., 0, :] @ AHEAD[arm] >= JUNCTION_M + parameters.cleared_m)
 
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the seat of an agent from each arm."""
+    """Return the `Seat` (the scenario with that agent as its ego) of an agent from each arm.
+
+    Keys are paths: approach and route as the shared scenario names them.
+    """
     return {(seen_from(0, arm), "straight"): _seat(arm) for arm in range(len(AHEAD))}
 
 

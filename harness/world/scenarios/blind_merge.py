@@ -41,7 +41,7 @@ SEATS_MPS = (3.0, 4.5)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `blind-merge`; a pair bounds a uniform draw."""
 
     ego_speed_mps: float = 14.0  # speed at the start: 50 km/h
     # from the start to where the ego's way has run into the right lane
@@ -72,7 +72,10 @@ class Parameters(Witnessed):
 
 @cache
 def network() -> Any:
-    """Build highway-env's `MergeEnv`, but shorter; the ramp's lane runs into the right lane."""
+    """Build a shorter version of the lanes of highway-env's `MergeEnv`.
+
+    The ramp's last lane ends in the right lane of the main road.
+    """
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
@@ -92,8 +95,9 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """Return the main road and its ramp;
-    the conflict zone is where the ramp has run into the right lane.
+    """Return the main road and its ramp as a `Road`.
+
+    The conflict zone is where the ramp has merged into the right lane.
     """
     ego, main = ("ramp", "merge"), ("main", "straight")
     ways = {
@@ -123,7 +127,7 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -170,7 +174,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough along the right lane."""
+    """Return whether the ego's centre is far enough along the right lane, for each world, (...).
+
+    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(xy_m[..., 0, 0] > parameters.cleared_m)
 
 

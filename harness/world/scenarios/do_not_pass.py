@@ -40,7 +40,7 @@ SEATS_M = (8.0, 9.5), (7.5, 8.5), (7.5, 8.5)  # from the ego to the first, and f
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `do-not-pass`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
     time_limit_s: float = 12.0
@@ -70,7 +70,7 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return a lane to the east and one to the west, as in highway-env's `TwoWayEnv`."""
+    """Return the two-way road as a `Road`: the ego's lane to the east, and one to the west."""
     ways = {
         ("own", BESIDE): ([("a", "b", 0)], [BESIDE], 0),
         ("own", OWN): ([("a", "b", 1)], [OWN], 1),
@@ -92,8 +92,9 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """Return the lanes as `TwoWayEnv` has them:
-    the left one is there twice, once in each direction.
+    """Return a lane network like that of highway-env's `TwoWayEnv`.
+
+    The left lane is in it twice, once in each direction, so that the ego may use it to pass.
     """
     from highway_env.road.lane import LineType
 
@@ -107,7 +108,7 @@ def network() -> Any:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -152,7 +153,12 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego is back ahead of the truck, or has let go by what came towards it."""
+    """Return whether the ego has passed the truck, or safely stayed behind, for each world, (...).
+
+    It has if it is on its own lane and either far enough ahead of the truck, or at most `behind_m`
+    behind it after an oncoming vehicle went by. `xy_m` are vehicle centres, (..., V, 2), the ego
+    first and then the truck; `approaches`, (..., V), are where their paths come from.
+    """
     x, lengths = xy_m[..., 0], (CAR + TRUCK) / 2
     in_lane = np.abs(xy_m[..., 0, 1] - LANE_WIDTH_M) <= LANE_WIDTH_M / 4
     ahead_m = x[..., 0] - x[..., 1]

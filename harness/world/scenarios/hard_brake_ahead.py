@@ -40,7 +40,7 @@ SEATS_MPS = (3.0, 4.5)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `hard-brake-ahead`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)  # 72 km/h, half of it, and standing
     time_limit_s: float = 14.0
@@ -72,7 +72,7 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return two lanes to the east."""
+    """Return the motorway of two lanes to the east as a `Road`, with the ego on the right one."""
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
     paths = paths_along(
         network(), {("own", name): ([lane], [name], 0) for name, lane in lanes.items()}
@@ -95,14 +95,14 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """highway-env's own straight road, of `HighwayEnv`."""
+    """Return highway-env's own straight road network of `HighwayEnv`, with two lanes."""
     from highway_env.road.road import RoadNetwork
 
     return RoadNetwork.straight_road_network(2, start=BEGIN_M, length=END_M - BEGIN_M)
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -138,7 +138,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough behind the conflict zone."""
+    """Return whether the ego's centre is far enough past the conflict zone, for each world, (...).
+
+    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(xy_m[..., 0, 0] > ZONE_M + parameters.cleared_m)
 
 

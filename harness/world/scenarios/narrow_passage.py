@@ -48,7 +48,7 @@ FROM_EAST = {
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `narrow-passage`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)  # up to 29 km/h
     time_limit_s: float = 18.0
@@ -69,7 +69,7 @@ class Parameters(Shared):
 
 @cache
 def network() -> Any:
-    """Build a lane for either direction, each of three that are straight, and the side road."""
+    """Build the lanes of the street: three in a row for each direction, and the side road."""
     from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 
@@ -88,8 +88,9 @@ def network() -> Any:
 
 @cache
 def road(from_east: bool = False) -> Road:
-    """Return the street for an ego from either end.
-    Its conflict zone is the middle of the passage.
+    """Return the street as a `Road` for an ego from the west, or from the east.
+
+    The conflict zone is the middle of the narrow passage.
     """
     names = FROM_EAST if from_east else {key: key for key in FROM_EAST}
 
@@ -130,7 +131,10 @@ def road(from_east: bool = False) -> Road:
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the seats of agents from the west and from the east."""
+    """Return the `Seat` of agents from the west and from the east, by path.
+
+    A seat is the scenario with that agent as its ego.
+    """
     from_east = replace(SCENARIO, road=partial(road, True), cleared=partial(cleared, ahead=-1))
     return {
         OWN: Seat(SCENARIO, {key: key for key in FROM_EAST}),
@@ -139,7 +143,7 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -188,7 +192,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters, ahead: int = 1) -> Bools:
-    """Return whether an ego that goes east (1) or west (-1) is far enough behind the passage."""
+    """Return whether the ego's centre is far enough beyond the passage, for each world, (...).
+
+    `ahead` is 1 for an ego that goes east and -1 for one that goes west. `xy_m` are the centres of
+    all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(ahead * xy_m[..., 0, 0] > parameters.cleared_m)
 
 

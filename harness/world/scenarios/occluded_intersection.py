@@ -39,7 +39,7 @@ SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that cr
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `occluded-intersection`; a pair bounds a uniform draw."""
 
     time_limit_s: float = 10.0  # an ego that has not cleared the intersection by then never will
     # how much later than the full-view driver an ego may clear the intersection. A needless SLOWER
@@ -76,7 +76,7 @@ class Parameters(Witnessed):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -162,10 +162,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:
-    """Return when a car from a side can be at its conflict point, at the soonest, behind the truck.
+    """Return the earliest time (s from the start) at which a crossing car can follow the truck.
 
-    In seconds from the start. Their ways cross at a right angle and both keep their speed,
-    so they touch if both are on the crossing at once.
+    The car comes from the side `approach` at `speed_mps` and would then be at its conflict point
+    without touching the truck, which starts at `truck_arc_m` of its path and keeps `truck_mps`.
     """
     at = road().crossings[approach, "straight"]
     truck, car = road().paths["oncoming", "straight"], road().paths[approach, "straight"]
@@ -179,7 +179,10 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough behind the junction's exit."""
+    """Return whether the ego's centre is far enough past the junction, for each world, (...).
+
+    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(JUNCTION_M + parameters.cleared_m <= -xy_m[..., 0, 1])
 
 

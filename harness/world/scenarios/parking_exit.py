@@ -39,7 +39,7 @@ SEATS_M = 6.0, 7.5  # blind seats: cars parked ahead of the van ahead, from cent
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `parking-exit`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)  # up to a driver's pace in a car park
     ego_speed_mps: float = 4.0  # speed at the start
@@ -71,9 +71,7 @@ class Parameters(Witnessed):
 
 @cache
 def network() -> Any:
-    """Build a lane to the east and one to the west, what is parked beside each,
-    and the ego's way out.
-    """
+    """Build the lanes of the street: one in each direction, the parking rows, and the pull-out."""
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
@@ -95,7 +93,7 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """Return the street. Its conflict zone is where the ego's way has come into the lane."""
+    """Return the street as a `Road`; its conflict zone is where the ego enters the lane."""
     ego, behind = ("own", "pull-out"), ("behind", "straight")
     own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
     ways = {
@@ -124,7 +122,7 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -186,7 +184,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough along the lane."""
+    """Return whether the ego's centre is far enough along the lane, for each world, (...).
+
+    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    """
     return np.asarray(xy_m[..., 0, 0] > OUT_M + parameters.cleared_m)
 
 

@@ -35,7 +35,7 @@ RAMP, MAIN = ("ramp", "merge"), ("main", "straight")  # where agents begin
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `platoon-merge`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
     speed_mps: float = 15.0  # speed of everybody at the start
@@ -55,13 +55,13 @@ class Parameters(Shared):
 
 
 def road() -> Road:
-    """Return the road of `blind-merge`."""
+    """Return the road of scenario `blind-merge`: a main road of two lanes and a ramp."""
     return blind_merge.road()
 
 
 @cache
 def main_road() -> Road:
-    """Return the same road for who is on its right lane, and into whose way the ramp runs."""
+    """Return the road for an agent on the right main lane, into which the ramp merges."""
     shared = road()
     back_m = shared.zone_arc_m - np.linspace(*SECTOR_REACH_M, 16)
     return replace(
@@ -75,7 +75,7 @@ def main_road() -> Road:
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the seat of the platoon's cars."""
+    """Return the `Seat` of the platoon's cars, by path: the scenario with such a car as its ego."""
     words = {
         "task": "keep to the right lane of a road, in a platoon, "
         "past a ramp that runs into the lane",
@@ -89,7 +89,7 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 

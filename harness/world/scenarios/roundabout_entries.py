@@ -58,7 +58,7 @@ PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `roundabout-entries`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 3.5, 7.0)
     time_limit_s: float = 18.0
@@ -81,8 +81,9 @@ class Parameters(Shared):
 
 
 def key_of(begin: str, leaves: int, own: str = EGO) -> PathKey:
-    """Return the name of a way by its first arm and at which one from there it leaves,
-    for an agent.
+    """Return the path key (approach, route), as an agent from arm `own` names it.
+
+    The path enters at the arm `begin` (`s`, `e`, `n` or `w`) and leaves `leaves` arms farther on.
     """
     approach = name_of(begin, own)
     return approach, ROUTES[approach, leaves]
@@ -90,8 +91,9 @@ def key_of(begin: str, leaves: int, own: str = EGO) -> PathKey:
 
 @cache
 def road(own: str = EGO) -> Road:
-    """Return the roundabout for an agent from an arm.
-    Its conflict zone is where its way joins the ring.
+    """Return the roundabout as a `Road` for an agent from an arm (`s`, `e`, `n` or `w`).
+
+    The conflict zone is where the agent's path joins the ring.
     """
     ego = key_of(own, 2, own)
     arms = {name_of(arm, own): arm for arm in ARMS}
@@ -139,7 +141,7 @@ def cleared(own: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the seats of those from the west and the east."""
+    """Return the `Seat` of the agents from the west and the east, by the path of each."""
     seats = {}
     for arm in "we":
         mine = replace(SCENARIO, road=partial(road, arm), cleared=partial(cleared, arm))
@@ -149,7 +151,7 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 

@@ -40,7 +40,7 @@ SEATS_MPS = (1.0, 2.0)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """The scenario's own dials. Pairs are bounds of a uniform draw."""
+    """Hold the parameters of scenario `roundabout-entry`; a pair bounds a uniform draw."""
 
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
     # speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386)
@@ -77,7 +77,7 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return the roundabout. Its conflict zone is where the ego's way joins the ring."""
+    """Return the roundabout as a `Road`; its conflict zone is where the ego joins the ring."""
     ego = ("own", "straight")
     # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past
     # it.
@@ -115,7 +115,7 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Draw one episode."""
+    """Return the start of the episode that a layout seed draws, always the same for a seed."""
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -175,7 +175,10 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego is past the first exit behind its entry."""
+    """Return whether the ego is past the first exit after its entry, for each world, (...).
+
+    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    """
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
     return np.asarray((x > 0) & (np.arctan2(y, x) < PLACE.ring_rad(1)))
 
