@@ -31,8 +31,9 @@ def summed(values: Floats, axis: int) -> Floats:
 
 
 def any_of(flags: Bools) -> Bools:
-    """Return whether any is true along a short last axis, such as that of helpers;
-    faster than `np.any`.
+    """Return whether any flag is true along the last axis, (..., n) to (...).
+
+    Faster than `np.any` if n is small, such as the number of helpers.
     """
     first = np.zeros(flags.shape[:-1], dtype=bool)
     result: Bools = reduce(np.logical_or, [flags[..., k] for k in range(flags.shape[-1])], first)
@@ -40,8 +41,9 @@ def any_of(flags: Bools) -> Bools:
 
 
 def count_of(flags: Bools) -> Ints:
-    """Count those that are true along a short last axis, such as that of helpers;
-    faster than `np.sum`.
+    """Return how many flags are true along the last axis, (..., n) to (...).
+
+    Faster than `np.sum` if n is small, such as the number of helpers.
     """
     none = np.zeros(flags.shape[:-1], dtype=np.int64)
     count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
@@ -49,10 +51,10 @@ def count_of(flags: Bools) -> Ints:
 
 
 def read_only(value: T) -> T:
-    """Return an array, or a dataclass or mapping of some, with views that nobody can write to.
+    """Return an array, or a dataclass or mapping of arrays, as views that cannot be written to.
 
-    So code of a package that writes to its arguments raises ValueError,
-    and moves nothing that others read.
+    Code of another package that writes to its arguments then raises ValueError, and changes
+    nothing.
     """
     given: Any = value
     if isinstance(given, np.ndarray):
@@ -68,7 +70,10 @@ def read_only(value: T) -> T:
 
 
 def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
-    """Raise ValueError unless `values` is an array of one of the shapes, without a mask."""
+    """Raise ValueError unless `values` is a NumPy array of one of the `allowed` shapes, unmasked.
+
+    `name` names the values in the message.
+    """
     if not isinstance(values, np.ndarray) or isinstance(values, np.ma.MaskedArray):
         raise ValueError(f"{name} of type {type(values).__name__}, not an array of numpy's")
     if values.shape not in allowed:
@@ -76,10 +81,10 @@ def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def numbers(name: str, values: Any, *allowed: tuple[int, ...]) -> Floats:
-    """Return numbers that a package gave, as an array of one's own, which it cannot write to later.
+    """Return a copy, as floats, of an array that another package gave.
 
-    Raises ValueError unless they are an array of one of the shapes, without a mask,
-    and of real numbers.
+    Raises ValueError, which begins with `name`, unless `values` is an unmasked array of real
+    numbers of one of the `allowed` shapes.
     """
     check_shape(name, values, *allowed)
     if values.dtype.kind not in "biuf":
@@ -88,7 +93,10 @@ def numbers(name: str, values: Any, *allowed: tuple[int, ...]) -> Floats:
 
 
 def check_distributions(name: str, values: Floats, where: Bools) -> None:
-    """Raise ValueError unless the rows (..., A) at `where` (...) are distributions."""
+    """Raise ValueError unless the rows, (..., A), where `where`, (...), is true sum to 1.
+
+    Negative values are an error, too; `name` names the rows in the message.
+    """
     rows = values[where]
     sums_to_one = np.abs(np.sum(rows, axis=-1) - 1.0) <= ROUNDING
     wrong = ~(sums_to_one & np.all(rows >= 0.0, axis=-1))
@@ -97,7 +105,10 @@ def check_distributions(name: str, values: Floats, where: Bools) -> None:
 
 
 def check_shares(name: str, values: Floats, where: Bools) -> None:
-    """Raise ValueError unless the values at `where`, of the same shape, are from 0 to 1, or NaN."""
+    """Raise ValueError unless all values where `where` is true are from 0 to 1, or NaN.
+
+    Both arrays have the same shape; `name` names the values in the message.
+    """
     wrong = values[where & ((values < 0.0) | (values > 1.0 + ROUNDING))]
     if wrong.size:
         raise ValueError(f"{name} that are not from 0 to 1, such as {wrong[0]:g}")

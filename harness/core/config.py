@@ -55,7 +55,7 @@ Seconds = Annotated[
 
 
 def between(least: float, most: float) -> msgspec.Meta:
-    """Return the bounds of an annotated number, with words for them."""
+    """Return bounds for an annotated number of a record, with their description for messages."""
     return msgspec.Meta(ge=least, le=most, description=f"a number from {least:g} to {most:g}")
 
 
@@ -90,10 +90,10 @@ def toml(path: Path, where: str) -> dict[str, Any]:
 
 
 def loads(text: str, where: str) -> dict[str, Any]:
-    """Parse a TOML text into tables. Raises UserError if it is not TOML.
+    """Parse a TOML text into tables; `where` names it in messages.
 
-    A dotted key with thousands of parts is refused:
-    the parser takes time and memory by the square of their number.
+    Raises UserError if it is no TOML. A dotted key of more than 100 parts is refused, since the
+    parser takes time and memory that grow with the square of their number.
     """
     if _LONG_KEY.search(text):
         raise UserError(f"{where} is no TOML: a key has more than {_DOTS} dots; fix the file")
@@ -113,10 +113,10 @@ def json_loads(text: str, where: str) -> Any:
 
 
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
-    """Convert a TOML or JSON table to a record; `where` names it in messages.
+    """Convert a TOML or JSON table to a record of type `kind`; `where` names it in messages.
 
-    The program fills in the fields `given`; the table may not hold them. Raises UserError for an
-    unknown or missing key and for a value that is not allowed.
+    The fields `given` are set by the program and may not be in the table. Raises UserError for an
+    unknown or missing key, or a value that is not allowed.
     """
     for path, key, known in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known)
@@ -133,10 +133,10 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
-    """Return a copy of a frozen dataclass with some fields set from text;
-    `where` names it in messages.
+    """Return a copy of a frozen dataclass with the fields in `settings` set from text.
 
-    Raises UserError for an unknown field and for a value that is not allowed.
+    `where` names the record in messages. Raises UserError for an unknown field or a value that is
+    not allowed.
     """
     hints = get_type_hints(type(record), include_extras=True)
     known = {name: getattr(record, name) for name in settable(record)}
@@ -153,8 +153,9 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 
 
 def check(record: Any) -> None:
-    """Raise UserError unless a dataclass's numbers and choices are what its annotations allow; NaN
-    is not.
+    """Raise UserError unless a dataclass's numbers and choices are what its annotations allow.
+
+    NaN is not allowed.
     """
     for name, hint in _fields(record.__class__).items():
         value = getattr(record, name)
@@ -169,15 +170,15 @@ def check(record: Any) -> None:
 
 
 def settable(record: Any) -> list[str]:
-    """Return the names of the fields that hold one number, boolean or string."""
+    """Return the names of a dataclass's fields that hold a single number, boolean or text."""
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
 
 
 def value_of(usual: object, text: str) -> object:
-    """Convert a text to the type of the `usual` value.
+    """Convert a text to the type of `usual`: bool, int, float or str.
 
-    A text that cannot be converted is returned unchanged; the check of the type then refuses it.
+    A text that cannot be converted is returned unchanged, for a later type check to refuse.
     """
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
@@ -348,7 +349,7 @@ def _choices(hint: Any) -> list[str]:
 
 
 def description(hint: Any) -> str | None:
-    """Return the text of a type's `Meta(description=...)`."""
+    """Return the `description` of the first `Meta` in a type annotation; None if it has none."""
     texts = (
         meta.description
         for meta in getattr(hint, "__metadata__", ())

@@ -9,11 +9,11 @@ def usable() -> int:
 
 
 def threads() -> int:
-    """Return the number of threads of an engine: OMP_NUM_THREADS, or else half of the usable cores.
+    """Return the number of threads for a model's engine.
 
-    Threads of an engine wait for each other after each layer: one that another program holds up
-    holds up all, so that an engine with a thread on every core stalls as soon as anybody else
-    computes.
+    It is the environment variable OMP_NUM_THREADS, or else half of the usable cores. With a thread
+    on every core, an engine stalls as soon as any other program computes, since its threads wait
+    for each other after each layer.
     """
     asked = os.environ.get("OMP_NUM_THREADS", "")
     return int(asked) if asked.isdigit() and int(asked) else max(1, usable() // 2)

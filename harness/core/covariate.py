@@ -28,18 +28,19 @@ COLLINEAR = 1e-6
 def corrected(
     plain: Estimate, values: Floats, known: Floats, pool: Floats, least: float, level: float = LEVEL
 ) -> Estimate | None:
-    """Return the mean of values (E,) from `least` to 1, corrected.
+    """Return the mean of values (E,), corrected by control variates; None if it cannot be.
+
+    The values are of some layouts; variables are known of these and of further layouts. It is None
+    with fewer than `LEAST` values, without further layouts, or if the values or all variables are
+    constant.
 
     Args:
-        plain: their mean as it is, with its interval.
-        values: of the layouts that have one, which are a random part of all.
-        known: what is known of these, (E, K).
-        pool: the same of all layouts, these included, (N, K).
+        plain: the uncorrected mean with its interval.
+        values: of E layouts, a random part of all, from `least` to 1.
+        known: the variables of these layouts, (E, K).
+        pool: the variables of all N layouts, these included, (N, K).
         least: the least that a value can be.
-        level: of the plain interval.
-
-    None if there are fewer than `LEAST` values or no further layouts,
-    or if either the values or all that is known of them are alike.
+        level: of confidence, of the plain interval.
     """
     from harness.core.special import stdtrit
 
@@ -64,10 +65,9 @@ def corrected(
 
 
 def worth(plain: Estimate, better: Estimate) -> float:
-    """Return how many times as many layouts the plain mean needs for an interval as narrow.
+    """Return by what factor the plain mean needs more layouts to be as precise as `better`.
 
-    It is that of the end which is farther from the bounds, where intervals are cut;
-    1 where none is known.
+    It is the squared ratio of interval widths, at the end farther from the bounds; 1 if not known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

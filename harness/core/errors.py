@@ -28,24 +28,25 @@ LISTS = {"model": "harness model list", "prompt": "harness prompt list"}
 
 
 class UserError(Exception):
-    """Bad input. The message names the thing, the value, what is allowed and what to do."""
+    """Report bad input in one line: the thing, the value, what is allowed and what to do."""
 
     code: ClassVar[int] = 2  # what the command ends with, one of `EXIT_CODES`
 
 
 class Unfinished(UserError):
-    """Some parts of the work cannot be done; all others are done."""
+    """Report that some parts of the work cannot be done; all other parts are done."""
 
 
 class Unanswered(Unfinished):
-    """The model could not be asked. The message begins with the words of its server or engine."""
+    """Report that the model could not be asked; begins with the message of its server or engine."""
 
     code = 3
 
 
 def printable(text: object, limit: int = 120) -> str:
-    """Make any text safe for one terminal line:
-    escape control characters, and cut at `limit` characters.
+    """Return the text of any object, made safe for one terminal line.
+
+    Control characters are escaped, and a text longer than `limit` characters is cut.
     """
     escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _said(text))
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
@@ -62,10 +63,10 @@ def _said(thing: object) -> str:
 
 
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
-    """Return a name if terminals, pages and records carry it as it is. Raises UserError otherwise.
+    """Return `name` unchanged. Raises UserError if terminals or tables cannot show it as it is.
 
-    Control characters, those that turn the direction of text, and bytes that are no UTF-8 are none
-    of these; nor is a name that looks like several, with what stands between names in tables.
+    That is so if it has control characters, invalid UTF-8 or the separator ` · `. `what` and
+    `repair` are words of the message.
     """
     if not name.isprintable():
         raise UserError(
@@ -79,15 +80,15 @@ def sayable(what: str, name: str, repair: str = "rename it") -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return an error's message on one line, made safe to show."""
+    """Return an error's message on one line of at most 200 characters, safe for a terminal."""
     return printable(" ".join(_said(error).split()), 200)
 
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
-    """Build the `UserError` for a name that does not exist;
-    it suggests the nearest name and lists all.
+    """Build the `UserError` for an unknown name; it suggests the nearest known name.
 
-    Of more than `MOST_LISTED`, or `FEW` if a command of `LISTS` prints all, the nearest are listed.
+    It lists all known names, or the nearest of more than `MOST_LISTED`, or of more than `FEW` if a
+    command of `LISTS` prints all. `kind` is what was named, and `hint` is appended.
     """
     names = sorted(known)
     nearest = get_close_matches(name, names, n=1)
@@ -108,7 +109,7 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
 
 
 def in_range(option: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless `least` <= `value` <= `most`."""
+    """Raise UserError unless `least` <= `value` <= `most`; `option` names the value."""
     if not least <= value <= most:
         given = f"{value:g}" if isinstance(value, float) else value
         raise UserError(f"{option} {given} is out of range; give {least} to {most}")

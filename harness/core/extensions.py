@@ -39,8 +39,9 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting of a run that an extension adds:
-    an option of `harness eval` and `harness drive`.
+    """Describe a setting of a run that an extension adds.
+
+    It is an option of `harness eval` and `harness drive`.
     """
 
     kind: type  # str, int, float or bool
@@ -50,7 +51,10 @@ class Setting:
 
 @dataclass(frozen=True, kw_only=True)
 class Extension:
-    """What a package adds. A place is `module:name`, imported when it is first used."""
+    """Describe what a package adds to the harness: commands, studies, settings and plug-ins.
+
+    Tables are keyed by name. A function or object is given as `module:name`, imported at first use.
+    """
 
     name: str  # the same as that of its entry point
     interface: int = INTERFACE  # the version of this class that it was written for
@@ -74,16 +78,17 @@ class Extension:
 
 
 def extensions() -> Mapping[str, Extension]:
-    """Return the extensions that are installed and work, those that ship first.
+    """Return the installed extensions that work, by name, those of this distribution first.
 
-    Of each other one a line on stderr says, once, what is wrong with it.
+    For each that does not work, one line on stderr says why, once.
     """
     return _extensions(tuple(sys.path))
 
 
 def owner(command: str) -> str | None:
-    """Return the extension that has a command or group, by the metadata of what is installed;
-    else None.
+    """Return the extension that a command or group of commands belongs to, or None.
+
+    It is read from package metadata, so it is known even if the extension's folder is missing.
     """
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
@@ -92,9 +97,9 @@ def owner(command: str) -> str | None:
 
 
 def from_python(name: str) -> Any:
-    """Return what extensions add to `import harness` by a name; None if there is no such name.
+    """Return the object that an extension adds to `import harness` under a name; None if none does.
 
-    Raises UserError if its extension is not installed, or does not work.
+    Raises UserError if the extension that has the name is not installed or does not work.
     """
     if name in PYTHON:
         return PYTHON[name]
@@ -104,16 +109,14 @@ def from_python(name: str) -> Any:
 
 
 class OfExtension(NamedTuple):
-    """Whose a setting of a condition is, by the metadata of what is installed."""
+    """Name the extension to which a setting of a condition belongs, by package metadata."""
 
     extension: str
     idle: str  # the value that does nothing, as text; empty for none
 
 
 def setting_of_extension(name: str) -> OfExtension | None:
-    """Return the extension that has a setting of conditions, and the value that does nothing;
-    else None.
-    """
+    """Return the extension that adds a setting of conditions (operating points), or None."""
     entry = entries(SETTINGS).get(name)
     if entry is None:
         return None
@@ -122,21 +125,25 @@ def setting_of_extension(name: str) -> OfExtension | None:
 
 
 def owner_of_plugin(kind: str, name: str) -> str | None:
-    """Return the extension that has a plug-in of a kind, such as `contents`, by the metadata;
-    else None.
+    """Return the extension that adds the plug-in `name` of a kind such as `contents`, or None.
+
+    It is read from package metadata, so it is known even if the extension is missing.
     """
     entry = entries(PLUG_INS).get(f"{kind} {name}")
     return _extension_of(entry) if entry else None
 
 
 def control_settings() -> dict[str, str]:
-    """Return the setting, such as `messages=blind`, of each control by name, by the metadata."""
+    """Return, by the name of each control of extensions, the setting that it is: `messages=blind`.
+
+    A control is a condition that replaces what helpers say; it is read from package metadata.
+    """
     values = {name: str(entry.value).partition(" ")[2] for name, entry in entries(CONTROLS).items()}
     return {name: setting.strip("[]") for name, setting in values.items()}
 
 
 def part_of(extension: str) -> str:
-    """Return what is said of a command or name whose extension is gone."""
+    """Return the words that a missing command or name is part of an extension not installed."""
     return f"part of the extension {extension}, which is not installed"
 
 
@@ -146,32 +153,35 @@ def _extension_of(entry: Any) -> str:
 
 
 def joined(core: Texts, kind: str) -> Mapping[str, Any]:
-    """Return a table of the core, such as its commands, with what extensions add to it.
+    """Return one of the core's tables, such as its commands, extended by what extensions add.
 
-    What is there already is not replaced; a line on stderr says so, once.
+    `kind` is the field of `Extension` that has the additions. A name that the table has already is
+    not replaced; a line on stderr says so, once.
     """
     return _joined(tuple(core.items()), kind, tuple(sys.path))
 
 
 def taken(path: str, table: Iterable[str]) -> bool:
-    """Return whether a path is a command of a table, begins one, or goes on after one."""
+    """Return whether a command path equals, begins or extends one of the paths in `table`.
+
+    Paths are words such as `model list`.
+    """
     return any(
         f"{each} ".startswith(f"{path} ") or f"{path} ".startswith(f"{each} ") for each in table
     )
 
 
 def studies() -> Texts:
-    """Return every kind of study, those of extensions that are gone included,
-    and what lists call it.
+    """Return every kind of study and the name that lists give it.
+
+    Kinds of missing extensions are included.
     """
     gone = {kind: kind for kind in entries(STUDIES)}
     return {**gone, **joined(formats.STUDIES, "studies")}
 
 
 def added(group: str) -> Mapping[str, Any]:
-    """Return the entry points of the plug-ins of a group, such as `swarmdrive.rules`,
-    that extensions add.
-    """
+    """Return the entry points that extensions add to a plug-in group such as `swarmdrive.rules`."""
     if group == GROUP:
         return {}
     kind, declared = group.rpartition(".")[2], entries(GROUP)
@@ -183,7 +193,7 @@ def added(group: str) -> Mapping[str, Any]:
 
 
 def shipped(group: str) -> frozenset[str]:
-    """Return the names of the plug-ins of a group that extensions of this distribution add."""
+    """Return the names of the plug-ins of a group that this distribution's own extensions add."""
     return _shipped(group, tuple(sys.path))
 
 

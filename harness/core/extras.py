@@ -23,12 +23,15 @@ OPTIONAL = Plugins[tuple[str, str]]("swarmdrive.extras", tuple, {
 
 
 def install(extra: str) -> str:
-    """Return the command that installs an extra."""
+    """Return the shell command that installs an optional extra of this distribution."""
     return f"pip install 'swarmdrive-harness[{extra}]'"
 
 
 def need(what: str, *modules: str) -> None:
-    """Raise UserError if one of these modules, keys of `OPTIONAL`, is not installed."""
+    """Raise UserError if one of the modules, keys of `OPTIONAL`, is not installed.
+
+    `what` names the command or option that needs them.
+    """
     for module in modules:
         if find_spec(module) is None:
             raise without(what, *OPTIONAL[module])

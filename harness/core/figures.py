@@ -11,7 +11,7 @@ DASH = "–"
 
 
 class Bounded(Protocol):
-    """A value with the ends of its interval; what is not known is None or NaN."""
+    """A value with the ends of its confidence interval; None or NaN if not known."""
 
     @property
     def value(self) -> float | None: ...
@@ -22,7 +22,7 @@ class Bounded(Protocol):
 
 
 class Counted(Bounded, Protocol):
-    """A bounded value over n episodes, decisions or seeds."""
+    """A value with its interval, and the number n of episodes, decisions or seeds behind it."""
 
     @property
     def n(self) -> int: ...
@@ -30,15 +30,19 @@ class Counted(Bounded, Protocol):
 
 @dataclass(frozen=True)
 class Unit:
-    """How a quantity is written. An unknown value is a dash, and no number is -0."""
+    """Describe how a quantity is written: its unit's name, decimals and factor.
+
+    An unknown value is written as a dash, and zero never as -0.
+    """
 
     name: str = ""  # stands behind the number
     decimals: int = 1  # digits behind the point
     factor: float = 1.0  # what a stored value is multiplied by
 
     def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
-        """Write a value without the unit's name;
-        `digits` are the most significant digits, all in all.
+        """Write a value without the unit's name, with at most `digits` significant digits if given.
+
+        `sign` is a format option such as `+`.
         """
         if value is None or math.isnan(value):
             return DASH
@@ -68,7 +72,7 @@ class Unit:
         return number if number == DASH else f"{number} [{', '.join(ends)}]"
 
     def ends(self, bounded: Bounded) -> str:
-        """Write an interval as `81.4 to 93.7 %`; empty where an end is not known."""
+        """Write an interval with its unit: `81.4 to 93.7 %`; empty if an end is not known."""
         low, high = self.number(bounded.low), self.number(bounded.high)
         return "" if DASH in (low, high) else f"{low} to {self.text(bounded.high)}"
 
@@ -82,35 +86,33 @@ def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
 
 
 def within(low: float, high: float) -> str:
-    """Write how large a difference may be, either way: `±5.2 points`;
-    its interval excludes larger ones.
-    """
+    """Write the larger size of an interval's ends as a bound of a difference: `±5.2 points`."""
     return f"±{POINTS.text(max(abs(low), abs(high)))}"
 
 
 def amount(n: int, noun: str) -> str:
-    """Write how many there are: `1 layout`, `2 layouts`."""
+    """Write a count with its noun: `1 layout`, `2 layouts`."""
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
 def some_of(names: Sequence[str], most: int = 3) -> str:
-    """Name up to so many things: `a`, `a and b`, `a, b, c and 2 more`."""
+    """Write up to `most` names and the number of further ones: `a, b, c and 2 more`."""
     parts = [*names[:most], *([f"{len(names) - most} more"] if len(names) > most else [])]
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
 
 
 def crossed(episodes: int, seeds: int) -> str:
-    """Write what figures are over: `6 episodes × 1 channel seed`."""
+    """Write the size of a run: `6 episodes × 1 channel seed`."""
     return f"{amount(episodes, 'episode')} × {amount(seeds, 'channel seed')}"
 
 
 def dataset_size(layouts: int, points: int) -> str:
-    """Write what a dataset holds: `2 layouts, 40 decision points`."""
+    """Write the size of a dataset: `2 layouts, 40 decision points`."""
     return f"{amount(layouts, 'layout')}, {amount(points, 'decision point')}"
 
 
 def known(value: float | None) -> float | None:
-    """Return the number; None if it is NaN."""
+    """Return a number, or None if it is None or NaN."""
     return None if value is None or math.isnan(value) else value
 
 

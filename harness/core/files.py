@@ -35,14 +35,16 @@ T = TypeVar("T")
 
 
 def canonical_json(value: Any) -> str:
-    """Return the one JSON text of a value: sorted keys, no spaces.
+    """Return the canonical JSON text of a value: sorted keys and no spaces.
+
     Raises ValueError on NaN or infinity.
     """
     return _EXACT.encode(value)
 
 
 def canonical_bytes(value: Any) -> bytes:
-    """Return `canonical_json` in UTF-8.
+    """Return `canonical_json` of a value in UTF-8.
+
     Raises UnicodeEncodeError, a ValueError, on a lone surrogate.
     """
     return canonical_json(value).encode()
@@ -53,9 +55,7 @@ BROKEN = (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionE
 
 
 class Refused(OSError):
-    """A file that is not read: it is no regular file,
-    or it is larger than the limit of its kind.
-    """
+    """Report that a file is not read, since it is no regular file or too large for its kind."""
 
 
 Kind = Literal["settings", "text", "record", "picture", "rows", "weights"]
@@ -77,10 +77,10 @@ MOST_TIMES = 200
 
 
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
-    """Open a file for reading; it is checked after it is opened,
-    so nothing can take its place in between.
+    """Open a file for reading in binary mode; `kind` says how large it may be.
 
-    Raises OSError, and Refused if it is not a regular file or is larger than `LARGEST` of its kind.
+    It is checked after it is opened, so that nothing can replace it in between. Raises OSError, and
+    Refused if it is not a regular file or is larger than `LARGEST` of its kind.
     """
     file = open(path, "rb", opener=_at_once)  # noqa: SIM115
     try:
@@ -107,13 +107,16 @@ def _size(size: int) -> str:
 
 
 def bytes_of(path: str | Path, kind: Kind) -> bytes:
-    """Read a file as it was when it was opened. Raises what `opened` raises."""
+    """Read a whole file, in the size that it had when it was opened.
+
+    Raises what `opened` raises.
+    """
     with opened(path, kind) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def text_of(path: str | Path, kind: Kind = "text") -> str:
-    """Read a UTF-8 text file. A byte order mark, which some editors put first, is left out.
+    """Read a UTF-8 text file, without the byte order mark that some editors put first.
 
     Raises what `opened` raises, and UnicodeDecodeError.
     """
@@ -121,9 +124,7 @@ def text_of(path: str | Path, kind: Kind = "text") -> str:
 
 
 def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Decorate what reads a file, so that the file is read again only after it was written
-    again.
-    """
+    """Decorate a function that reads a file: cache its result until the file is modified."""
 
     @lru_cache(maxsize=64)
     def kept(path: Path, written_ns: int) -> T:
@@ -141,10 +142,9 @@ def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
 
 
 def neutral(cell: T) -> T | str:
-    """Return a cell of a CSV file for spreadsheets:
-    a text that they would take for a formula as text.
+    """Return a CSV cell, with an apostrophe before a text that spreadsheets would run as a formula.
 
-    It gets an apostrophe before it. Numbers, also those that are texts, stay as they are.
+    Numbers, also those that are texts, stay as they are.
     """
     if not isinstance(cell, str) or not cell.startswith(FORMULA):
         return cell
@@ -156,10 +156,9 @@ def neutral(cell: T) -> T | str:
 
 
 def refuse_bomb(archive: "ZipFile", packed: int, most: float = math.inf) -> None:
-    """Raise BadZipFile, before anything is unpacked, for an archive that states too much.
+    """Raise BadZipFile if a ZIP archive states that it unpacks to too much; nothing is unpacked.
 
-    It may unpack to `most` bytes, and to `MOST_TIMES` the bytes that it has, `packed`,
-    and a megabyte.
+    The limit is the lesser of `most` bytes and `MOST_TIMES` its size `packed` (bytes) plus 1 MB.
     """
     from zipfile import BadZipFile  # imported here, since few commands need it
 
@@ -180,15 +179,13 @@ def sha256_file(path: Path, kind: Kind = "weights") -> str:
 
 
 def digest(value: Any) -> str:
-    """Return the hex SHA-256 digest of a JSON value; it is the same in every process."""
+    """Return the hex SHA-256 digest of a JSON value's canonical text."""
     return sha256_bytes(canonical_bytes(value))
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Have an error that a disk has no room, which comes without a name,
-    name the file that is written.
-    """
+    """Add the file's name to an OSError that the disk is full or fails, which comes without it."""
     try:
         yield
     except OSError as error:
@@ -199,17 +196,17 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[BinaryIO]:
-    """Open a file, a new one as well, to write at its end. Raises OSError, which names it."""
+    """Open a file to append bytes, created if it is missing; an OSError names the file."""
     with naming(path), path.open("ab") as file:
         yield file
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file to write to; it replaces `path` on success and is deleted on an error.
+    """Yield a temporary file to write; it replaces `path` on success and is deleted on an error.
 
-    Temporary files of killed processes are deleted as well.
-    Raises OSError if `path` cannot be written, which is never FileNotFoundError.
+    Temporary files of killed processes are deleted as well. Raises OSError if `path` cannot be
+    written, but never FileNotFoundError.
     """
     sayable("file", path.name, "give another name")
     if path.is_dir():  # fail now, and not only after all is written
@@ -236,7 +233,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def refuse_taken(option: str, folder: Path) -> None:
-    """Raise UserError if there is something where an option names a new folder."""
+    """Raise UserError if anything exists at `folder`, which an option names as a new folder."""
     if os.path.lexists(folder):
         raise UserError(f"{option} {printable(folder)} is there already; give a new folder")
 
@@ -261,8 +258,9 @@ def making(folder: Path) -> Iterator[Path]:
 
 
 def forget_halves(folder: Path, name: str = "*") -> None:
-    """Delete what killed processes left half written (it is not locked);
-    `name` is a glob pattern.
+    """Delete the temporary files and folders in `folder` that killed processes left.
+
+    Those of running processes are locked and stay. `name` is a glob pattern of the final names.
     """
     for part in folder.glob(f".{name}.[0-9]*.part"):
         with suppress(OSError), alone(part):
@@ -278,11 +276,10 @@ def write_whole(path: Path, data: str | bytes) -> None:
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an exclusive lock on a folder or file; a missing file is created.
-    A killed process releases it.
 
-    On a system without such locks (Windows) nothing is locked. Raises BlockingIOError if another
-    process still holds it after `patience_s` seconds, and OSError if the file is a link or cannot
-    be opened.
+    The lock of a killed process is released. On systems without such locks (Windows) nothing is
+    locked. Raises BlockingIOError if another process still holds it after `patience_s` seconds, and
+    OSError if the file is a link or cannot be opened.
     """
     try:
         import fcntl

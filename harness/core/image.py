@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Image:
-    """A picture as `pixels`, (height, width, 3) red, green and blue."""
+    """Hold a picture as RGB `pixels`, (height, width, 3) uint8."""
 
     def __init__(self, pixels: "Pixels") -> None:
         self._pixels = pixels
@@ -23,7 +23,7 @@ class Image:
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of the size and the pixels; it does not depend on a file format."""
+        """Hex SHA-256 digest of the picture's size and pixels, whatever its file format."""
         return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def png(self) -> bytes:

@@ -11,7 +11,7 @@ WHOLE = 10**6  # most characters of a message
 
 @dataclass(frozen=True)
 class Case:
-    """One test case of a class `of`."""
+    """Describe one test case of a JUnit report."""
 
     of: str  # the class
     name: str  # the case's own name
@@ -20,7 +20,7 @@ class Case:
 
 
 def junit(name: str, cases: Sequence[Case]) -> str:
-    """Return a test suite as XML; texts may hold any characters."""
+    """Return JUnit XML of a test suite `name`; characters that XML cannot hold are escaped."""
     failed = sum(case.failure is not None and case.error is None for case in cases)
     errors = sum(case.error is not None for case in cases)
     counts = {"tests": str(len(cases)), "failures": str(failed)}

@@ -14,7 +14,7 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def folder() -> Path:
-    """Return `$SWARMDRIVE_CACHE`, or else the harness's folder in the user's cache folder."""
+    """Return the cache folder: `$SWARMDRIVE_CACHE`, or the harness's folder in the user's cache."""
     if moved := os.environ.get("SWARMDRIVE_CACHE"):
         return Path(moved)
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
@@ -22,7 +22,7 @@ def folder() -> Path:
 
 
 def recall(name: str) -> bytes | None:
-    """Read what was kept under a name; None if it cannot be read."""
+    """Read what `keep` stored under a file name in the cache folder; None if it cannot be read."""
     try:
         return bytes_of(folder() / name, "rows")
     except OSError:
@@ -30,13 +30,16 @@ def recall(name: str) -> bytes | None:
 
 
 def keep(name: str, data: bytes) -> None:
-    """Keep data under a name; do nothing if the folder cannot be written."""
+    """Store data under a file name in the cache folder; do nothing if it cannot be written."""
     with suppress(OSError):
         write_whole(folder() / name, data)
 
 
 @cache
 def code_sha256(*patterns: str) -> str:
-    """Return the digest of the package's files that match, for keys that change with the code."""
+    """Return a digest of the package's source files that match glob patterns, and of its version.
+
+    For cache keys that must change with the code.
+    """
     files = sorted(file for pattern in patterns for file in _PACKAGE.glob(pattern))
     return digest([__version__, *(sha256_file(file) for file in files)])

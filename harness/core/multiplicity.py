@@ -12,13 +12,11 @@ LEAST = 1e-12  # below this p-value, levels of confidence are too near 1 to be t
 
 
 def p_value(interval: Callable[[float], Estimate]) -> float | None:
-    """Return the two-sided p-value of a difference of 0:
-    1 less the level at which the interval touches 0.
+    """Return the two-sided p-value of a difference of 0, by inverting its confidence interval.
 
-    It is below 0.05 exactly if the 95 % interval excludes 0, even for an asymmetric interval. For
-    Student's t interval it is the p-value of the paired t test. It is None without an interval,
-    `LEAST` for any smaller one, and 1 above 0.999. `interval` gives the difference at a level of
-    confidence; a higher one is wider.
+    `interval` gives the difference's estimate at a level of confidence. The result is below 0.05
+    exactly if the 95 % interval excludes 0; for Student's t interval it is that of the paired t
+    test. None without an interval; `LEAST` for any smaller value, and 1 above 0.999.
     """
     difference = interval(1 - LEVEL)
     if math.isnan(difference.low) or math.isnan(difference.high):
@@ -44,9 +42,9 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
 def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
     """Return the two-sided p-value of a difference of 0 from a bootstrap's 95 % interval.
 
-    Resamples are too few to find the level at which the interval would touch 0, so the side nearer
-    to 0 is treated as a normal distribution's (Altman and Bland 2011, doi:10.1136/bmj.d2304). None
-    without an interval.
+    `value` is the difference. The side nearer to 0 is treated as that of a normal distribution
+    (Altman and Bland 2011, doi:10.1136/bmj.d2304), since resamples are too few to invert the
+    interval. None without an interval.
     """
     from harness.core.special import ndtr, ndtri
 
@@ -59,13 +57,11 @@ def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
 
 
 def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[float]:
-    """Correct p-values for multiple comparisons by Holm's step-down method (Holm 1979);
-    order is kept.
+    """Correct p-values for multiple comparisons by Holm's step-down method (1979), in order.
 
-    If a difference is called real where its corrected p is at most `LEVEL`, at least one false
-    alarm among all of them has a probability of 5 % at most, however they depend on each other. If
-    those given were picked among more `comparisons`, the others count as less striking, which can
-    only raise the result.
+    Differences whose corrected p is at most `LEVEL` include a false alarm with a probability of at
+    most 5 %, however they depend on each other. `comparisons` is the number from which these were
+    picked, if larger.
     """
     order = np.argsort(p_values, kind="stable")
     steps = np.array(p_values)[order] * ((comparisons or len(p_values)) - np.arange(len(p_values)))

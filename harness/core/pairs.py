@@ -2,8 +2,9 @@
 
 
 def pairs(text: str) -> dict[str, str]:
-    """Return the names and values in `density_per_km=200,power_dbm=23`;
-    a missing value is empty.
+    """Parse settings such as `density_per_km=200,power_dbm=23` into a dict of texts.
+
+    A missing value is an empty text.
     """
     parted = [pair.partition("=") for pair in text.split(",") if pair]
     return {key: value for key, _, value in parted}

@@ -30,8 +30,9 @@ _RAY = re.compile(r"ray(?::(//)?([\w.\[\]:-]+:\d+))?", re.ASCII)
 
 @dataclass(frozen=True)
 class Ray:
-    """A Ray cluster by its address; None means that of `RAY_ADDRESS`,
-    or else one on this machine.
+    """Name a Ray cluster by its address.
+
+    None means the cluster of `RAY_ADDRESS`, or else a new one on this machine.
     """
 
     address: str | None = None
@@ -42,7 +43,10 @@ Workers = int | Ray  # a number of processes, or a cluster
 
 
 def workers_of(text: str) -> Workers:
-    """Parse the value of `--workers`. Raises UserError if it is neither a count nor a cluster."""
+    """Parse the value of `--workers`: a number of processes, or a Ray cluster.
+
+    Raises UserError if it is neither.
+    """
     if text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= MOST_WORKERS:
         return int(text)
     if match := _RAY.fullmatch(text):
@@ -54,21 +58,20 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Runs items on workers. Every submitted item comes back once,
-    as its result or as `WorkerDied`.
-    """
+    """Runs items on workers; each submitted item comes back once, as result or `WorkerDied`."""
 
     def room(self) -> bool:
         """Return whether another item can be submitted."""
         ...
 
     def give(self, place: int, item: Any) -> None:
-        """Submit an item."""
+        """Submit an item; `place` is its index among all items."""
         ...
 
     def take(self) -> "tuple[int, Any]":
-        """Wait for an item; return its place, and its result or `WorkerDied`.
-        Raises what the work raises.
+        """Wait until any item is done; return its index, and its result or `WorkerDied`.
+
+        Raises what the work raised.
         """
         ...
 
@@ -78,7 +81,7 @@ class Executor(Protocol):
 
 
 class WorkerDied:
-    """Stands for the result of an item whose worker died."""
+    """Stand in for the result of an item whose worker process died."""
 
 
 def each(
@@ -89,7 +92,7 @@ def each(
     label: Callable[[Item], str] = str,
     repeatable: bool = True,
 ) -> None:
-    """Call `work` on every item, in any order, and handle each result once, in this process.
+    """Call `work` on every item, in any order, and pass each result once to `on_result`, here.
 
     If `work` raises, or the call is interrupted, the items that still run are stopped. Raises
     Unfinished if the workers of some items died `TRIES` times; all other items are done.
@@ -98,7 +101,7 @@ def each(
         work: the function; it and the items can be pickled.
         items: its arguments.
         workers: 1 means this process.
-        on_result: called with an item's place and its result as soon as the result arrives.
+        on_result: called with an item's index and its result as soon as the result arrives.
         label: gives an item's name in messages.
         repeatable: whether the same item must give the same result on another node;
             a difference is an error.
@@ -141,7 +144,7 @@ def each(
 
 
 def done(work: Callable[[Item], Result], item: Item) -> Result:
-    """Return the result of an item, whose work may call a package's code."""
+    """Return `work(item)`, kept from ending the program or changing its working folder."""
     with strangers():
         return work(item)
 
@@ -154,7 +157,10 @@ def spread(
     label: Callable[[Item], str] = str,
     repeatable: bool = True,
 ) -> list[Result]:
-    """Return `[work(i) for i in items]` (see `each`), and call `progress(1)` after every item."""
+    """Return `[work(i) for i in items]`, computed by workers (see `each`).
+
+    `progress(1)` is called after every item.
+    """
     results: dict[int, Result] = {}
 
     def on_result(place: int, result: Result) -> None:
@@ -232,10 +238,9 @@ _shared: tuple[Flags, int] | None = None  # of a worker: which workers have work
 
 
 def share(total: int) -> int:
-    """Return how many of `total` this process may use, which all workers at work divide;
-    1 at least.
+    """Return this worker's share of `total` (such as threads), at least 1.
 
-    It grows when another worker ends. Outside workers, and on a cluster, it is all.
+    All workers that still have work divide it; outside a worker, and on a cluster, it is all.
     """
     if _shared is None:
         return total
@@ -254,9 +259,7 @@ def _begin(at_work: Flags, number: int) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as its parent ends, for whatever reason,
-    even in the middle of its work.
-    """
+    """End this process as soon as its parent process ends, even in the middle of its work."""
 
     def wait() -> None:
         parent = parent_process()

@@ -20,10 +20,10 @@ COMMAND = "command"  # key of a value that is a command line
 
 
 def nameless(value: Any, key: str = "") -> Any:
-    """Return a value of JSON with the names of files in place of their absolute paths.
+    """Return a JSON value with file names in place of absolute paths, for others to read.
 
-    Addresses lose a user, a password and a query.
-    A path with spaces is found if it is the whole text, or a word of a command line.
+    URLs lose user, password and query. A path with spaces is found only if it is a whole text, or a
+    word of a command line; `key` is the key of `value`, as of a command.
     """
     if isinstance(value, str):
         return _command(value) if key == COMMAND else text(value)
@@ -35,14 +35,14 @@ def nameless(value: Any, key: str = "") -> Any:
 
 
 def text(value: str) -> str:
-    """Return a text with the names of files in place of their absolute paths; see `nameless`."""
+    """Return a text with file names in place of absolute paths; see `nameless`."""
     if _WHOLE.fullmatch(value) and not _ADDRESS.match(value):
         return name(value)
     return _PATH.sub(lambda match: address(match[0]) if match["address"] else name(match[0]), value)
 
 
 def name(path: str) -> str:
-    """Return the last part of a path of any system; the path itself if it has none."""
+    """Return the last part of a POSIX or Windows path; the path itself if it has none."""
     kind: type[PurePath] = (
         PureWindowsPath if "\\" in path or re.match("[A-Za-z]:", path) else PurePosixPath
     )
@@ -50,7 +50,7 @@ def name(path: str) -> str:
 
 
 def address(url: str) -> str:
-    """Return an address without its user, password, query and fragment; of a file, its name."""
+    """Return a URL without user, password, query and fragment; of a `file:` URL, its name."""
     try:
         parts = urlsplit(url)
         host = parts.netloc.rpartition("@")[2]

@@ -22,7 +22,10 @@ LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
 def entries(group: str) -> Mapping[str, Any]:
-    """Return the entry points of a group by name, of the packages on `sys.path`."""
+    """Return the packages' entry points of a group, such as `swarmdrive.rules`, by name.
+
+    Of two with one name, this distribution's or else the first is taken, and stderr says so.
+    """
     return _entries(group, tuple(sys.path))
 
 
@@ -100,14 +103,14 @@ class Added:
 
 @cache
 def say_once(line: str) -> None:
-    """Print a line on stderr, once."""
+    """Print a line on stderr, after `harness: `; the same line is not printed again."""
     print(f"harness: {line}", file=sys.stderr)
 
 
 def texts(said: Any, what: str = "its answer") -> list[str]:
-    """Return a package's texts as plain ones, which raise nothing where they are shown.
+    """Return texts that a package gave as plain `str`, without its subclasses' code.
 
-    Raises TypeError, which names `what` they are, for anything but a list of texts.
+    Raises TypeError, which begins with `what`, for anything but a list of texts.
     """
     each = () if isinstance(said, str) else tuple(said)
     if isinstance(said, str) or not all(isinstance(text, str) for text in each):
@@ -128,34 +131,31 @@ def line_or_none(said: Any, what: str) -> str | None:
 
 
 class Failed(UserError):
-    """What people read in the place of what a plug-in would have said:
-    whose it is, and why it says none.
-    """
+    """Report, in place of what a plug-in should have said, whose plug-in failed and why."""
 
 
 def of_type(kind: type) -> Allowed:
-    """Return the rule of a value of one type."""
+    """Return the rule, for `Plugins.stated`, that a value is of one type."""
     return lambda value: isinstance(value, kind), kind.__name__
 
 
 def one_of(*values: object) -> Allowed:
-    """Return the rule of a value that is one of these."""
+    """Return the rule, for `Plugins.stated`, that a value is one of these."""
     return values.__contains__, ", ".join(map(str, values))
 
 
 def tuple_of(each: Allowed) -> Allowed:
-    """Return the rule of a tuple whose values follow another rule."""
+    """Return the rule, for `Plugins.stated`, that a value is a tuple of what `each` allows."""
     fits, words = each
     return lambda value: isinstance(value, tuple) and all(map(fits, value)), f"a tuple of {words}"
 
 
 class Plugins(Mapping[str, T], Generic[T]):
-    """Plug-ins by name. A package adds one by an entry point,
-    which is loaded when its name is looked up.
+    """Hold the plug-ins of one group by name: built-in ones, and those of entry points.
 
-    Each must be an instance of `kind`, a class or runtime-checkable protocol, and have what is
-    `stated`: by name, whether a value is allowed, and which are. Those that are `built_in` cannot
-    be replaced.
+    A package's plug-in is loaded and checked when it is looked up: it must be an instance of `kind`
+    (a class or a runtime-checkable protocol), and its attributes must follow the rules `stated` (a
+    test and its words, by attribute). Built-in plug-ins cannot be replaced.
     """
 
     stated: ClassVar[Mapping[str, Allowed]] = {}
@@ -171,7 +171,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         return self._loaded[name]
 
     def is_ours(self, name: str) -> bool:
-        """Return whether a plug-in ships with the harness: none of others has its name."""
+        """Return whether a plug-in ships with the harness, so that no package can replace it."""
         from harness.core.extensions import shipped
 
         return name in self.built_in or name in shipped(self.group)
@@ -188,10 +188,10 @@ class Plugins(Mapping[str, T], Generic[T]):
         }
 
     def ask(self, name: str, question: Callable[[T], Said]) -> Said:
-        """Return what a plug-in says to people, who read on where it fails.
+        """Return `question(plugin)`, such as its description for people.
 
-        Raises Failed if it does not load or its package fails,
-        and UserError if the plug-in raises that.
+        Raises Failed if the plug-in does not load or its code fails, and UserError if it raises
+        that.
         """
         try:
             plugin = self[name]
@@ -248,23 +248,23 @@ class Plugins(Mapping[str, T], Generic[T]):
         return plugin
 
     def check(self, name: str, plugin: T) -> None:
-        """Raise an error for a package's plug-in that says of itself what does not go."""
+        """Raise any error if a package's plug-in is inconsistent; for subclasses to override."""
 
 
 class FilesAndPlugins(Plugins[T]):
-    """Plug-ins that may also be TOML files, shipped or a project's.
+    """Hold plug-ins that may also be TOML files, shipped or in the user's project.
 
-    Those that ship come first, then files, then packages.
+    Built-in ones come first, then files, then packages.
     """
 
     folder: str  # kind of resource that the files are, such as `channels`
 
     @abstractmethod
     def read(self, file: Path) -> T:
-        """Read the plug-in in a file. Raises UserError if the file is wrong."""
+        """Read a plug-in from its TOML file. Raises UserError if the file is wrong."""
 
     def file(self, name: str) -> Path | None:
-        """Return the file of a plug-in; None if it is not a file."""
+        """Return the TOML file of a plug-in; None if it does not come from a file."""
         if self.is_ours(name) or Path(f"{name}.toml").stem != name:  # a path is no name
             return None
         file = resources.find(self.folder, f"{name}.toml")

@@ -20,16 +20,18 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 
 @dataclass(frozen=True)
 class Spread:
-    """How much the difference of two successes varies between episodes,
-    whose parts are averaged.
+    """Hold how much a paired difference of success varies between episodes, by stratum.
+
+    The mean over the H strata is unweighted, as in `statistics.paired_difference`.
     """
 
-    shares: Floats  # of all episodes that each part has, (H,); they sum to 1
-    variances: Floats  # of an episode's difference in each part, (..., H)
+    shares: Floats  # share of all episodes that is in each stratum, (H,); they sum to 1
+    variances: Floats  # variance of an episode's difference in each stratum, (..., H)
 
     def episodes(self, difference: float, power: float) -> Floats:
-        """Return how many episodes find a difference with a power, (...);
-        whole numbers, inf above `MOST`.
+        """Return how many episodes find a difference (a share) with this power, (...).
+
+        Whole numbers; inf above `MOST`. Found means that the 95 % interval excludes 0.
         """
         low, high = np.ones(self._shape), np.full(self._shape, MOST)
         for _ in range(HALVINGS):  # of the ratio, since the bracket spans nine orders of magnitude
@@ -39,8 +41,9 @@ class Spread:
         return np.where(high < MOST, np.ceil(high - 1e-6), np.inf)
 
     def difference(self, n: float, power: float) -> Floats:
-        """Return the least difference that n episodes find with a power, (...);
-        NaN where none up to 1 is.
+        """Return the least difference (a share) that n episodes find with this power, (...).
+
+        NaN if they find none up to 1. Found means that the 95 % interval excludes 0.
         """
         low, high = np.zeros(self._shape), np.ones(self._shape)
         for _ in range(HALVINGS):
@@ -81,8 +84,9 @@ class Spread:
 
 
 def variance(values: Floats, counts: Ints) -> Floats:
-    """Return the variance of values (E,) that count so often, (..., E);
-    inf where fewer than two count.
+    """Return the sample variance of values (E,) with integer weights `counts`, (..., E) to (...).
+
+    inf where the weights sum to less than 2.
     """
     n = counts.sum(axis=-1)
     mean = counts @ values / np.maximum(n, 1)

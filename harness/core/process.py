@@ -29,9 +29,7 @@ STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their 
 
 
 class Stop(KeyboardInterrupt):
-    """SIGTERM or SIGINT, which end a command wherever it is;
-    the argument is the signal's number.
-    """
+    """Raised where the program is when SIGTERM or SIGINT comes; its argument is the number."""
 
     @property
     def word(self) -> str:
@@ -39,15 +37,15 @@ class Stop(KeyboardInterrupt):
 
     @property
     def code(self) -> int:
-        """The exit code, as shells have it."""
+        """The exit code as shells have it: 128 plus the signal's number."""
         return 128 + int(self.args[0])
 
 
 def run(program: Callable[[], object]) -> None:
-    """Run the program so that SIGTERM, SIGINT or a want of memory end it with one line.
+    """Run the program so that SIGTERM, SIGINT or lack of memory end it with one line on stderr.
 
-    Exit codes are 143, 130 and 2. Where standard input, output or error is closed, nothing is read
-    or written; a character that an encoding lacks is replaced.
+    Exit codes are 143, 130 and 2. Standard streams that are closed are replaced by the null device,
+    and a character that an encoding lacks is replaced.
     """
     _open_streams()
     _leave_out_wrong_date()
@@ -77,8 +75,9 @@ def run(program: Callable[[], object]) -> None:
 
 
 def give_up() -> None:
-    """Note that something hangs: what its package registered with `atexit` may wait for the same
-    server.
+    """Shorten the wait at exit, after something hung that exit handlers may hang on as well.
+
+    Packages' `atexit` functions then have `GIVEN_UP_S` instead of `LEAVE_S` to finish.
     """
     global LEAVE_S
     LEAVE_S = min(LEAVE_S, GIVEN_UP_S)
@@ -197,8 +196,9 @@ def _open_streams() -> None:
 
 @contextmanager
 def streams_kept(what: str) -> Iterator[None]:
-    """Run code that may close or replace output and error;
-    both are put back, and a line on stderr says whose it was, `what`.
+    """Run code that may close or replace stdout and stderr; both are restored afterwards.
+
+    A line on stderr then says that `what`, the name of the code, did so.
     """
     copies = {number: os.dup(number) for number in (1, 2) if _file_at(number)}
     files = {number: _file_at(number) for number in copies}

@@ -2,13 +2,13 @@
 
 
 class Progress:
-    """Counts what is done, and what is still to do; this one shows nothing."""
+    """Receive counts of work that is done and still to do; this base class shows nothing."""
 
     def __call__(self, done: int) -> None:
         """Add to what is done."""
 
     def more(self, count: int) -> None:
-        """Add to what there is to do."""
+        """Add to the count of what there is to do."""
 
     def say(self, text: str) -> None:
-        """Write a line."""
+        """Show a line of text."""

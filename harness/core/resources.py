@@ -34,8 +34,9 @@ def folder(kind: str) -> Path:
 
 
 def entries(kind: str, pattern: str) -> list[Path]:
-    """List the paths of one kind, shipped and the project's,
-    that match a glob pattern below its folder.
+    """List the paths of one kind of resource that match a glob pattern, sorted.
+
+    Both the shipped folder and the project's are searched.
     """
     return sorted(path for where in _folders(kind) for path in where.glob(pattern))
 
@@ -46,9 +47,7 @@ def names(kind: str) -> list[str]:
 
 
 def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
-    """Load all that a list shows; one that is wrong stands there as its error,
-    and takes no other with it.
-    """
+    """Load every name with `load`; return, by name, what it gave or the UserError it raised."""
     loaded: dict[str, T | UserError] = {}
     for name in names:
         try:
@@ -59,10 +58,10 @@ def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserEr
 
 
 def find(kind: str, name: str) -> Path:
-    """Return the path of a resource; if it does not exist, its path among the shipped ones.
+    """Return the path of a resource by kind and name, such as `prompts` and `v4`.
 
-    Raises UserError if the project and the harness both have a resource of that name,
-    or nothing can show it.
+    The project and the shipped folder are searched; if it does not exist, it is its path among the
+    shipped ones. Raises UserError if both have it, or the name cannot be shown.
     """
     # one, if `name` is absolute
     candidates = list(dict.fromkeys(where / name for where in _folders(kind)))
@@ -78,8 +77,9 @@ def find(kind: str, name: str) -> Path:
 
 
 def card_to_copy(model: str) -> str | None:
-    """Say where the card of a model is that no longer ships, and what to do with it;
-    None of all others.
+    """Return the advice for a model whose card no longer ships: where it is and where to copy it.
+
+    None for all other names.
     """
     page = root() / "docs" / "model-cards.md"
     name, _, _ = model.partition(":")

@@ -4,9 +4,7 @@ from collections.abc import Sequence
 
 
 def rounded(p: Sequence[float], parts: int = 100) -> list[float]:
-    """Round a distribution to multiples of 1/`parts`, hundredths unless given,
-    by largest remainders.
-    """
+    """Round a distribution to multiples of 1/`parts` that still sum to 1, by largest remainders."""
     floor = [int(x * parts + 1e-9) for x in p]
     short = parts - sum(floor)
     for i in sorted(range(len(p)), key=lambda i: floor[i] - p[i] * parts)[:short]:

@@ -18,8 +18,9 @@ LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """Return the one purpose of the layout seeds `first` to `first + count - 1`,
-    or raise UserError.
+    """Return what the layout seeds `first` to `first + count - 1` are for.
+
+    It is `tune`, `train` or `report`. Raises UserError if they are for several.
     """
     present = purposes(first, count)
     if len(present) > 1:

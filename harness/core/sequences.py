@@ -30,11 +30,10 @@ MEANS = np.linspace(0.0, 1.0, 1001)  # the means that are tried; ends are the ne
 
 
 def any_time(parts: Sequence[Floats]) -> Estimate:
-    """Return the mean of means of parts, with an interval that holds at every look.
+    """Return a mean of shares with a 95 % confidence sequence, valid at every number of episodes.
 
-    Values of one or two parts are independent, of one mean a part, from 0 to 1, (E,); NaN is left
-    out. The capital of two is the product of theirs; the interval has every mean of means that it
-    does not refute.
+    `parts` are one or two strata of independent values from 0 to 1, (E,) each, NaN left out; the
+    result is the unweighted mean of their means. By betting: Waudby-Smith and Ramdas 2024.
     """
     values = [part[~np.isnan(part)] for part in parts]
     n, n_excluded = sum(map(len, values)), sum(map(len, parts)) - sum(map(len, values))
@@ -47,8 +46,9 @@ def any_time(parts: Sequence[Floats]) -> Estimate:
 
 
 def any_time_difference(parts: Sequence[Floats]) -> Estimate:
-    """Return what `paired_difference` does of the same parts,
-    with an interval that holds at every look.
+    """Return `paired_difference` of the same strata, with a 95 % confidence sequence.
+
+    The interval is valid at every number of episodes (asymptotically), so a run may stop by it.
     """
     return paired_reach(parts, _mixture(sum(int((~np.isnan(part)).sum()) for part in parts)))
 

@@ -28,7 +28,7 @@ TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `number` of `of` parts, counted from 1."""
+    """Name part `number` of `of` equal parts of the work, counted from 1."""
 
     number: int
     of: int
@@ -37,7 +37,8 @@ class Shard:
         return f"{self.number}/{self.of}"
 
     def part(self, items: Sequence[T]) -> Sequence[T]:
-        """Return this shard's slice of a sequence.
+        """Return this shard's contiguous slice of a sequence.
+
         Raises UserError if there are more shards than items.
         """
         if self.of > len(items):
@@ -52,7 +53,8 @@ class Shard:
 def shard_of(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     """Parse the value of `--shard`: `3/16`, or `auto/16` for the number of this task in a job.
 
-    Raises UserError if there is no such shard, or `auto` is given outside a job.
+    `auto` reads the task's number from `environment` (Slurm, Kubernetes). Raises UserError if there
+    is no such shard, or `auto` is given outside a job.
     """
     number, _, total = text.partition("/")
     if number == "auto":
@@ -78,10 +80,10 @@ Start = TypeVar("Start", bound=work.WorkStart)
 
 
 def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
-    """Read what the shards in some folders began with, and check that they make up one work.
+    """Read the stored settings of the shards in some folders, and check that they make up one work.
 
-    Raises UserError if a folder holds no shard, one is still being written,
-    they are of different works, or one is missing.
+    Raises UserError if a folder holds no shard, one is still being written, they are of different
+    works, or one is missing.
     """
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
@@ -130,7 +132,7 @@ def owners(
     parts: Sequence[str],
     label: Callable[[str], str],
 ) -> dict[str, Path]:
-    """Return the path of each part of a work, by its name, in the folders of its shards.
+    """Return the path of each part of the work, by its name, in the folder of its shard.
 
     `parts` are the names of all parts, in order; `label` gives a part's name in messages. Raises
     UserError if a shard is not finished, or a part differs between two folders.
@@ -155,7 +157,10 @@ def owners(
 
 
 def collect(parts: Mapping[str, Path], folder: Path) -> None:
-    """Copy parts to a working folder, each in one step; parts that it already holds are skipped."""
+    """Copy parts (files or folders, by name) to a working folder, each in one step.
+
+    Parts that the folder already holds are skipped.
+    """
     for name, part in parts.items():
         copy = folder / f".{name}.{os.getpid()}.part"
         if not (folder / name).exists():

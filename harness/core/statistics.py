@@ -34,7 +34,8 @@ class Estimate:
 
 
 def safe_target(safe: Bools) -> Floats:
-    """Return the uniform distribution over the safe actions, `(..., A)`;
+    """Return the uniform distribution over the safe actions, `(..., A)`.
+
     NaN where no action is safe.
     """
     count = np.sum(safe, axis=-1, keepdims=True)
@@ -42,24 +43,22 @@ def safe_target(safe: Bools) -> Floats:
 
 
 def brier(p: Floats, target: Floats) -> Floats:
-    """Return the squared distance of intents from target distributions, both `(..., A)`;
-    0 best, 2 worst.
+    """Return the Brier score (1950) of intents against target distributions, `(..., A)` to `(...)`.
 
-    This is the score of Brier 1950 for many classes, with a distribution (`safe_target`) instead of
-    one true class. It is smallest at p = target: with two safe actions, an intent that is sure of
-    one scores 0.5, and one that is undecided between both scores 0. Shape `(...)`.
+    It is the squared distance: 0 is best, 2 worst. The target may be a distribution (`safe_target`)
+    instead of one true class. It is smallest at p = target: with two safe actions, an intent that
+    is sure of one scores 0.5, and one that is undecided between both scores 0.
     """
     score: Floats = np.sum((p - target) ** 2, axis=-1)
     return score
 
 
 def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
-    """Return -ln of the probability that intents `(..., A)` give to the safe actions; 0 best.
-    Shape `(...)`.
+    """Return -ln of the probability that intents give to the safe actions, `(..., A)` to `(...)`.
 
-    This is the logarithmic score (Good 1952) with the set of safe actions as the event that came
-    true. Unlike in `brier`, it does not matter how the mass is spread inside the set. NaN where no
-    action is safe. An answer that is sure and wrong costs -ln(LEAST_MASS) = 9.2 nats.
+    This is the logarithmic score (Good 1952) of the event that the action is safe, in nats; 0 is
+    best. How the probability is spread among safe actions does not matter. NaN where no action is
+    safe. An answer that is sure and wrong costs -ln(`LEAST_MASS`) = 9.2.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -102,11 +101,10 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
-    """Return the mean of values from 0 to 1, `(n,)`,
-    with Wilson's interval for their effective sample size.
+    """Return the mean of n shares from 0 to 1, with Wilson's interval for their effective size.
 
-    NaN is left out. `episodes` is the episode of each value, one of its own if None; how much an
-    episode counts depends on how alike its seeds or decisions are (`_effective_n`).
+    Values are `(n,)`, NaN left out. `episodes` is the episode of each value, `(n,)`; by default
+    each is its own. Values of one episode count as clustered (`_effective_n`).
     """
     known = ~np.isnan(values)
     n, n_excluded = int(known.sum()), int((~known).sum())
@@ -118,7 +116,7 @@ def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
 
 
 def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
-    """Return Wilson's score interval of a share among n (Wilson 1927)."""
+    """Return the ends of Wilson's score interval (1927) of a share `rate` observed in n trials."""
     z = _normal(level)
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
@@ -154,30 +152,28 @@ def seed_rate_interval(values: Floats) -> Estimate:
 
 
 def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate:
-    """Return the mean of the parts' mean differences, with an interval over episodes.
+    """Return the unweighted mean of the strata's mean differences, with an interval over episodes.
 
-    Parts are strata that weigh alike, such as the layouts with a danger and without of each family:
-    the variance is that of a stratified mean (Cochran 1977, section 5.6). What is rare may not have
-    been seen, so it counts on a little more, in two ways that were found by simulation and whose
-    coverage and power `benchmarks/differences.py` measures. Each of several parts varies as if it
-    had more episodes, `ALIKE` in all parts together, that differ as often as those of all. And two
-    more differ, one each way (as Bonett and Price 2012 add pairs): as heavy as those that differ
-    are on average, or, where few do, as one may be. With k that differ, the squares of both weights
-    are mixed by exp(-k / `FEW`).
+    The strata are such as the layouts with a danger and without of each family, and the variance is
+    that of a stratified mean (Cochran 1977, section 5.6). It is enlarged for rare differences that
+    were not seen, in two ways that were found by simulation (`benchmarks/differences.py` measures
+    coverage and power). Each stratum's variance is mixed with that of all, as of `ALIKE` more
+    episodes over all strata. And two episodes that differ are added, one each way (as Bonett and
+    Price 2012 add pairs): with k that differ, their squared weight goes from the largest possible
+    to the usual one by exp(-k / `FEW`).
 
     Args:
-        parts: differences from -1 to 1 of each part's episodes, (E,) each; NaN is left out.
+        parts: the strata: differences from -1 to 1 of each one's episodes, (E,) each; NaN is left
+        out.
         level: of confidence.
 
-    A part with one episode bounds nothing, so the ends are NaN.
+    The ends are NaN if a stratum has only one episode.
     """
     return paired_reach(parts, _normal(level))
 
 
 def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
-    """Return the mean of `paired_difference` with an interval that reaches so many standard
-    errors.
-    """
+    """Return `paired_difference` with ends that are `errors` standard errors from the mean."""
     value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
     half = errors * error
@@ -208,15 +204,13 @@ def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
 
 
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
-    """Return what `paired_difference` does of one part,
-    with an interval from the two of `rate_interval`.
+    """Return the mean paired difference of two sets of shares, with a combined Wilson interval.
 
-    It is wider, above all as a mean of several (`mean_of`), and stays for what was computed with it
-    (`runs/pinned.py`). The ends of both intervals are combined by the correlation over episodes
-    (Newcombe 1998, method 10; Zou and Donner 2008). The correlation includes two more pairs that
-    differ, one each way (as in Bonett and Price 2012): even if all pairs agree, a few of other
-    episodes might not. Both are `(E,)` or `(E, ...)`, with the same episodes; a pair in which
-    either is NaN is excluded.
+    `a` and `b` are `(E,)` or `(E, ...)`, of the same episodes; a pair in which either is NaN is
+    left out. The ends of both `rate_interval`s are combined by the correlation over episodes
+    (Newcombe 1998, method 10; Zou and Donner 2008), with two more pairs that differ, one each way.
+    Wider than `paired_difference`, and kept for results that were computed with it
+    (`runs/pinned.py`).
     """
     unknown = np.isnan(a) | np.isnan(b)
     x, y = (
@@ -247,10 +241,9 @@ def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
 def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
-    The distances of the estimates' ends from their values are combined as the root of their sum of
-    squares ("MOVER": Zou and Donner 2008), so the level is theirs. The averaged estimates are taken
-    as fixed and not as a sample: the interval says nothing of another family of scenes. NaN where
-    any estimate is.
+    The distances of the ends from the values are combined as the root of their sum of squares
+    ("MOVER": Zou and Donner 2008), so the level is theirs. The estimates are taken as fixed, not as
+    a sample of more. NaN where any estimate is.
     """
     value = np.array([estimate.value for estimate in estimates])
     low = np.array([estimate.low for estimate in estimates])
@@ -262,16 +255,14 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
-    """Return how often each of n units counts, `(1 + times, n)`:
-    once, then as drawn with replacement.
-    """
+    """Return bootstrap counts of n units, `(1 + times, n)`: ones, then draws with replacement."""
     return np.vstack(
         [np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)]
     )
 
 
 def resampled_estimate(values: Floats, n: int) -> Estimate:
-    """Return a figure of n units with its bootstrap's 95 % interval.
+    """Return a figure of n units with the 95 % percentile interval of its bootstrap.
 
     `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 +
     times,)`. NaN resamples are left out; if the figure itself is NaN, there is no interval.

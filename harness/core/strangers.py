@@ -29,8 +29,9 @@ _watchers: set[int] = set()  # processes with a thread that watches
 
 @contextmanager
 def watched(what: str, patience_s: float | None = None) -> Iterator[None]:
-    """Run code; a line on stderr says it, once, if that takes longer than `patience_s`, in
-    seconds, or than `PATIENCE_S`.
+    """Run code; if it takes longer than `patience_s` seconds, a line on stderr names it, once.
+
+    `what` names the code; the default is `PATIENCE_S`.
     """
     call = object()
     _calls[call] = what, time.monotonic(), patience_s or PATIENCE_S
@@ -55,9 +56,9 @@ def _watch() -> None:
 
 @contextmanager
 def strangers(what: str = "a package") -> Iterator[None]:
-    """Run code that may be a package's; `what` names it in messages.
+    """Run code that may be another package's; `what` names it in messages.
 
-    Raises UserError for what would end the program, unless somebody did type Ctrl-C. A changed
+    If it tries to end the program (except by a typed Ctrl-C), this raises UserError. A changed
     working folder is put back, and a line on stderr says so.
     """
     here = _folder()
@@ -76,8 +77,9 @@ def strangers(what: str = "a package") -> Iterator[None]:
 
 @contextmanager
 def aside(what: str) -> Iterator[None]:
-    """Run code as `strangers` does; what it prints goes to stderr,
-    since a program may read stdout.
+    """Run a package's code as `strangers` does; its stdout goes to stderr.
+
+    A line on stderr says if it takes long (`watched`).
     """
     with watched(what), strangers(what), redirect_stdout(sys.stderr):
         yield
@@ -111,10 +113,9 @@ def worded(
     built_in: bool = False,
     door: Callable[[str], AbstractContextManager[None]] = strangers,
 ) -> Iterator[None]:
-    """Run a package's code whose errors end a run; code that is `built_in` runs as it is.
+    """Run a package's code, and turn its errors into a one-line UserError that names `what`.
 
-    The `door` is `strangers` or `aside`. Raises UserError, in one line that names the package's
-    thing, `what`, and where it failed.
+    If `built_in` is true the code runs as it is. `door` is `strangers` or `aside`.
     """
     if built_in:
         yield
@@ -131,8 +132,9 @@ def worded(
 
 
 def ends_the_program(error: BaseException) -> bool:
-    """Return whether this is no error, and nobody typed Ctrl-C:
-    code that runs here has no right to it.
+    """Return whether an exception would end the program though no error: such as SystemExit.
+
+    A Ctrl-C that somebody typed, and `Stop`, do not count.
     """
     if isinstance(error, Stop):
         return False
@@ -145,7 +147,7 @@ def ends_the_program(error: BaseException) -> bool:
 
 
 def ended(what: str, error: BaseException) -> UserError:
-    """Build the error for what a package raised to end the program; it says what, and where."""
+    """Build the UserError for code `what` that tried to end the program by raising `error`."""
     return UserError(f"{what} ends the program ({_raised(error)}); repair or uninstall the package")
 
 

@@ -93,15 +93,16 @@ _WITH_LENGTH = (str, bytes, list, tuple, dict)
 
 
 class TooMuch(SecurityError):
-    """A template wants more than it may have; the message says what."""
+    """Report that a template exceeds its limit of steps or memory; the message says which."""
 
     def __init__(self, what: str = f"more than {MOST_STEPS:,} steps and characters") -> None:
         super().__init__(what)
 
 
 class Unwritten(SecurityError):
-    """A template writes a thing whose text is where it lies in memory,
-    another one in every process.
+    """Report that a template writes an object whose text is its memory address.
+
+    Such a text would differ in every process.
     """
 
     def __init__(self, thing: object) -> None:
@@ -118,12 +119,15 @@ _account = _Account()
 
 
 def begin() -> None:
-    """Begin a rendering in this thread, with all its steps."""
+    """Give the template rendering that begins in this thread its full budget of `MOST_STEPS`."""
     _account.left = MOST_STEPS
 
 
 def spend(steps: int) -> bool:
-    """Pay for some steps. Raises TooMuch if there are not so many left."""
+    """Charge steps to the rendering's budget. Raises TooMuch if it has fewer left.
+
+    Returns True, so that it can stand in an expression.
+    """
     _account.left -= steps
     if _account.left < 0:
         raise TooMuch
@@ -131,15 +135,16 @@ def spend(steps: int) -> bool:
 
 
 def read(value: Any) -> Any:
-    """Return a value after paying for reading the whole of it."""
+    """Return a template's value, after charging the rendering's budget for reading all of it."""
     if type(value) not in _SMALL and not (type(value) is str and len(value) < _SHORT):
         spend(_size(value))
     return value
 
 
 def written(value: Any) -> Any:
-    """Return a value that is to be written, as `read` does.
-    Raises Unwritten if its text is its address.
+    """Return a value that a template writes, after charging the budget for reading it.
+
+    Raises Unwritten if its text is its memory address.
     """
     if isinstance(value, _ADDRESSED):
         raise Unwritten(value)
@@ -147,7 +152,7 @@ def written(value: Any) -> Any:
 
 
 def looked_in(value: Any) -> Any:
-    """Return a value after paying for a search in it."""
+    """Return a container, after charging the budget for a search in it; a mapping costs nothing."""
     return value if isinstance(value, _MAPPINGS) else read(value)
 
 
@@ -319,7 +324,7 @@ class _Namespace(Namespace):
 
 
 class Code(CodeGenerator):
-    """Jinja's compiler, whose code pays for what it reads, joins and repeats."""
+    """Jinja's code generator; its code charges the budget for what it reads, joins and repeats."""
 
     environment: "Sandbox"
 
@@ -396,7 +401,7 @@ def _cost(body: Iterable[nodes.Node]) -> int:
 
 
 class Bounded(Template):
-    """A template whose every rendering has all the steps."""
+    """A compiled template, each of whose renderings has the full number of steps."""
 
     def render(self, *given: Any, **named: Any) -> str:
         begin()
@@ -404,10 +409,10 @@ class Bounded(Template):
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja environment for templates of strangers, each of whose renderings has `MOST_STEPS`.
+    """A Jinja environment for untrusted templates; each rendering is limited to `MOST_STEPS` steps.
 
-    Compiling raises jinja2.TemplateSyntaxError for whatever is no template,
-    and for one that is too long.
+    Compiling raises jinja2.TemplateSyntaxError for an invalid template and for one that is too
+    long.
     """
 
     intercepted_binops = frozenset(ImmutableSandboxedEnvironment.default_binop_table)
@@ -463,7 +468,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         )
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether it is known of an expression that its value costs nothing to read."""
+        """Return whether an expression is known to cost nothing to read: a constant."""
         return isinstance(node, nodes.Const)
 
     def _put_steps_into(self, source: nodes.Template) -> None:
@@ -486,7 +491,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
             raise TemplateSyntaxError("its parts are nested too deeply", 1) from None
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
-        """Pay for an intercepted operator and what it makes."""
+        """Compute a binary operator, after charging the budget for its operands and result."""
         if isinstance(left, int) and isinstance(right, int):
             bits = left.bit_length(), right.bit_length()
             powers = bits[0] * abs(right) if operator == "**" else 0
@@ -512,7 +517,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
             read(right)
 
     def call(self, context: Context, called: Any, /, *given: Any, **named: Any) -> Any:
-        """Call something after paying for what it is given; then pay for the result."""
+        """Call a function of a template, and charge the budget for its arguments and result."""
         if given or named:
             spend(sum(map(_size, chain(given, named.values()))))
         owner = getattr(called, "__self__", None)
@@ -538,17 +543,17 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return given
 
     def getattr(self, obj: Any, attribute: str) -> Any:
-        """Return an attribute; not while a template is compiled."""
+        """Return an attribute as Jinja does, but never at compile time, when nothing is charged."""
         if _account.compiles:
             raise nodes.Impossible
         return super().getattr(obj, attribute)
 
     def getitem(self, obj: Any, argument: Any) -> Any:
-        """Return an item; one that is not named by a text or number is paid for."""
+        """Return an item as Jinja does; the budget is charged for a key of a large value."""
         return super().getitem(obj, argument if type(argument) in (str, int) else read(argument))
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        """Refuse methods that make much of little."""
+        """Return whether a template may read an attribute; not methods that make large results."""
         if isinstance(obj, bytes | int):
             return False
         return not (isinstance(obj, str) and attr == "translate") and super().is_safe_attribute(
@@ -556,7 +561,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         )
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:
-        """Return the method `format` of a text as one that pays."""
+        """Return a text's `format` method as one that charges the budget; None if it is none."""
         method = super().wrap_str_format(value)
         if method is None:
             return None

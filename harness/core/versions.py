@@ -21,8 +21,9 @@ _version = cache(metadata.version)
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
-    """Return the versions of the harness, Python,
-    the platform and those packages that are installed.
+    """Return, by name, the versions of the harness, Python, the platform and installed packages.
+
+    `parser`, `decisions` and `figures` are versions of the harness's own results.
     """
     installed = {
         "harness": __version__,
@@ -42,9 +43,7 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
 
 @cache
 def node_versions() -> dict[str, str]:
-    """Return the versions that must agree on all nodes of one job,
-    with a digest of the harness's source.
-    """
+    """Return the versions that all nodes of one job must share, and a digest of the source."""
     required: dict[str, str] = versions(
         (*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow")
     )
@@ -53,7 +52,7 @@ def node_versions() -> dict[str, str]:
 
 
 def differing(wanted: dict[str, str]) -> str | None:
-    """Describe the first version that differs here from those wanted; None if all agree."""
+    """Describe the first version that differs here from `wanted`; None if all agree."""
     here = node_versions()
     for name in {**wanted, **here}:
         if here.get(name) != wanted.get(name):

@@ -24,27 +24,26 @@ WAITING = 64
 
 
 class HeadInTime(H11Protocol):
-    """HTTP that closes a connection on which a request's head takes longer than `HEAD_S`.
+    """HTTP protocol of uvicorn that limits how long a request's line and headers may take.
 
-    uvicorn waits for a head for ever, however slowly it drips. Between requests its own, shorter
-    time holds. Who sends no head takes nobody's place: no more than `WAITING` connections wait for
-    one.
+    A connection is closed after `HEAD_S` seconds without a complete head. At most `WAITING`
+    connections may wait for one; of more, the one that waited longest is closed.
     """
 
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first head."""
+        """Begin the time limit of the connection's first request."""
         super().connection_made(transport)
         self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Take what has come."""
+        """Handle data, and begin or end the time limit of a request's head."""
         super().data_received(data)
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait for nothing more."""
+        """Cancel the time limit of a connection that is gone."""
         super().connection_lost(exc)
         self._relax()
 
@@ -71,7 +70,7 @@ class HeadInTime(H11Protocol):
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether only this machine can reach a host name or address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -79,7 +78,7 @@ def is_loopback(host: str) -> bool:
 
 
 def server_of(app: ASGIApp, **limits: Any) -> uvicorn.Server:
-    """Return the server of an application, with further settings of uvicorn."""
+    """Return a uvicorn server for an application; `limits` are further settings of uvicorn."""
     config = uvicorn.Config(
         app,
         log_level="critical",

@@ -26,13 +26,13 @@ SHORT = 30  # most characters of a setting's value that a message has
 
 
 class WorkStart(msgspec.Struct, frozen=True, kw_only=True):
-    """The settings that a piece of work began with."""
+    """Hold the settings that a piece of work began with, as stored in its working folder."""
 
     settings: dict[str, Any]  # plain values that must be the same for the work to be resumed
     shard: str = ""  # which part of the work this is, such as `3/16`; empty for the whole
 
     def facts(self) -> dict[str, Any]:
-        """Return the values that must be the same in all shards of one work."""
+        """Return the values that must be equal in all shards of one work."""
         return self.settings
 
 
@@ -40,10 +40,10 @@ Kind = TypeVar("Kind", bound=WorkStart)
 
 
 def begun(out: Path, kind: type[Kind]) -> Kind | None:
-    """Read what the unfinished work in a folder began with;
-    None if the folder is new, empty or `idle`.
+    """Read what the unfinished work in an output folder began with; None if there is none.
 
-    Raises UserError if the file is damaged, or the folder holds something else.
+    None means that the folder is new, empty or `idle`. `kind` is the type of the record. Raises
+    UserError if the file is damaged, or the folder holds something else.
     """
     sayable("--out", out.name, "give another name")
     shown, file = printable(out), out / WORK / CONFIG
@@ -63,8 +63,9 @@ def begun(out: Path, kind: type[Kind]) -> Kind | None:
 
 
 def unanswered(out: Path) -> str | None:
-    """Return why the work in a folder, or in one of its runs,
-    stopped if its model could not be asked.
+    """Return why the work in an output folder stopped, if its model could not be asked, else None.
+
+    The subfolders of a study are searched as well.
     """
     for place in (out, *([] if (out / "run.json").is_file() else sorted(out.glob("*/")))):
         with suppress(OSError, ValueError, UserError):
@@ -75,7 +76,7 @@ def unanswered(out: Path) -> str | None:
 def idle(out: Path) -> bool:
     """Return whether the work in a folder stopped before its model answered anything.
 
-    Nothing is lost if it begins anew, with other settings or a model that its server has only now.
+    Then nothing is lost if the work begins anew, with other settings.
     """
     work = out / WORK
     with suppress(OSError):
@@ -93,10 +94,10 @@ def same(
     stored: Mapping[str, Any],
     typed: Callable[[], str] = lambda: "",
 ) -> None:
-    """Raise UserError, naming what differs and what it was, unless work began with these settings.
+    """Raise UserError, naming the differences, unless the settings `now` equal the `stored` ones.
 
-    `typed` says what it began with, and what was typed now;
-    it is empty where nobody typed what differs.
+    `out` is the output folder. `typed` returns words for the message, of what the work began with
+    and what was typed now; empty words are replaced by the names of the settings.
     """
     # turns tuples into lists, as they are stored
     now = msgspec.json.decode(msgspec.json.encode(now))
@@ -125,12 +126,12 @@ def held(out: Path) -> bool:
 
 @contextmanager
 def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Path]:
-    """Lock the working folder, an existing one or a new one that begins with `begin`, and yield it.
+    """Lock the working folder of `out`, create it if there is none, and yield its path.
 
-    If a UserError or OSError ends the work before anything is done, the folders created here are
-    deleted; but if the model could not be asked, the folder keeps why (`unanswered`). Finished work
-    writes the file `last` of `out` at the end: if another process has finished since this one
-    looked, this raises UserError.
+    A new one stores `begin`. On a UserError or OSError before anything is done, the folders created
+    here are deleted; but if the model could not be asked, the folder keeps the reason
+    (`unanswered`). `last` is the file that finished work leaves in `out`. Raises UserError if
+    another process works there, or has finished since.
     """
     work, created = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
     try:
@@ -188,9 +189,7 @@ def going_on(out: Path) -> Iterator[None]:
 
 
 def tidy(out: Path) -> None:
-    """Delete the working folder, and temporary files that killed processes left in the output
-    folder.
-    """
+    """Delete the working folder of `out`, and temporary files of killed processes in `out`."""
     with suppress(OSError):  # first, so that nothing resumes from a half-deleted folder
         os.unlink(out / WORK / CONFIG)
     shutil.rmtree(out / WORK, ignore_errors=True)
