@@ -58,10 +58,13 @@ LEAST_AUDITED = 100  # fewest layouts that are audited; an audit of fewer says l
 
 @runtime_checkable
 class Audit(Protocol):
-    """Looks at the layouts of a dataset that is built, for its card."""
+    """Examine the layouts of a dataset that is being built, for a paragraph of its card.
+
+    An audit looks for tells: what gives a hidden danger away. Extensions add audits.
+    """
 
     def ready(self) -> None:
-        """Raise UserError if a package that it needs is missing."""
+        """Raise UserError if a package that the audit needs is missing."""
         ...
 
     def found(
@@ -72,7 +75,10 @@ class Audit(Protocol):
         progress: Callable[[int], None],
         workers: Workers,
     ) -> str:
-        """Return what the card says of the layout seeds `seed` to `seed + layouts - 1`."""
+        """Return the paragraph about the layout seeds `seed` to `seed + layouts - 1`.
+
+        `progress` is called with the number of layouts just examined.
+        """
         ...
 
 
@@ -93,13 +99,13 @@ def build(
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
     Episode e has layout seed `seed + e`, and the folder's name is the dataset's. `audits` says
-    whether the layouts are audited for tells, if there are `LEAST_AUDITED` or more; `more` is
-    called with their number before that, `progress` with the number of layouts just finished or
-    audited.
+    whether the layouts are examined for what gives a danger away (`Audit`), if there are at least
+    `LEAST_AUDITED`; `more` is called with their number before that, `progress` with the number of
+    layouts just finished or audited.
 
-    Returns the manifest; for a shard the settings that it begins with. Raises UserError if the
-    folder holds a finished dataset, one begun with other settings, or something else; the seeds are
-    for several purposes; or the audit needs a package that is missing.
+    Returns the manifest as a dict; for a shard, the settings that it begins with. Raises UserError
+    if the folder holds a finished dataset, one begun with other settings, or something else; the
+    seeds are for several purposes; or the audit needs a package that is missing.
     """
     refuse_agents(scenario, "a dataset")
     # An environment states no danger.
@@ -166,11 +172,10 @@ def merge(
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
 ) -> dict[str, Any]:
-    """Combine the shards of a dataset into the one that `build` makes without shards,
-    byte for byte.
+    """Combine the shards of a dataset into the one that `build` makes without shards.
 
-    Raises UserError as `build`, or if the folders are not all the shards of one build, a shard is
-    unfinished, or two hold different bytes for the same layout.
+    The bytes are the same. Raises UserError as `build`, or if the folders are not all the shards of
+    one build, a shard is unfinished, or two hold different bytes for the same layout.
     """
     begun = shards.read(folders, work.WorkStart)
     config = begun[0].settings
@@ -320,12 +325,12 @@ def _entry(name: str) -> ZipInfo:
 
 
 def part_of(episode: int) -> str:
-    """Return the name of a layout's file in a working folder."""
+    """Return the file name of a layout in a working folder: `00042.zip` for episode 42."""
     return f"{episode:05d}.zip"
 
 
 def named(episode: int) -> str:
-    """Return a layout's name for people."""
+    """Return how messages name a layout: `layout 42` for episode 42."""
     return f"layout {episode}"
 
 

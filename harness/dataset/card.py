@@ -39,7 +39,7 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 
 @dataclass(frozen=True)
 class Table:
-    """A published dataset as it was written."""
+    """Describe a Parquet table of a published dataset: its source, size and reference results."""
 
     manifest: Manifest  # of the frozen dataset
     dataset_sha256: str  # digest of the frozen dataset's manifest
@@ -70,13 +70,14 @@ class Table:
 
 
 def path_of(name: str) -> str:
-    """Return the place of a table in its folder."""
+    """Return the path of a dataset's Parquet file within the published folder."""
     return f"data/{name}.parquet"
 
 
 def readme(name: str, tables: Sequence[Table]) -> str:
-    """Return the card. Texts of a manifest stand in it quoted,
-    so none of them adds a key or a heading.
+    """Return the card (YAML and Markdown) of published tables.
+
+    Texts from a manifest are quoted, so that none of them adds a key or a heading.
     """
     released = all(t.released for t in tables)
     head = _front_matter(name, tables)
@@ -129,7 +130,7 @@ def _cells(t: Table) -> Sequence[object]:
 
 
 def limits(tables: Sequence[Table]) -> Iterator[str]:
-    """Yield what the tables are not good for, a sentence or two each."""
+    """Yield sentences, for a card, that say what the tables must not be used for."""
     splits = {t.split for t in tables}
     if SPLITS["report"] in splits:
         yield (
@@ -168,8 +169,9 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
 
 
 def croissant(name: str, tables: Sequence[Table]) -> str:
-    """Return the Croissant file: each Parquet file with its digest,
-    and each column with its meaning.
+    """Return the Croissant 1.0 description (JSON-LD) of published tables.
+
+    It has each Parquet file with its digest, and each column with its meaning.
     """
     document = {
         "@context": _CONTEXT,
@@ -258,7 +260,7 @@ def _references(tables: Sequence[Table]) -> Iterator[str]:
 
 
 def hub_size(rows: int) -> str:
-    """Return the hub's word for a number of rows, such as `10K<n<100K`."""
+    """Return the Hugging Face hub's size category of a number of rows, such as `10K<n<100K`."""
     words = [f"{n // 10**6}M" if n >= 10**6 else f"{n // 1000}K" for n in SIZES]
     reached = sum(rows >= least for least in SIZES)
     if not reached:

@@ -32,8 +32,10 @@ from harness.world.parameters import Parameters
 
 @dataclass(frozen=True)
 class Forest:
-    """E trees with N decision points and A actions;
-    within a tree, decision points are ordered by level.
+    """Hold E decision trees with N decision points and A actions as arrays, and derive values.
+
+    Decision points are numbered tree by tree, and within a tree by step. An edge is what one or
+    several equivalent actions do at a decision point: it leads to another one or ends the episode.
     """
 
     actions: tuple[str, ...]  # the meta-actions
@@ -56,7 +58,7 @@ class Forest:
     def of(
         cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters
     ) -> "Forest":
-        """Return the arrays of some trees of one scenario, with its actions and parameters."""
+        """Return the arrays of trees of one scenario, which has these actions and parameters."""
         action_index = {action: n for n, action in enumerate(actions)}
         points: list[Branching] = []
         roots, tree_of_point, step_of_point = list[int](), list[int](), list[int]()
@@ -101,12 +103,15 @@ class Forest:
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """The index of each decision point by its id."""
+        """Index of each decision point by its scene id."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
     def cleared_s(self) -> Floats:
-        """When each edge reaches the goal, (edges,); inf if it ends otherwise or leads on."""
+        """Time (s) at which each edge reaches the goal, (edges,).
+
+        inf if it ends otherwise or leads to another decision point.
+        """
         times_s = np.full(len(self.edges), np.inf)
         for n, edge in enumerate(self.edges):
             if edge.end and edge.end.result == "cleared":
@@ -115,15 +120,13 @@ class Forest:
 
     @cached_property
     def harms(self) -> Bools:
-        """Whether each edge ends in a collision or off the road, (edges,)."""
+        """Whether each edge ends the episode in a collision or off the road, (edges,)."""
         ends = [edge.end for edge in self.edges]
         return np.array([end is not None and RATINGS[end.result] == "unsafe" for end in ends])
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
-        """How near others come to the ego in time on each edge, (edges,),
-        as columns of decisions.
-        """
+        """Least TTC and PET on each edge, as `conflict_measures.columns`, each (edges,)."""
 
         def number(measure_s: float | UnsetType | None) -> float:
             if measure_s is UNSET:
@@ -136,9 +139,7 @@ class Forest:
 
     @cached_property
     def earliest_s(self) -> Floats:
-        """The earliest time at which the goal can be reached after each action, (N, A);
-        inf for never.
-        """
+        """Earliest time (s) at which the goal can be reached after each action, (N, A), or inf."""
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
             leads = self.child[rows] >= 0
@@ -148,9 +149,7 @@ class Forest:
 
     @cached_property
     def avoids_harm(self) -> Bools:
-        """Whether an end without a collision and on the road is still possible after each action,
-        (N, A).
-        """
+        """Whether collision and leaving the road can still be avoided after each action, (N, A)."""
         avoids = ~self.harms[self.edge]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -159,19 +158,20 @@ class Forest:
 
     @cached_property
     def miss(self) -> Bools:
-        """Whether harm is inevitable after each action, though it was not before, (N, A)."""
+        """Whether each action makes harm inevitable that could be avoided before it, (N, A)."""
         return np.asarray(self.avoids_harm.any(axis=-1, keepdims=True) & ~self.avoids_harm)
 
     @cached_property
     def false_alarm(self) -> Bools:
-        """Whether each action gives success away,
-        though harm can still be avoided after it, (N, A).
+        """Whether each action makes success impossible by time alone, (N, A).
+
+        Success was possible before it, and a collision can still be avoided after it.
         """
         return np.asarray(self.value[:, None] & ~self.safe & self.avoids_harm)
 
     @cached_property
     def then_full_view(self) -> Ints:
-        """The last edge after each action if the full-view driver decides from there, (N, A)."""
+        """Last edge of the episode after each action if the full-view driver goes on, (N, A)."""
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -185,38 +185,41 @@ class Forest:
 
     @cached_property
     def reference_s(self) -> Floats:
-        """When the full-view driver reaches the goal, (E,); inf for never."""
+        """Time (s) at which the full-view driver reaches the goal in each tree, (E,), or inf."""
         return self.cleared_s[self.last_edge(self.drivers[PRIVILEGED])]
 
     @cached_property
     def limit_s(self) -> Floats:
-        """The latest time of a success, (E,): the time limit if the full-view driver fails."""
+        """Latest time (s) of an arrival that is a success, (E,).
+
+        It is the full-view driver's time plus the allowance, but at most the time limit.
+        """
         return np.minimum(self.reference_s + self.allowance_s, self.time_limit_s) + ROUNDING_S
 
     @cached_property
     def safe(self) -> Bools:
-        """Whether success is still possible after each action, (N, A)."""
+        """Whether the episode can still succeed after each action, (N, A)."""
         return self._in_time(self.earliest_s, self.limit_s[self.tree][:, None])
 
     @cached_property
     def value(self) -> Bools:
-        """Whether success is possible at each decision point, (N,):
-        whether the best policy succeeds.
+        """Whether the episode can still succeed at each decision point, (N,).
+
+        It is what the best policy achieves.
         """
         return np.asarray(self.safe.any(axis=-1))
 
     @cached_property
     def delay_s(self) -> Floats:
-        """The seconds by which a safe action puts off the earliest success, (N, A);
-        NaN if it is not safe.
-        """
+        """How much (s) each action puts off the earliest arrival, (N, A); NaN if it is not safe."""
         soonest_s = self.earliest_s.min(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             return np.where(self.safe, self.earliest_s - soonest_s, np.nan)
 
     def last_edge(self, chosen: Ints) -> Ints:
-        """Return the edge at which each episode ends, (E,),
-        if `chosen` (N,) is taken at each point.
+        """Return the edge at which each episode ends, (E,), if a fixed policy decides.
+
+        `chosen` has the index of the action taken at each decision point, (N,).
         """
         at, last = self.root.copy(), np.full(len(self.root), -1)
         while (undecided := at >= 0).any():
@@ -226,8 +229,9 @@ class Forest:
         return last
 
     def visited(self, chosen: Ints) -> Ints:
-        """Return the decision points that the episodes visit, ascending,
-        if `chosen` (N,) is taken.
+        """Return the indices of the decision points that a fixed policy visits, ascending.
+
+        `chosen` has the index of the action taken at each decision point, (N,).
         """
         visited, at = [], self.root
         while len(at):
@@ -237,7 +241,7 @@ class Forest:
         return np.sort(np.concatenate(visited))
 
     def succeeds(self, edge: Ints, tree: Ints) -> Bools:
-        """Return whether ending at an edge (...) is a success in its tree (...)."""
+        """Return whether an episode of a tree that ends at an edge succeeds; all are (...)."""
         return self._in_time(self.cleared_s[edge], self.limit_s[tree])
 
     @staticmethod
@@ -245,7 +249,7 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """Return how the episode ends at an edge that ends it."""
+        """Return how the episode ends at an edge; the edge must be a last one."""
         end = self.edges[edge].end
         assert end is not None
         return end
@@ -259,14 +263,16 @@ class Forest:
         return self._success(np.full(len(self.tree), self.actions.index(action)))
 
     def sequence_success(self, actions: Sequence[str]) -> Bools:
-        """Return whether an ego that takes one action after the other, and then the last,
-        succeeds, (E,).
+        """Return whether an ego that takes these actions in turn succeeds in each episode, (E,).
+
+        After the last one it takes this again.
         """
         return self._success(self.sequence(actions))
 
     def sequence(self, actions: Sequence[str]) -> Ints:
-        """Return what is taken at each point, (N,):
-        one action after the other, then the last again.
+        """Return the action index at each decision point if actions are taken in turn, (N,).
+
+        The nth action is for step n; after the last one it is taken again.
         """
         indices = np.array([self.actions.index(action) for action in actions])
         return np.asarray(indices[np.minimum(self.step, len(indices) - 1)])
@@ -275,23 +281,19 @@ class Forest:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 
     def uniform_success(self) -> Floats:
-        """Return with what probability each episode succeeds, (E,),
-        if every action is equally likely.
-        """
+        """Return the probability of success of each episode under uniform random actions, (E,)."""
         return np.asarray(self.worth[self.root].mean(axis=-1))
 
     @cached_property
     def worth(self) -> Floats:
-        """The `chance` of each action if all later ones are drawn evenly, (N, A);
-        0 if none saves it.
-        """
+        """Probability of success after each action if later ones are drawn uniformly, (N, A)."""
         return self.chance(np.ones(self.child.shape))
 
     def chance(self, policy: Floats) -> Floats:
-        """Return with what probability an episode succeeds after each action, (N, A).
+        """Return the exact probability of success after each action under a policy, (N, A).
 
-        What follows is drawn by a policy's weights of the actions at each decision point, (N, A). A
-        pass from the leaves backwards gives that exactly: no action is drawn.
+        `policy` has the weights of the actions at each decision point, (N, A), by which later
+        actions are drawn; they need not sum to 1.
         """
         chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)
         for rows in self._levels_backwards():

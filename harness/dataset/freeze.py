@@ -26,17 +26,16 @@ from harness.world.world import Target, World
 
 
 class Frozen(NamedTuple):
-    """A layout's decision tree, and the scene of each of its decision points,
-    both level by level.
-    """
+    """Hold a layout's decision tree and the record of each decision point, both by step."""
 
-    branchings: list[list[Branching]]
-    scenes: list[list[Record]]
+    branchings: list[list[Branching]]  # by step: what each action does at each decision point
+    scenes: list[list[Record]]  # by step: state and scene graphs of each decision point
 
 
 def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
-    """Return the decision trees of some layouts, whose seeds are by episode,
-    in the order of the episodes.
+    """Simulate and return the decision tree of each layout, in the order of `seeds`.
+
+    `seeds` has the layout seed of each episode number.
     """
     level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
     trees = {episode: Frozen([], []) for episode in seeds}
@@ -63,10 +62,11 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
 def edges(
     worlds: Sequence[World], episodes: Sequence[int]
 ) -> tuple[list[list[Edge]], list[tuple[int, World]]]:
-    """Return where each action leads from the decision points of a step,
-    and the points that follow.
+    """Simulate every action at the decision points of one step.
 
-    The points that follow stand beside their episode; edges count those of their own episode.
+    `worlds` are the decision points, of the `episodes` given beside them. Returned are the edges of
+    each, and the distinct decision points of the next step, each as (episode, world). `Edge.to`
+    counts the next points of the same episode.
     """
     waiting = [world.branch() for world in worlds]
     p = worlds[0].scenario.parameters
@@ -143,10 +143,10 @@ def _drivers(
 def record_of(
     world: World, state: WorldState, episode: int, viewers: Sequence[VehicleState]
 ) -> Record:
-    """Return a decision point's state, and what the viewers see of it;
-    the ego is the first of them.
+    """Return a decision point's state with the scene graphs of its viewers, as a dataset has it.
 
-    Distances to the conflict zone and to the ego are as the ego knows them.
+    The ego is the first viewer. Distances to the conflict zone and to the ego are as the ego knows
+    them from beacons.
     """
     [record] = records_of(world.scenario, [(world, state, episode, viewers)])
     return record
@@ -155,7 +155,7 @@ def record_of(
 def records_of(
     scenario: Scenario, points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]
 ) -> list[Record]:
-    """Return the record of some decision points of one scenario."""
+    """Return `record_of` for each decision point: its world, state, episode number and viewers."""
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
     graphs, zone_m = iter(scene_graphs(scenario, looks)), scenario.road().zone_m
     records = []

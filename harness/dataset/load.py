@@ -47,13 +47,13 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 
 @dataclass(frozen=True)
 class Scene:
-    """One decision point, frozen."""
+    """Hold one decision point of a dataset or of a drive: its state and its scene graphs."""
 
     record: Record  # its record in the dataset
     # results computed from it, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     seat: Scenario | None = None  # the scenario of who decides, if that is an agent on a seat
-    agent: int = 0  # its place among the vehicles that answer; the ego is at 0
+    agent: int = 0  # index of who decides among the vehicles that can be asked; the ego has 0
     several: bool = False  # whether vehicles beside the ego can decide in this scenario
 
     @property
@@ -75,15 +75,19 @@ class Scene:
         return tuple(self.graphs)
 
     def viewer(self, name: str | None) -> str:
-        """Return a viewer's id, the ego's for None.
-        Raises UserError if nobody of that name answers here.
+        """Return a viewer's id: `name` itself, or the ego's for None.
+
+        Raises UserError if no viewer of this scene has that name.
         """
         if name is not None and name not in self.viewers:
             raise unknown(f"viewer of scene {printable(self.id, 40)}", name, self.viewers)
         return self.viewers[0] if name is None else name
 
     def place(self, viewer: int) -> int:
-        """Return the place of a viewer among the vehicles that answer, whoever decides."""
+        """Return the index of the nth viewer among the vehicles that can be asked.
+
+        Viewers begin with the agent that decides, and vehicles with the ego; `viewer` is n.
+        """
         if not viewer:
             return self.agent
         return viewer if viewer > self.agent else viewer - 1
@@ -94,12 +98,18 @@ class Scene:
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
-    """Return the scenarios of who decides in some scenes, each with the places of its scenes."""
+    """Return the indices of scenes by the scenario of the agent that decides in them.
+
+    That scenario is `scenario` where the ego decides.
+    """
     return places_by(scene.seat or scenario for scene in scenes)
 
 
 class Trees(Sequence[Tree]):
-    """The decision trees of the episodes `numbers`, by index; each is read on use by its number."""
+    """Sequence of the decision trees of the episodes `numbers`, each read when it is used.
+
+    `read` returns the tree of an episode number.
+    """
 
     def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
         self.numbers, self.read = tuple(numbers), read
@@ -114,7 +124,7 @@ class Trees(Sequence[Tree]):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A verified dataset; its trees and scenes are read and verified on use."""
+    """Hold a verified dataset; its trees and scenes are read and verified when they are used."""
 
     path: Path  # the dataset's folder
     manifest: Manifest  # its manifest
@@ -134,7 +144,7 @@ class Dataset:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The frozen scenario, with the parameters that it had then."""
+        """The scenario, with the parameters with which the dataset was built."""
         return scenario_of(self.manifest)
 
     @property
@@ -166,7 +176,7 @@ class Dataset:
 
     @property
     def lost(self) -> int:
-        """In how many episodes the ego collides before its first action, whatever that is."""
+        """Number of episodes in which the ego collides before its first action can act."""
         lag_s, forest = self.scenario.parameters.decision_lag_s, self.forest
         before_any = np.zeros(len(forest.edges), dtype=bool)  # whether each edge ends so
         for n, edge in enumerate(forest.edges):
@@ -177,7 +187,7 @@ class Dataset:
         return int(before_any[first_edges].all(axis=1).sum())
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """Return the dataset with those of its episodes that have these numbers."""
+        """Return this dataset restricted to the episodes with these numbers."""
         if len(numbers) == len(self.episodes) and set(numbers) == set(self.episodes):
             return self
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
@@ -185,15 +195,14 @@ class Dataset:
 
     @property
     def whole(self) -> "Dataset":
-        """The dataset with all of its episodes."""
+        """This dataset with all episodes of its folder."""
         return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
 
     def reference_success(self) -> dict[str, Floats]:
-        """Return the success of each reference in each episode, (E,):
-        0 or 1, of `uniform` its probability.
+        """Return the success of each reference policy in each episode, (E,), by name.
 
-        The references are the drivers, `uniform`,
-        and where their actions are known `constant`, `open-loop`.
+        It is 0 or 1, and for `uniform` a probability. References are the drivers, `uniform`, and
+        where their actions are known `constant` and `open-loop`.
         """
         parts: dict[str, list[Floats]] = {}
         action, actions = constant(self.scenario), open_loop(self.scenario)
@@ -210,8 +219,9 @@ class Dataset:
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
-        """Return decision points' scenes.
-        Raises UserError for a damaged one, KeyError for an unknown id.
+        """Return the scenes with these ids, read from the folder where needed.
+
+        Raises UserError for a damaged one and KeyError for an unknown id.
         """
         missing: dict[tuple[int, int], list[int]] = {}  # indices within each level of each tree
         for name in ids:
@@ -267,7 +277,10 @@ class Dataset:
                 yield record
 
     def scene(self, scene_id: str) -> Scene:
-        """Return the scene with this id, or with the only id that begins like this."""
+        """Return the scene with this id, or with the only id that begins like this.
+
+        Raises UserError if there is none, or several.
+        """
         ids = self.forest.ids
         matches = [name for name in ids if name.startswith(scene_id)] if scene_id else []
         if len(matches) != 1:
@@ -277,15 +290,16 @@ class Dataset:
         return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
-        """Return the ids of the decision points that the reference drivers visit."""
+        """Return the ids of all decision points that some reference driver visits."""
         forest = self.forest
         visited = [forest.visited(chosen) for chosen in forest.drivers.values()]
         return tuple(forest.ids[n] for n in np.unique(np.concatenate(visited)).tolist())
 
 
 def find(name: str) -> Path:
-    """Return the folder of a dataset, given by its path,
-    or by its name if it is shipped or the project's.
+    """Return the folder of a dataset, given by its path or by its name.
+
+    A name is one that ships or the project's. Raises UserError if there is no such dataset.
     """
     if os.path.isdir(name):  # unlike Path.is_dir, false for a name too long to be one
         sayable("dataset", os.path.basename(name))
@@ -307,8 +321,9 @@ def find(name: str) -> Path:
 
 
 def argument(path: Path) -> str:
-    """Return what finds a dataset again:
-    its name, else its path, relative if below the current folder.
+    """Return the text by which `find` finds a dataset's folder again: its name, or else its path.
+
+    The path is relative if the folder is below the current one.
     """
     try:
         if find(path.name).resolve() == path.resolve():
@@ -320,9 +335,7 @@ def argument(path: Path) -> str:
 
 
 def released() -> dict[str, str]:
-    """Return the digest of each released dataset's manifest by name,
-    from `datasets/released.toml`.
-    """
+    """Return the manifest digest of each released dataset by name (`datasets/released.toml`)."""
     pins = folder("datasets") / "released.toml"
     return tomllib.loads(text_of(pins)) if pins.is_file() else {}
 

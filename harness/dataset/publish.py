@@ -36,19 +36,20 @@ def publish(
     progress: Progress,
     suite: str | None = None,
 ) -> Sequence[Table]:
-    """Write the tables of some datasets, their card and their Croissant file to a new folder.
+    """Write datasets as Parquet tables, with a card and a Croissant file, to a new folder.
 
     Equal datasets and prompts give equal bytes, with one version of the harness and of Arrow.
 
     Args:
         folders: of the datasets; one is in memory at a time.
         out: the folder, which exists only once it is complete.
-        ask: of a scenario, the prompt version and what asks by it.
+        ask: returns, for a scenario, the name of the prompt version and a function from a scene
+            graph to the chat messages that ask its viewer.
         progress: counts layouts.
-        suite: how the datasets together are named; by the first of them if None.
+        suite: the name of all datasets together; that of the first one if None.
 
-    Raises UserError if the folder is there, the name will not do, two datasets have one name, or
-    one is damaged, and OSError if the folder cannot be written.
+    Raises UserError if the folder exists, a name is not allowed, two datasets have one name, or one
+    is damaged, and OSError if the folder cannot be written.
     """
     refuse_taken("--out", out)
     manifests = [read_manifest(folder)[0] for folder in folders]

@@ -28,13 +28,13 @@ BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the w
 
 
 def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
-    """Raise UserError unless a dataset's layouts are those of its seeds, and no reported ones.
+    """Raise UserError unless a dataset is what its seeds give, and shares no layout with test data.
+
+    Layouts are rebuilt in the simulator, some of them; without the simulator this is skipped.
 
     Args:
-        dataset: one that something learns from, or is chosen by. A released one is known.
-        others: those that numbers of the same command are reported of, beside all that ship.
-
-    Where the simulator is not installed nothing is rebuilt.
+        dataset: one that something is trained on or chosen by; a released one always passes.
+        others: datasets on which the same command reports results, beside all that ship.
     """
     if dataset.trusted:
         return
@@ -44,7 +44,11 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
 
 
 def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
-    """Raise UserError if a dataset has a first scene of others, that numbers are reported of."""
+    """Raise UserError if a dataset shares a first scene with `others`, on which results are
+    reported.
+
+    Scenes are equal if their vehicles agree to 0.01 in all numbers, whatever their seeds.
+    """
     starts = _starts(dataset)
     for other in others:
         other_starts = _starts(other)
@@ -58,10 +62,10 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
 
 
 def differences(dataset: Dataset) -> Iterator[str]:
-    """Yield which layouts of a dataset are not those of the seeds that it states.
+    """Yield a line if layouts of a dataset are not those of the seeds that it states.
 
-    None where the simulator is not installed.
-    If layouts begin as they should, a few are built whole.
+    The first scene of up to `BEGUN` layouts is rebuilt, then up to `REBUILT` whole trees. Nothing
+    is yielded if the simulator is not installed.
     """
     if find_spec("highway_env") is None:
         return
@@ -78,7 +82,7 @@ def differences(dataset: Dataset) -> Iterator[str]:
 
 
 def drawn(dataset: Dataset, count: int) -> list[int]:
-    """Draw layouts, always the same of a dataset on a machine."""
+    """Draw up to `count` episode numbers of a dataset, always the same on one machine."""
     return spot_check(dataset.episodes, dataset.sha256, count)
 
 

@@ -33,26 +33,25 @@ SceneId = Annotated[str, Meta(pattern="^[0-9]{5}-[0-9]-[0-9a-f]{12}$")]
 
 
 def scene_id(episode: int, state: WorldState) -> str:
-    """Return `<episode>-<step>-<digest>`;
-    equal states have equal ids, frozen and in the closed loop.
-    """
+    """Return a decision point's id, `<episode>-<step>-<digest>`; equal states have equal ids."""
     return f"{episode:05d}-{state.step}-{digest(msgspec.to_builtins(state))[:12]}"
 
 
 class Road(Closed, frozen=True):
-    """What the scenario says of its road."""
+    """Facts about the scenario's road: texts, and numbers with the unit in the name."""
 
 
 class Danger(Closed, frozen=True):
-    """The vehicle that the layout sends against the ego, if any."""
+    """The vehicle that the layout sends against the ego, and its sector; null if there is none."""
 
     sector: str | None
     vehicle: VehicleId | None
 
 
 class Record(Closed, frozen=True):
-    """A decision point: a line of `<episode>/<step>.jsonl`.
-    `record_type` has a scenario's own names.
+    """A decision point as a line of `<episode>/<step>.jsonl`; it has state and scene graphs.
+
+    `record_type` narrows it to a scenario's names of paths and sectors.
     """
 
     scene: SceneId  # `<episode>-<step>-<digest>`
@@ -72,13 +71,13 @@ class Record(Closed, frozen=True):
 
 
 class EnvironmentRecord(Record, frozen=True):
-    """A decision point of a highway-env environment, whose state is the actions taken so far."""
+    """A decision point of a highway-env environment, whose snapshot is the actions taken so far."""
 
     snapshot: ActionsTaken | UnsetType = UNSET  # type: ignore[assignment]
 
 
 class End(Closed, frozen=True):
-    """How an episode ended."""
+    """How an episode ended: result, time, and of a collision the other vehicle and the fault."""
 
     result: Literal["cleared", "collision", "time_out", "off_road"]
     time_s: Number
@@ -88,11 +87,11 @@ class End(Closed, frozen=True):
 
 
 class Edge(Closed, frozen=True):
-    """Where actions lead that come to the same, and what happens on the way.
+    """What one or several equivalent actions do at a decision point, and what happens on the way.
 
     Attributes:
-        actions: meta-actions.
-        to: place of the next decision point in the next level; None where the episode ends.
+        actions: meta-actions that have the same effect here.
+        to: index of the next decision point in the next level; None where the episode ends.
         end: how it ends; None where it goes on.
         least_gap_m: smallest distance to another vehicle's outline on the way.
         hard_brakings: times the ego begins to brake harder than 4 m/s² on the way.
@@ -113,9 +112,7 @@ class Edge(Closed, frozen=True):
 
 
 class Branching(Closed, frozen=True):
-    """A decision point in its tree: what each reference driver does there,
-    and where actions lead.
-    """
+    """A decision point in its tree: what each reference driver does, and what actions lead to."""
 
     scene: SceneId
     drivers: dict[str, Text]
@@ -123,10 +120,10 @@ class Branching(Closed, frozen=True):
 
 
 class Tree(Closed, frozen=True):
-    """Every course of a layout: `<episode>/tree.json` in `layouts.zip`.
+    """The decision tree of a layout, with all action sequences: `<episode>/tree.json`.
 
     Attributes:
-        episode: its number.
+        episode: number of the episode.
         episode_seed: seed of the layout.
         danger: the vehicle that the layout sends against the ego, if any.
         levels: decision points by step; the first level is the start alone.
@@ -141,10 +138,9 @@ class Tree(Closed, frozen=True):
 
 
 class Manifest(Closed, frozen=True):
-    """`manifest.json`: what a dataset was built from,
-    and the sha256 of every file and of every tree.
+    """The content of `manifest.json`: how a dataset was built, and digests of its files and trees.
 
-    Of an environment it holds the whole configuration.
+    For an environment of highway-env it holds the whole configuration.
     """
 
     format: Literal["swarmdrive-dataset/2"]
@@ -163,14 +159,15 @@ class Manifest(Closed, frozen=True):
 
 
 def plain_type(scenario: Scenario) -> type[Record]:
-    """Return the type of a scenario's records, which allows any names in them."""
+    """Return the type of a scenario's records that allows any names of paths and sectors."""
     return EnvironmentRecord if scenario.is_environment else Record
 
 
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
-    """Return `Record` narrowed to the approaches, routes,
-    sectors and facts of the scenario's road.
+    """Return the type of a scenario's records, narrowed to the names of the road's paths.
+
+    The names of its sectors and facts are those of the scenario, too.
     """
     road = scenario.road()
     approach = _choice(approach for approach, _ in road.paths)
@@ -219,17 +216,17 @@ def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
 
 
 def record_schema(scenario: Scenario) -> dict[str, Any]:
-    """Return the JSON Schema of one line of an `<episode>/<step>.jsonl`."""
+    """Return the JSON Schema of a line of `<episode>/<step>.jsonl`: a decision point."""
     return _published(record_type(scenario), "decision point")
 
 
 def tree_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a `tree.json`."""
+    """Return the JSON Schema of `tree.json`: a layout's decision tree."""
     return _published(Tree, "decision tree of a layout")
 
 
 def manifest_schema() -> dict[str, Any]:
-    """Return the JSON Schema of `manifest.json`."""
+    """Return the JSON Schema of `manifest.json`: how a dataset was built."""
     return _published(Manifest, "dataset manifest")
 
 

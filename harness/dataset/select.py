@@ -16,7 +16,7 @@ NONE = "none"  # the `danger` of layouts without one
 
 @dataclass(frozen=True)
 class Selection:
-    """Conditions that an episode must all meet; without any, all episodes are selected."""
+    """State which episodes of a dataset to evaluate; one must meet all conditions that are set."""
 
     limit: int | None = None  # keeps the first so many of those that the other conditions leave
     only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end
@@ -39,8 +39,9 @@ class Selection:
         return conditions
 
     def of(self, dataset: Dataset) -> Dataset:
-        """Return the dataset with only these episodes.
-        Raises UserError for none, or an unknown danger.
+        """Return the dataset restricted to the selected episodes.
+
+        Raises UserError if there are none, or the danger is unknown.
         """
         numbers = list(dataset.episodes)
         if self.only is not None:
@@ -66,8 +67,10 @@ ALL = Selection()
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
-    """Draw some of the episodes' numbers, all below `end`.
-    Raises UserError if there are too few.
+    """Draw `sample` of the episode numbers, without replacement, and return them sorted.
+
+    All are below `end`. A larger sample of the same seed contains a smaller one. Raises UserError
+    if there are too few.
     """
     if not 1 <= sample <= len(numbers):
         raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")
@@ -96,13 +99,10 @@ def _numbers(text: str, end: int) -> set[int]:
 
 
 def spot_check(items: Sequence[T], sha256: str, most: int) -> list[T]:
-    """Draw some of the items of a file, always the same on a machine;
-    who made the file does not know them.
+    """Draw up to `most` items of a file, always the same on one machine.
 
-    Args:
-        items: what is drawn from.
-        sha256: digest of the file.
-        most: how many, where there are as many.
+    The draw is keyed by the file's digest `sha256` and the machine's name, so that whoever made the
+    file cannot know which items are checked.
     """
     draw = random.Random(f"{sha256} {platform.node()}")
     return draw.sample(items, min(most, len(items)))

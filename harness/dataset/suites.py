@@ -17,7 +17,7 @@ PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
 
 class Suite(Struct, frozen=True, forbid_unknown_fields=True):
-    """One suite."""
+    """Describe a suite: datasets of several scenarios that are evaluated together."""
 
     name: str  # the suite's name
     description: str  # its purpose
@@ -28,7 +28,7 @@ class Suite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def named(text: str) -> Suite | None:
-    """Return the suite that `suite:NAME` names, shipped or the project's; None for any other text.
+    """Return the suite that a text `suite:NAME` names, shipped or the project's; else None.
 
     Raises UserError if there is no such suite, or two, or its table is wrong.
     """
@@ -63,7 +63,8 @@ def named(text: str) -> Suite | None:
 
 
 def datasets(text: str) -> Sequence[str]:
-    """Return the datasets that `--dataset` names: those of a suite, or one.
+    """Return the dataset names that `--dataset` gives: those of a suite, or the one.
+
     Raises what `named` raises.
     """
     suite = named(text)

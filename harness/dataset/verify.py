@@ -43,7 +43,10 @@ LARGEST_ENTRY = 1 << 28  # bytes
 
 
 def read_manifest(path: Path) -> tuple[Manifest, str]:
-    """Read a dataset's manifest and its digest. Raises UserError if it is missing or wrong."""
+    """Read the manifest of a dataset's folder; return it and its digest.
+
+    Raises UserError if it is missing or wrong.
+    """
     file = path / "manifest.json"
     try:
         data = bytes_of(file, "record")
@@ -112,7 +115,10 @@ def scenario_of(manifest: Manifest) -> Scenario:
 
 
 def check(path: Path) -> list[str]:
-    """Return everything that is wrong with a dataset, one line each; empty if it is sound."""
+    """Return all problems of the dataset in a folder, one line each; empty if it is sound.
+
+    Raises UserError if the manifest is missing or wrong.
+    """
     manifest, _ = read_manifest(path)
     problems, nodes = list(file_problems(path, manifest)), 0
     try:
@@ -142,7 +148,7 @@ def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[s
 
 
 def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
-    """Yield a line for each file of the manifest that is missing or changed."""
+    """Yield a line for each file of the manifest that is missing or whose digest differs."""
     for name, expected in manifest.files.items():
         if not (path / name).is_file():
             yield f"{name}: missing"
@@ -151,13 +157,14 @@ def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
 
 
 class Damaged(Exception):
-    """A part of a dataset is not what was pinned; the message says how."""
+    """Report that a part of a dataset is missing, broken or differs from its digest."""
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
-    """Open a dataset's layouts. Digests pin the content;
-    the compressed bytes may differ by machine.
+    """Open the archive `layouts.zip` of a dataset's folder; its entries are not yet verified.
+
+    Raises UserError if it cannot be read.
     """
     file = path / LAYOUTS
     try:
@@ -208,7 +215,10 @@ def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
 
 
 def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = False) -> Tree:
-    """Read an episode's tree. Raises Damaged if it is not the manifest's, or is broken."""
+    """Read an episode's decision tree. Raises Damaged if its digest or content is wrong.
+
+    The content of a `trusted` dataset is not checked beyond its digest and types.
+    """
     name = tree_name(episode)
     data = _entry(file, name, manifest.trees_sha256[episode])
     try:
@@ -223,8 +233,9 @@ def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = F
 
 
 def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
-    """Read the scenes of one level of a tree, one line each, in the level's order.
-    Raises Damaged.
+    """Read the scenes of one step of a tree as JSON lines, in the order of its decision points.
+
+    Raises Damaged if the digest or the number of lines is wrong.
     """
     name = level_name(tree.episode, step)
     lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
@@ -236,17 +247,20 @@ def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
 
 
 def tree_name(episode: int) -> str:
-    """Return the name of a tree in `layouts.zip`."""
+    """Return the name of an episode's tree in `layouts.zip`."""
     return f"{episode:05d}/tree.json"
 
 
 def level_name(episode: int, step: int) -> str:
-    """Return the name of a level's scenes in `layouts.zip`."""
+    """Return the name, in `layouts.zip`, of the file with the scenes of one step of an episode."""
     return f"{episode:05d}/{step}.jsonl"
 
 
 def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str]:
-    """Return where a tree contradicts itself or the manifest in ways that no type can state."""
+    """Return how a tree contradicts itself or the manifest, one phrase each.
+
+    `number` is the episode's. Types are checked elsewhere.
+    """
     actions = Counter(manifest.actions)
     points = [point for level in tree.levels for point in level]
     edges = [edge for point in points for edge in point.edges]
@@ -292,8 +306,10 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
 
 
 def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
-    """Return a scene's record and what is wrong with it;
-    the record is usable only if nothing is.
+    """Decode a scene's JSON line; return the record, and a line for each problem.
+
+    The record is None if it cannot be decoded, and may be used only if there is no problem. `name`
+    is the scene id that it should have.
     """
     scenario = scenarios.get(manifest.scenario)
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
@@ -308,7 +324,7 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
 
 
 def unusable(path: Path, problem: str) -> UserError:
-    """Return the error for a dataset with a problem."""
+    """Build the UserError for a dataset that has a problem."""
     return UserError(
         f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or "
         "rebuild it"
@@ -316,7 +332,10 @@ def unusable(path: Path, problem: str) -> UserError:
 
 
 def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
-    """Return in one line what in a JSON text does not fit a type."""
+    """Return in one line where a JSON text does not fit a type.
+
+    `error` is msgspec's, which is used if no better words are found; `what` names the text.
+    """
     try:
         if isinstance(table := _JSON.decode(text), dict):
             convert(table, kind, what)
@@ -328,7 +347,10 @@ def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -
 
 
 def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name: str) -> list[str]:
-    """Return where a record contradicts itself or the manifest in ways that no type can state."""
+    """Return how a record contradicts itself, its scenario or the manifest, one phrase each.
+
+    `name` is the scene id that it should have.
+    """
     state, graphs = record.state, record.graphs
     ids = [v.id for v in state.vehicles]
     viewers = {v.id for v in state.vehicles if v.part != "other"}
