@@ -23,7 +23,11 @@ FIRST: Mapping[str, int] = MappingProxyType({})  # the choice of the first alter
 
 
 class Mark(NamedTuple):
-    """A mark in a template's text."""
+    """Describe a mark in a template: alternatives to choose from, or parts to put in some order.
+
+    `start` and `end` are its span in the text. It is written `{% either name %}A{% or %}B{%
+    endeither %}`, or with `order`.
+    """
 
     start: int
     end: int
@@ -33,7 +37,7 @@ class Mark(NamedTuple):
 
     @property
     def choices(self) -> int:
-        """How many alternatives it has."""
+        """Number of alternatives: that of the parts, or of their permutations."""
         return factorial(len(self.parts)) if self.order else len(self.parts)
 
     def alternative(self, number: int) -> str:
@@ -62,8 +66,9 @@ def _marks(text: str) -> Iterator[Mark]:
 
 
 def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
-    """Return a template's text with each mark replaced by the alternative of this number,
-    from 0.
+    """Return a template's text with each mark replaced by one of its alternatives.
+
+    `choice` has the number of the alternative, from 0, by the mark's name; others take the first.
     """
     pieces, place = [], 0
     for mark in _marks(text):
@@ -73,9 +78,9 @@ def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
 
 
 def counts(texts: Iterable[str]) -> dict[str, int]:
-    """Return how many alternatives each mark of some templates has, by name.
+    """Return the number of alternatives of each mark in some templates, by the mark's name.
 
-    Raises ValueError if a mark cannot be chosen from.
+    Raises ValueError if a mark has one alternative, too many parts, or differing numbers of them.
     """
     sizes: dict[str, int] = {}
     for text in texts:

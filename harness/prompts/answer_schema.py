@@ -23,7 +23,7 @@ EVIDENCE_CHARS = 200
 
 
 class Shape(NamedTuple):
-    """What decides the JSON of an answer."""
+    """Describe what an answer's JSON must look like; it decides the schema and the parser."""
 
     role: str  # `ego` or `helper`
     actions: tuple[str, ...]  # meta-action names, in the environment's order
@@ -40,7 +40,7 @@ class Shape(NamedTuple):
 
     @property
     def named(self) -> str | None:
-        """The key of the action that its form names, with a confidence; None for a distribution."""
+        """Key of the action that the answer names with a confidence; None for a distribution."""
         return None if self.form == "distribution" else NAMED[self.role]
 
     @property
@@ -58,8 +58,9 @@ def answer_schema(
 ) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
 
-    An answer has one of two forms: a distribution, or one action with a confidence. `scenario`
-    stands in the title only, and `placeholders` nowhere. Raises UserError for an unknown role.
+    An answer has one of two forms: a distribution over the actions, or one action with a
+    confidence. `scenario` is in the title only, and `placeholders` nowhere. Raises UserError for an
+    unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)
@@ -88,7 +89,7 @@ def _choice(names: Sequence[str]) -> dict[str, Any]:
 
 
 def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an object that has all of some properties and no others."""
+    """Return the JSON Schema of an object that has exactly these properties, all required."""
     return {
         "type": "object",
         "properties": dict(properties),
@@ -99,8 +100,9 @@ def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 @lru_cache
 def constrained_schema(shape: Shape) -> Mapping[str, Any]:
-    """Return the schema that constrains an answer of a stated form:
-    a helper's evidence is an empty text.
+    """Return the JSON Schema by which decoding is constrained, for a shape with a stated form.
+
+    A helper's evidence is an empty text in it.
     """
     schema = answer_schema(shape.role, shape.actions, form=shape.form, extension=shape.extension)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
@@ -113,10 +115,10 @@ def constrained_schema(shape: Shape) -> Mapping[str, Any]:
 
 
 def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the texts of a number that a constrained answer chooses from,
-    100 to 1000 steps for a `number`.
+    """Return the texts of numbers among which a constrained answer chooses, for a number's schema.
 
-    The step is a power of ten: hundredths between 0 and 1, tenths between -10 and 10.
+    They are steps of a power of ten between `minimum` and `maximum`: 100 to 1000 for type `number`,
+    such as hundredths between 0 and 1; whole numbers for `integer`.
     """
     least, most = schema["minimum"], schema["maximum"]
     decimals = 0 if schema["type"] == "integer" else 2 - math.floor(math.log10(most - least))
@@ -126,7 +128,10 @@ def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def longest(schema: Mapping[str, Any]) -> int:
-    """Return the most characters of a value's compact JSON, escapes aside."""
+    """Return the greatest number of characters of a value's compact JSON, without escapes.
+
+    `schema` is one that `harness.prompts.extension` allows.
+    """
     if "enum" in schema:
         return max(len(json.dumps(choice, ensure_ascii=False)) for choice in schema["enum"])
     match schema["type"]:
@@ -144,7 +149,7 @@ def longest(schema: Mapping[str, Any]) -> int:
 
 
 def plainest(schema: Mapping[str, Any]) -> Any:
-    """Return a value that fits and says as little as possible."""
+    """Return a minimal value that fits a schema: an empty text, the first choice, 0."""
     if "enum" in schema:
         return schema["enum"][0]
     match schema["type"]:

@@ -13,7 +13,7 @@ REPAIR = "repair"  # any call with the turn that follows an answer that cannot b
 
 
 class Outside(NamedTuple):
-    """A prompt outside the budget."""
+    """Describe a rendered prompt whose number of tokens is outside the version's budget."""
 
     scene: str  # its id
     viewer: str
@@ -24,7 +24,7 @@ class Outside(NamedTuple):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Token counts of all prompts."""
+    """Hold the token counts of all rendered prompts, by call, and those outside the budget."""
 
     # by call: a role, `FUSION` or `REPAIR`
     tokens: dict[str, list[int]] = field(default_factory=dict)
@@ -39,11 +39,12 @@ def measure(
     picture: int,
     progress: Callable[[int], None],
 ) -> Sizes:
-    """Render the prompt of every viewer,
-    and of the ego with the longest messages of one helper, of two, ...
+    """Render every prompt of some scenes, and return their sizes in tokens.
 
-    `count` returns the tokens of a chat's turns, None renders and counts nothing; a picture beside
-    a text has `picture` tokens. `progress` is called with 1 after each scene.
+    These are the prompt of every viewer, and that of the ego with the longest possible messages of
+    one helper, of two, and so on. `count` returns the tokens of a chat's messages; None renders and
+    counts nothing. A picture beside a text costs `picture` tokens. `progress` is called with 1
+    after each scene.
     """
     words, (least, most) = data.scenario.prompt_words, prompt.token_budget
     turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}

@@ -35,7 +35,7 @@ CARE = {
 
 @dataclass(frozen=True)
 class Question:
-    """A choice between actions, or what somebody else asks of a served model."""
+    """State a choice between actions, or between other options that a client of a server gives."""
 
     state: str  # what the prompt says of the scene
     instructions: str  # what is asked, in the scenario's words
@@ -43,7 +43,7 @@ class Question:
     kind: Kind = "choice"
 
     def reworded(self, change: Callable[[str], str]) -> "Question":
-        """Return the question with all its texts changed."""
+        """Return the question with `change` applied to all of its texts."""
         meanings = {action: text and change(text) for action, text in self.meanings.items()}
         return replace(
             self,
@@ -59,10 +59,10 @@ def question(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> Question:
-    """Return what a scene graph's viewer is asked;
-    the state is the last message of a prompt's chat about it.
+    """Return the question that a decision model is asked about a scene graph, for its viewer.
 
-    `words` are the scenario's (`Scenario.prompt_words`).
+    The state is the text of the last of `messages`, a prompt's chat about the graph. `words` are
+    the scenario's (`Scenario.prompt_words`).
     """
     ego, task, hiding = graph.ego.id, words.get("task", "drive on"), words.get("hiding")
     care = CARE[graph.role]
@@ -88,9 +88,10 @@ def _meaning(action: str, words: Mapping[str, str]) -> str | None:
 def asked(
     question: Question, messages: Sequence[Mapping[str, str]], order: Sequence[str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return the chat that asks a chat model for one letter; the actions are listed in an order.
+    """Return the chat messages that ask a chat model the same question, to answer by one letter.
 
-    The state comes first, since all orders share it. A picture stays with the last of the messages.
+    The actions are listed in `order`, after the state, which all orders share. A picture stays with
+    the last of `messages`.
     """
     meant = (question.meanings[action] for action in order)
     options = [

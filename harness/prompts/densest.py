@@ -10,8 +10,9 @@ ERROR_CHARS = 120  # most characters of the parser's message
 
 
 def dense(characters: int) -> str:
-    """Return digits and spaces in turn:
-    one token a character for Qwen's tokenizers, the most for ASCII.
+    """Return digits and spaces in turn, of this many characters.
+
+    Each is one token for Qwen's tokenizers, the most that ASCII text takes.
     """
     return ("1 2 3 4 5 6 7 8 9 " * characters)[:characters]
 
@@ -20,9 +21,7 @@ EVIDENCE = dense(EVIDENCE_CHARS)
 
 
 def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a message of each sender for `Prompt.render`,
-    with evidence as long and dense as allowed.
-    """
+    """Return a message of each sender, for `Prompt.render`, that takes the most tokens."""
     share = round(1 / len(actions), 2)
     return [
         {
@@ -38,7 +37,7 @@ def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Map
 
 
 def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a plan of each sender for `Prompt.render`, with numbers as long as they get."""
+    """Return a plan of each sender, for `Prompt.render`, that takes the most tokens."""
     share = round(1 / len(actions), 2)
     return [
         {
@@ -55,8 +54,9 @@ def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mappin
 def densest_repair(
     prompt: Prompt, role: str, actions: tuple[str, ...], words: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return what a repair turn adds to a chat at most:
-    the longest answer, and the request to repair it.
+    """Return the longest two messages that a repair turn adds to a chat.
+
+    They are an answer of the greatest length, and the request to write it again.
     """
     request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
     answer = dense(prompt.most_answer_tokens(role))

@@ -40,7 +40,7 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Hunk:
-    """A change with the words around it."""
+    """Describe one change between two texts A and B, with the words around it."""
 
     line_a: int  # line of A in which it begins, from 1
     line_b: int  # line of B
@@ -50,7 +50,7 @@ class Hunk:
 
 @dataclass(frozen=True)
 class TextChange:
-    """Differences between two texts."""
+    """Hold the word-by-word differences between two texts A and B."""
 
     hunks: tuple[Hunk, ...]  # changes in order; empty if the texts are the same
     removed: int  # number of words that only A has
@@ -59,7 +59,7 @@ class TextChange:
 
 @dataclass(frozen=True)
 class PromptChange:
-    """Differences between two versions."""
+    """Hold the differences between two prompt versions A and B; true if there are any."""
 
     # name, A's value and B's value of each setting that differs; descriptions are left out
     settings: tuple[tuple[str, Any, Any], ...]
@@ -71,7 +71,10 @@ class PromptChange:
 
 @dataclass(frozen=True)
 class Sent:
-    """The messages about one scene as versions A and B render them, before any chat template."""
+    """Compare the messages about one scene as versions A and B render them.
+
+    The comparison is before any chat template of a model.
+    """
 
     viewer: str  # id of the vehicle that is asked
     role: str  # `ego`, `helper`, or `fusion` for the ego with messages
@@ -82,7 +85,7 @@ class Sent:
 
 
 def change(a: Prompt, b: Prompt) -> PromptChange:
-    """Compare version A with version B."""
+    """Compare the settings and the template texts of version A with those of version B."""
     before, after = (dict(_settings(side)) for side in (a, b))
     return PromptChange(
         tuple((name, value, after[name]) for name, value in before.items() if value != after[name]),
@@ -91,7 +94,7 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 
 
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
-    """Combine the ego's part of one version with the helper's part of another."""
+    """Return a version with the ego's part of one version and the helper's part of another."""
     of_ego, of_helper = (prompt.examples or Examples("") for prompt in (ego, helper))
     examples = Examples(of_ego.scenario or of_helper.scenario, of_ego.ego, of_helper.helper)
     return replace(
@@ -127,11 +130,11 @@ def sent(
     scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
 ) -> list[Sent]:
-    """Render what is sent to the ego, to its first helper,
-    and to the ego with a message of every helper.
+    """Render what versions A and B ask about a scene, and compare it call by call.
 
-    `scenario` gives the actions and words of the prompts.
-    `count` counts the tokens of chat messages; None leaves them uncounted.
+    The calls are that of the ego, of its first helper, and of the ego with a message of every
+    helper. `scenario` gives the actions and words of the prompts. `count` counts the tokens of chat
+    messages; None leaves them uncounted.
     """
     ego, *helpers = scene.viewers
     questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
@@ -193,8 +196,9 @@ def _count(tokens: Iterable[str]) -> int:
 
 
 def marked(hunk: Hunk) -> list[tuple[Kind, str]]:
-    """Mark a hunk's pieces, safe to print:
-    `[-removed-]`, `{+added+}`, and ↵ for a changed line break.
+    """Return a hunk's pieces with marks, safe to print: `[-removed-]` and `{+added+}`.
+
+    A line break in a change is shown as ↵.
     """
     pieces: list[tuple[Kind, str]] = []
     for kind, text in hunk.pieces:

@@ -20,7 +20,7 @@ EXAMPLES = "examples.json"
 
 
 class Example(Struct, frozen=True):
-    """One earlier turn."""
+    """Hold one few-shot example: an earlier turn of the chat with the right answer."""
 
     layout_seed: int  # seed of the layout that it comes from
     graph: SceneGraph  # the viewer's scene graph, which the version's template renders
@@ -28,7 +28,7 @@ class Example(Struct, frozen=True):
 
 
 class Examples(Struct, frozen=True):
-    """The examples of a version by role, in the order in which they are shown."""
+    """Hold the few-shot examples of a prompt version by role, in the order they are shown in."""
 
     # the scenario that they come from, and the only one in which they may be shown, unless
     # `everywhere`
@@ -43,7 +43,10 @@ class Examples(Struct, frozen=True):
         return self.ego if role == "ego" else self.helper
 
     def only(self, numbers: Sequence[int]) -> "Examples | None":
-        """Return each role's examples of these numbers, from 1, in this order; None without any."""
+        """Return the examples with these numbers, from 1, of each role in this order.
+
+        None if `numbers` is empty.
+        """
         if not numbers:
             return None
         ego = tuple(self.of("ego")[number - 1] for number in numbers)
@@ -65,10 +68,10 @@ class Examples(Struct, frozen=True):
 
 
 def read(text: str, where: str) -> Examples:
-    """Read examples from a file's text in JSON; `where` names the file in messages.
+    """Parse the JSON text of a version's `examples.json`; `where` names the file in messages.
 
-    Raises UserError if it is no JSON or lacks something,
-    or an example is of another role or no train seed.
+    Raises UserError if it is no JSON or lacks something, or an example is of another role or not of
+    a train seed.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict):
@@ -92,7 +95,7 @@ def _check(example: Example, role: str, what: str) -> None:
 
 
 def text_of(examples: Examples) -> str:
-    """Return the text of the file, with one example a line."""
+    """Return the text of `examples.json` with these examples, one on each line."""
     lines = [f'{{"scenario": {_json(examples.scenario)}']
     if examples.everywhere:
         lines.append('"everywhere": true')

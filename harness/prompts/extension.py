@@ -34,10 +34,10 @@ _CHOICE = re.compile(r'[^"\\]{1,80}')
 
 
 def read(text: str, where: str) -> dict[str, str]:
-    """Return the JSON text of the members' schemas by role, as `Shape` takes it;
-    `where` names the file.
+    """Return the schemas of the further members that a version's `answer.json` asks for, by role.
 
-    Raises UserError if the text is no JSON, or has something that cannot be constrained.
+    They are JSON texts as `Shape.extension` takes them; `where` names the file in messages. Raises
+    UserError if the text is no JSON, or has something that cannot be constrained.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict) or not table:

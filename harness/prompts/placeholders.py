@@ -11,7 +11,10 @@ _MEMBER = re.compile(r'"[^"\n]*"\s*:\s*("[^"\n]*"(?=\s*[,}\n])|[^,{}\n]+)')
 
 
 def placeholders(template: str) -> tuple[str, ...]:
-    """Return the values of the JSON that a template shows, each once, up to what Jinja fills in."""
+    """Return the values in the JSON answer that a template shows, such as `max 12 words`.
+
+    A value ends where Jinja fills something in.
+    """
     shown = _JINJA.sub(_FILLED, template)
     values = [
         value.partition(_FILLED)[0].strip().strip('"').strip() for value in _MEMBER.findall(shown)

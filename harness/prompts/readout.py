@@ -21,8 +21,9 @@ _BLANKS = " \t\r\n\u2581\u0120\u010a"
 
 
 def letters(actions: Sequence[str]) -> str:
-    """Return one letter for each action, in order.
-    Raises UserError if there are too few letters.
+    """Return one letter for each action, in order: `ABC` for three.
+
+    Raises UserError if there are more actions than letters.
     """
     if len(actions) > len(LETTERS):
         raise UserError(
@@ -32,19 +33,17 @@ def letters(actions: Sequence[str]) -> str:
 
 
 def cyclic(actions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the cyclic orders of the actions: in each, every letter stands for the next action."""
+    """Return the cyclic orders of the actions, so that each action gets each letter once."""
     return [(*actions[start:], *actions[:start]) for start in range(len(actions))]
 
 
 def spelt(token: str) -> str:
-    """Return a token's text without blanks around it:
-    ` A` is another token than `A`, and the same letter.
-    """
+    """Return a token's text without blanks and their signs around it, so that ` A` becomes `A`."""
     return token.strip(_BLANKS)
 
 
 def question(actions: Sequence[str]) -> str:
-    """Return the line that asks for a letter."""
+    """Return the line that asks for a letter: `Answer with one letter: A SLOWER, B IDLE`."""
     options = ", ".join(
         f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True)
     )
@@ -54,10 +53,10 @@ def question(actions: Sequence[str]) -> str:
 def asked(
     messages: Sequence[Mapping[str, str]], actions: Sequence[str], answered: Sequence[str] = ()
 ) -> tuple[Mapping[str, str], ...]:
-    """Append to every question of a chat the line that asks for one letter,
-    which stand for the actions.
+    """Return a chat in which every question asks for the letter of an action.
 
-    `answered` has the likeliest action of each earlier answer, whose letter replaces the answer.
+    `answered` has the likeliest action of each earlier answer of the chat, whose letter replaces
+    the answer.
     """
     letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
 
@@ -70,7 +69,7 @@ def asked(
 
 
 def stated(actions: Sequence[str], shares: Sequence[float]) -> str:
-    """Write a read-out as an answer's text: the actions' shares, normalised, in millionths."""
+    """Return the JSON of an answer with these shares of the actions, normalised, in millionths."""
     total = math.fsum(shares)
     p = rounded([share / total for share in shares], parts=10**6)
     return canonical_json({"action_distribution": dict(zip(actions, p, strict=True))})

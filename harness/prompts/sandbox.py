@@ -55,10 +55,9 @@ LONGEST_CHAIN = 3  # filters one after another that need not pay
 
 
 class Code(templates.Code):
-    """Jinja's compiler with shorter code for what prompts do most;
-    every template renders the same text.
+    """Jinja's code generator with shorter code for what prompts do most, of the same result.
 
-    `_at` is a variable of the code, which no template can name.
+    `_at` is a variable of the generated code, which no template can name.
     """
 
     @optimizeconst
@@ -168,7 +167,7 @@ def _bare(node: nodes.Filter, name: str) -> bool:
 
 
 class Sandbox(templates.Sandbox):
-    """Jinja environment for prompt templates: fewer operators and filters, and shorter code.
+    """A Jinja environment for prompt templates, with fewer operators and filters than its base.
 
     `graph.ego` always means the member of that name; no method of a mapping hides it.
     """
@@ -193,7 +192,7 @@ class Sandbox(templates.Sandbox):
         super()._put_steps_into(source)
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether it is known of an expression that its value costs nothing to read."""
+        """Return whether an expression is known to cost nothing to read, as a number does."""
         number = (
             isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
         )
@@ -203,7 +202,10 @@ class Sandbox(templates.Sandbox):
         return self.filters["int"](self.filters["round"](value))
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
-        """Allow products, powers and remainders of numbers only, and only small powers."""
+        """Compute an operator; `*`, `**` and `%` are for numbers only, and powers must be small.
+
+        Raises jinja2's SecurityError otherwise.
+        """
         if type(left) is float and operator in ("+", "-", "*") and type(right) in (float, int):
             # costs nothing; the rest takes a microsecond
             return self.binop_table[operator](left, right)

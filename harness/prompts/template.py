@@ -12,7 +12,7 @@ from harness.prompts.sandbox import Sandbox
 
 
 class Template:
-    """A compiled template.
+    """Hold a compiled prompt template.
 
     Attributes:
         blocks: names of its blocks.
@@ -33,7 +33,10 @@ class Template:
         self.blocks = tuple(compiled.blocks)
 
     def render(self, variables: Mapping[str, Any], blocks: Sequence[str]) -> list[str]:
-        """Render some blocks. May raise any exception, since a template is a program."""
+        """Render some blocks of the template, one text each.
+
+        May raise any exception, since a template is a program.
+        """
         templates.begin()
         # `Template.new_context` takes a quarter of a prompt's time
         context = object.__new__(Context)

@@ -48,7 +48,7 @@ OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})
 
 @dataclass(frozen=True)
 class Prompt:
-    """One prompt version."""
+    """Hold one prompt version: its templates and settings turn scene graphs into chats."""
 
     version: str  # name of its folder
     sha256: str  # digest of its files
@@ -120,9 +120,7 @@ class Prompt:
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
-        """Roles whose template has a block `repair`:
-        an unreadable answer is asked for once more.
-        """
+        """Roles whose template has a block `repair`: an unreadable answer is asked for again."""
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def form(self, role: str) -> str:
@@ -134,13 +132,14 @@ class Prompt:
 
     @cached_property
     def placeholders(self) -> Mapping[str, tuple[str, ...]]:
-        """What each role's template shows in place of an answer's values."""
+        """By role, the values of a JSON answer that the template shows, such as `max 12 words`."""
         texts = self.texts if self._templates else {}  # which raises what is wrong with a text
         return {role: placeholders(resolved(text)) for role, text in texts.items()}
 
     def most_answer_tokens(self, role: str) -> int:
-        """Return the most tokens of an answer:
-        `max_answer_tokens`, and one a character of what is added.
+        """Return the most tokens that a role's answer may have.
+
+        It is `max_answer_tokens`, and one per character of the further members that are asked for.
         """
         further = self.shape(role, ()).further
         return self.max_answer_tokens[role] + (longest(closed(further)) if further else 0)
@@ -148,7 +147,11 @@ class Prompt:
     def repair(
         self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]
     ) -> str:
-        """Render the message to a viewer whose answer could not be read, for the reason `error`."""
+        """Render the message that asks a viewer again, since its answer could not be parsed.
+
+        `error` is the reason, and `words` are texts by which the scenario describes itself. Raises
+        UserError if the template fails.
+        """
         variables = {"error": error, "actions": actions, "words": words}
         [text] = self._rendered(
             role, variables, ("repair",), "its block repair may use error, actions, words"
@@ -168,10 +171,10 @@ class Prompt:
         The graph's `role` chooses the template. Examples follow the system message as earlier
         turns. A message with the key `image` has a picture before its text. `messages` are those of
         helpers to the ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and
-        `confidence`, or with `sender` and `evidence` alone if the version `shows_words`, or of
-        agents, if it `shows_plans`: those of `fusion.messages_of`. `words` are texts by which the
-        scenario describes itself. A `letter` is asked for in place of the block `question`
-        (`readout.asked`).
+        `confidence`; or with `sender` and `evidence` alone if the version `shows_words`; or agents'
+        plans if it `shows_plans` (`fusion.messages_of`). `words` are texts by which the scenario
+        describes itself. If `letter` is true, a letter is asked for (`readout.asked`) in place of
+        the block `question`. Raises UserError if the template fails.
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)
@@ -256,8 +259,9 @@ class Prompt:
 
 
 def listed(graph: "SceneGraph", most: int) -> list[int]:
-    """Return the indices of the nodes that a prompt lists:
-    those in conflict first, then the nearest.
+    """Return the indices of at most `most` nodes, those that a prompt lists.
+
+    Those in conflict with the ego come first, then the nearest to the viewer.
     """
     meets = {conflict.vehicle for conflict in graph.conflicts}
     order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
@@ -265,8 +269,9 @@ def listed(graph: "SceneGraph", most: int) -> list[int]:
 
 
 def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
-    """Return the indices of conflicts, the soonest first;
-    those that the ego never reaches are last.
+    """Return the indices of conflicts in the order in which the ego reaches them.
+
+    Those that it never reaches are last.
     """
     order = [
         (math.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m)
@@ -276,13 +281,13 @@ def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
 
 
 def names(where: Path | None = None) -> list[str]:
-    """List the versions that ship and the project's, or only those in a folder."""
+    """List the prompt versions that ship and the project's, or those in a folder, sorted."""
     files = where.glob("*/prompt.toml") if where else entries("prompts", "*/prompt.toml")
     return sorted({file.parent.name for file in files})
 
 
 def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
-    """Return why a version may not be used in a scenario; None if it may."""
+    """Return why a version may not be used in a scenario, as a phrase; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
     if (
@@ -303,10 +308,10 @@ def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
 
 
 def load(version: str, where: Path | None = None) -> Prompt:
-    """Load a version by name, from a folder if one is given.
+    """Load a prompt version by name, from the folder `where` if one is given.
 
-    Raises UserError if there is no such version, its files are wrong,
-    or it was released and has changed.
+    Raises UserError if there is no such version, its files are wrong, or it was released and has
+    changed.
     """
     if version not in names(where):
         raise unknown("prompt", version, names(where))
@@ -327,7 +332,8 @@ def load(version: str, where: Path | None = None) -> Prompt:
 
 
 def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prompt:
-    """Make a version of the texts of its files, in the order of `FILES`.
+    """Return a prompt version made of the texts of its files, by file name in the order of `FILES`.
+
     Raises UserError if one is wrong.
     """
     what, sha256 = f"prompt {version} prompt.toml", digest(texts)
@@ -363,7 +369,7 @@ def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prom
 
 
 def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | None:
-    """Load a version, from a folder if one is given, if its files have this digest; else None."""
+    """Load a prompt version if its files have this digest; None if not, or if it does not load."""
     try:
         prompt = load(version, where)
     except UserError:
@@ -372,7 +378,7 @@ def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | 
 
 
 def lock(version: str, where: Path | None = None) -> str:
-    """Release a version by pinning its digest. Returns the digest."""
+    """Release a prompt version: pin its digest in `released.toml`, and return it."""
     prompt = load(version, where)
     base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
@@ -392,8 +398,9 @@ def _base(version: str, where: Path | None) -> Path:
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Return the digest of a version's files, which are in the order of `FILES`,
-    with the others last.
+    """Return the digest of a version's files, given as text by name in the order of `FILES`.
+
+    Files beside those of `FILES` come last.
     """
     return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 
