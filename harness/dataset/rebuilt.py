@@ -44,8 +44,7 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
 
 
 def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
-    """Raise UserError if a dataset shares a first scene with `others`, on which results are
-    reported.
+    """Raise UserError if a dataset has a first scene of `others`, which results are reported on.
 
     Scenes are equal if their vehicles agree to 0.01 in all numbers, whatever their seeds.
     """

@@ -20,15 +20,13 @@ MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
-    """An intent, its sum as stated, a helper's message, the repairs,
-    and what else was asked for.
-    """
+    """Hold an answer that was read from an object: its intent, and the repairs that it took."""
 
-    intent: values.Intent
-    mass: float | None
-    message: dict[str, Any] | None
+    intent: values.Intent  # probabilities in the order of the actions
+    mass: float | None  # sum of the probabilities as stated; None without any
+    message: dict[str, Any] | None  # a helper's evidence, risk, maneuver and confidence
     repairs: frozenset[Repair]
-    extension: dict[str, Any] | None = None
+    extension: dict[str, Any] | None = None  # further members that the prompt asked for
 
     def mended(self, repair: Repair) -> "Answer":
         return replace(self, repairs=self.repairs | {repair})
@@ -40,9 +38,11 @@ class Answer(Struct, frozen=True):
 def read(
     members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False
 ) -> Answer:
-    """Read an answer-shaped object; with `divides`, any sum above 0 is divided out.
+    """Read an answer of this shape from the members of a JSON object.
 
-    Raises Failure with all statuses for values that are true of it.
+    With `divides`, probabilities of any sum above 0 are divided by it. `so_far` are the repairs
+    that finding the object took. Raises Failure, with all statuses that apply, if the members give
+    no intent.
     """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
@@ -165,9 +165,7 @@ def _judgement(
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
-    """Return the intent with `confidence` on the maneuver and the rest spread evenly over the
-    others.
-    """
+    """Return the intent of one action with a confidence, the rest spread evenly over others."""
     if len(actions) == 1:
         return (1.0,)
     share = (1 - confidence) / (len(actions) - 1)

@@ -28,11 +28,11 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object shaped like an answer."""
+    """Hold an object in a completion that is shaped like an answer."""
 
     members: dict[str, Any]  # what it holds
     repairs: frozenset[Repair] = frozenset()  # the repairs that reading it took
-    # repairs that would say of members which could not be read that they were not given
+    # repairs to drop from the answer: they would report as missing what could only not be read
     lost: frozenset[Repair] = frozenset()
 
 
@@ -48,11 +48,12 @@ class _Objects:
 def candidates(
     text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
 ) -> list[Candidate]:
-    """Return all candidates, in the order of the text, which has no thought and no special tokens.
+    """Return all objects in a text that could be the answer, in the order of the text.
 
-    If the token limit `cut` the text, an open bracket is never closed. With `reasons_first` the
-    prompt asked for reasons before the answer, and prose there is no repair. Raises Failure
-    (no_json, label_only, truncated_json, syntax or missing_action) if there is no candidate.
+    The text is without thought and special tokens. `cut` says that the token limit ended it; then
+    an open bracket is not closed. With `reasons_first` the prompt asked for reasons before the
+    answer, and prose there is no repair. Raises Failure (no_json, label_only, truncated_json,
+    syntax or missing_action) if there is no candidate.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)
@@ -101,8 +102,9 @@ def candidates(
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return the spans of a text's candidates;
-    empty if `candidates` must change the text to find any.
+    """Return the start and end of each candidate in a text.
+
+    Empty if `candidates` must change the text to find any.
     """
     try:
         objects = _objects(text, cut=False)

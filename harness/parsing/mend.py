@@ -23,16 +23,16 @@ _NUMBER = re.compile(r"(?<![\w.])-?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?(?![\
 
 
 def unreadable() -> Failure:
-    """Return the failure of a text from which json_repair makes no answer."""
+    """Build the Failure (syntax) of a text in which json_repair finds no reliable answer."""
     return Failure(Status.SYNTAX, "a JSON object was begun but cannot be read without guessing")
 
 
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """Return the broken object at the start of `text`, repaired, and the text after it.
 
-    The object counts only if it holds nothing ambiguous, each of `names` is a key at most once, and
-    the numbers read are the numbers written, in the same order. Nothing is repaired of a text that
-    the token limit `cut`. Raises Failure for syntax.
+    It counts only if it holds nothing ambiguous, each of `names` is a key at most once, and the
+    numbers read are the numbers written, in the same order. A text that the token limit `cut` is
+    not repaired. Raises Failure (syntax).
     """
     import json_repair
 
@@ -55,14 +55,13 @@ def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
 def around(
     text: str, at: int, end: int, fields: Sequence[str], cut: bool
 ) -> tuple[dict[str, Any], str, str]:
-    """Return the members of the broken object at the start of `text`,
-    around a value that can be read.
+    """Repair a broken object at the start of `text` around one of its values, which can be read.
 
     The value stands from `at` to `end`, with its numbers as they are written, so the text of other
     members may hold anything. The object counts only if it has no other members than `fields`, and
-    each text in it stands in `text`. Returned are the other members, the name of the value, and the
-    text after the object. Nothing is repaired of a text that the token limit `cut`. Raises Failure
-    for syntax.
+    each text in it stands in `text`. Returned are the other members, the key of the value, and the
+    text after the object. A text that the token limit `cut` is not repaired. Raises Failure
+    (syntax).
     """
     import json_repair
 

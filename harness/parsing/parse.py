@@ -44,7 +44,7 @@ _ECHO = re.compile(
 
 
 class Parsed(Struct, frozen=True):
-    """The result of parsing one completion."""
+    """Hold the result of parsing one completion: a status, and an intent unless it failed."""
 
     status: Status  # the outcome
     # the repairs, in the order of `Repair`; empty unless recovered
@@ -84,7 +84,7 @@ def parse(
     finish_reason: str = "stop",
     error: str | None = None,
 ) -> Parsed:
-    """Parse one completion. Any text gives a `Parsed`; no text makes this raise.
+    """Parse one completion into a status and an intent. Never raises for any text.
 
     A closed thought is what a thinking model should write, and an empty one is what a template
     adds, so neither is a repair. A closed thought with content is one if the model was not asked to
@@ -164,8 +164,7 @@ def _failed(failure: Failure, thought: str | None) -> Parsed:
 def spans(
     text: str, role: str, actions: Sequence[str], thinking: bool = False
 ) -> list[tuple[int, int]]:
-    """Return the start and end of each answer that `parse` finds in a completion,
-    to show them to people.
+    """Return the start and end of each answer that `parse` finds in a completion, for display.
 
     Empty if there is no answer, or if the text had to be rewritten before one was found.
     """

@@ -22,7 +22,10 @@ Found = tuple[dict[str, Any], frozenset[Repair]]  # members, and the repairs tha
 
 
 def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
-    """Return what a text states as JSON, or nearly so, with the repairs; another value as it is."""
+    """Return the JSON object that a text holds, and the repairs; any other value as it is.
+
+    Nearly valid JSON counts, too.
+    """
     if not isinstance(value, str) or "{" not in value:
         return value, frozenset()
     text = value.strip()
@@ -42,7 +45,10 @@ def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
 
 
 def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set[str]:
-    """Return the fields of an answer that an object has; actions of its own are a distribution."""
+    """Return the names of the answer's fields that an object has, whatever their spelling.
+
+    Keys that are actions count as `action_distribution`.
+    """
     names = {match(key, FIELDS[role]) for key in members}
     if any(match(key, actions) for key in members):
         names.add(_DISTRIBUTION)
@@ -50,13 +56,14 @@ def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set
 
 
 def decides(fields: set[str], role: str) -> bool:
-    """Return whether fields of an answer say which action is taken."""
+    """Return whether these fields of an answer name an action or a distribution."""
     return not fields.isdisjoint((_DISTRIBUTION, NAMED[role]))
 
 
 def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
-    """Return the answers in a JSON Schema:
-    beside its keywords, and under `properties` in place of types.
+    """Return the answers that a model wrote into a JSON Schema, each with the repairs.
+
+    They are beside the schema's keywords, or under `properties` in place of types.
     """
     found: list[Found] = []
     own = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
@@ -70,8 +77,9 @@ def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list
 
 
 def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
-    """Return the distribution that stands in a text or under a schema's `properties`,
-    with the repairs.
+    """Return the distribution in a text or under a schema's `properties`, and the repairs.
+
+    Any other value is returned as it is.
     """
     value, repairs = decoded(value)
     inner = _properties(value)
@@ -100,10 +108,10 @@ def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
 def gathered(
     members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]
 ) -> Found:
-    """Return an answer with the fields that it has one level deeper,
-    but for those in members `apart`.
+    """Return an answer's members, with fields from one level deeper moved up, and the repairs.
 
-    Raises Failure conflicting_answers if two members have the same field.
+    Members named in `apart` are left alone. Raises Failure (conflicting_answers) if two members
+    have the same field.
     """
     given = fields_of(members, role, actions)
     repairs: frozenset[Repair] = frozenset()
@@ -132,8 +140,9 @@ def _two_forms(fields: set[str], role: str) -> bool:
 
 
 def are_one(pieces: Sequence[dict[str, Any]], role: str, actions: Sequence[str]) -> bool:
-    """Return whether several objects are pieces of one answer:
-    one decides, and none repeats another.
+    """Return whether several objects are pieces of one answer.
+
+    That is so if exactly one of them names an action or a distribution, and no field is in two.
     """
     if len(pieces) < 2 or any(isinstance(piece, relaxed.Repeated) for piece in pieces):
         return False

@@ -31,13 +31,13 @@ _TAG = re.compile(
 
 
 def split(text: str, thinking: bool) -> tuple[str | None, str]:
-    """Return the thought (None if there was none, empty for an empty block),
-    and the rest as the answer.
+    """Split a completion into the model's thought and the text of its answer.
 
-    A closing tag without an opening one means that the prompt's template opened the thought: all
-    text before it is thought. Text before, between and after closed thoughts belongs to the answer.
-    If the model was asked to think, a text without a closed thought is all thought. A tag in a
-    string of valid JSON is text. Raises Failure for truncated_reasoning.
+    The thought is None if there is none, and empty for an empty block. A closing tag without an
+    opening one means that the prompt's template opened the thought: all text before it is thought.
+    Text before, between and after closed thoughts belongs to the answer. If the model was asked to
+    think (`thinking`), a text without a closed thought is all thought. A tag in a string of valid
+    JSON is text. Raises Failure (truncated_reasoning) for a thought that is not closed.
     """
     depth = at = 0
     thoughts: list[str] = []

@@ -48,11 +48,14 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f", "\n": ""}
 
 
 class Repeated(dict[str, Any]):
-    """An object in which a key was repeated; it holds the last value."""
+    """An object in which a key was repeated; it holds the last value of each key."""
 
 
 class Broken(Exception):
-    """The text at this brace cannot be read; `meant` tells broken JSON from a brace in prose."""
+    """Report that the text at a brace cannot be read as an object.
+
+    `meant` is true for broken JSON, and false for a brace in prose.
+    """
 
     def __init__(self, meant: bool) -> None:
         super().__init__()
@@ -60,13 +63,14 @@ class Broken(Exception):
 
 
 class Unfinished(Exception):
-    """The text ends inside the value."""
+    """Report that the text ends inside the value."""
 
 
 @dataclass
 class Reading:
-    """A value, where it ends in the text, the repairs,
-    and whether the end of the text closed it.
+    """Hold a value that was read from almost-JSON, with the repairs that it took.
+
+    `end` is where it ends in the text; `closed_by_end` is true if brackets were still open there.
     """
 
     value: Any = None
@@ -76,7 +80,10 @@ class Reading:
 
 
 def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an `object_pairs_hook` that marks an object with a repeated key."""
+    """Return a dict of an object's pairs, or a `Repeated` if a key is repeated.
+
+    It is the `object_pairs_hook` of `DECODER`.
+    """
     members = dict(pairs)
     return members if len(members) == len(pairs) else Repeated(members)
 
@@ -88,7 +95,7 @@ DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 
 @dataclass(frozen=True)
 class Token:
-    """A token of the text."""
+    """Describe a token of almost-JSON."""
 
     # a group of the pattern; `other` for a character that begins no token, `end` at the text's end
     kind: str
@@ -98,7 +105,7 @@ class Token:
 
 
 def next_token(text: str, at: int) -> Token:
-    """Return the first token at or after `at`; white space and comments are skipped."""
+    """Return the first token of almost-JSON at or after `at`, skipping white space and comments."""
     repairs: frozenset[Repair] = frozenset()
     while True:
         while at < len(text) and text[at].isspace():
@@ -119,7 +126,7 @@ def next_token(text: str, at: int) -> Token:
 
 
 def read(text: str, at: int) -> Reading:
-    """Read the object that opens at `at`. Raises `Broken` or `Unfinished`."""
+    """Read the object of almost-JSON whose brace is at `at`. Raises `Broken` or `Unfinished`."""
     return _Reader(text, at).run()
 
 

@@ -12,7 +12,10 @@ from harness.prompts.answer_schema import Shape, closed
 
 
 def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
-    """Return the further members of an answer, without lone surrogates, if they fit; else None."""
+    """Return the further members of an answer if they fit the schemas of its shape; else None.
+
+    Lone surrogates in them are replaced.
+    """
     if not is_json(members) or not _validator(shape).is_valid(members):
         return None
     text = json.dumps(members, ensure_ascii=False).encode("utf-8", "replace").decode()
@@ -20,9 +23,7 @@ def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
 
 
 def is_json(value: object) -> bool:
-    """Return whether a value that was read from JSON has no repeated key and no NaN,
-    which are no JSON.
-    """
+    """Return whether a decoded value has no repeated key and no NaN, which JSON does not allow."""
     if isinstance(value, dict):
         return not isinstance(value, Repeated) and all(map(is_json, value.values()))
     if isinstance(value, list):

@@ -21,7 +21,7 @@ class _Documented(StrEnum):
 
 
 class Status(_Documented):
-    """The outcome of a completion. All but the first two are failures and give no intent."""
+    """State the outcome of parsing a completion; all but the first two give no intent."""
 
     STRICT = (
         "strict",
@@ -73,7 +73,7 @@ class Status(_Documented):
 
 
 class Repair(_Documented):
-    """A correction without which an answer cannot be parsed."""
+    """Name a correction that was needed to read an answer."""
 
     THINK_BLOCK = (
         "think_block",
@@ -146,7 +146,9 @@ class Repair(_Documented):
 
 
 class Failure(Exception):
-    """A completion that gives no intent. This is data and no bug: `parse` turns it into a `Parsed`.
+    """Report that a completion gives no intent; `parse` turns it into a `Parsed`.
+
+    It is data about the model, not a bug.
 
     Attributes:
         status: the reason.
@@ -171,7 +173,7 @@ class Failure(Exception):
 
 @contextmanager
 def noted(failures: list[Failure]) -> Iterator[None]:
-    """Keep a failure of one part of an answer, so that the other parts are read as well."""
+    """Append a Failure of one part of an answer to `failures`, so that all parts are read."""
     try:
         yield
     except Failure as failure:
@@ -179,10 +181,9 @@ def noted(failures: list[Failure]) -> Iterator[None]:
 
 
 def joined(failures: Sequence[Failure]) -> Failure:
-    """Return a failure with the faults of all.
+    """Return one failure with the faults of all.
 
-    The first one leads, but an echo goes before it:
-    what was copied from the prompt was never meant.
+    Its status is the first one's, but an echo of the prompt goes first: it was never meant.
     """
     first = min(failures, key=lambda failure: failure.status is not Status.SCHEMA_ECHO)
     faults = dict.fromkeys(

@@ -18,7 +18,7 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def fitting(text: str, shape: Shape) -> Answer | None:
-    """Return the answer if the text is nothing else and fits the schema and the sum of 1."""
+    """Return the answer if the text is exactly JSON of this shape that sums to 1; else None."""
     try:
         value = DECODER.decode(text)
     except (ValueError, RecursionError):

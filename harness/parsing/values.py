@@ -43,10 +43,10 @@ Intent = tuple[float, ...]
 
 
 def match(name: str, known: Sequence[str]) -> str | None:
-    """Return the known name that is meant:
-    the same, or the only one with other case and separators.
+    """Return the one of the `known` names that is meant; None if there is none, or several.
 
-    A name behind a sign that denies it, such as !SLOWER, is not meant.
+    Letter case and separators may differ. A name behind a sign that denies it, such as !SLOWER, is
+    not meant.
     """
     if name in known:
         return name
@@ -63,8 +63,10 @@ def _plain(name: str) -> str:
 def sort_fields(
     members: dict[str, Any], known: Sequence[str], repairs: set[Repair]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return members by their known names, and the rest.
-    Raises duplicate_key, even for two spellings.
+    """Split members into those with a known name, under that name, and the rest.
+
+    Spellings that differ are added to `repairs`. Raises Failure (duplicate_key) if one is given
+    twice, also in two spellings.
     """
     if isinstance(members, Repeated):
         raise Failure(Status.DUPLICATE_KEY, "an object has the same key twice")
@@ -86,10 +88,10 @@ def sort_fields(
 def distribution(
     value: object, actions: Sequence[str], repairs: set[Repair], divides: bool
 ) -> tuple[Intent, float]:
-    """Return the intent in the order of `actions`, summing to 1, and the sum as stated.
+    """Return the probabilities in the order of `actions`, summing to 1, and their sum as stated.
 
-    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure
-    with all statuses for values that are true of it.
+    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure,
+    with all statuses that apply, if `value` is no such distribution.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -143,8 +145,9 @@ def _check_sum(mass: float, repairs: set[Repair], divides: bool) -> None:
 
 
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
-    """Return a finite number, and whether a percent sign followed it.
-    Raises `Failure` for others.
+    """Return a finite number, and whether a percent sign followed it; `name` is for messages.
+
+    `repairs` receives the repairs. Raises Failure for any other value.
     """
     percent = False
     if isinstance(value, str):
@@ -184,14 +187,15 @@ def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[fl
 
 
 def check_range(name: str, value: float) -> None:
-    """Raise `Failure` out_of_range unless a value is in 0..1."""
+    """Raise Failure (out_of_range) unless a probability is from 0 to 1; `name` is for messages."""
     if not 0 <= value <= 1:
         raise Failure(Status.OUT_OF_RANGE, f"{printable(name, 40)} is {value:.4g}, outside 0..1")
 
 
 def in_percent(value: object, rest: Sequence[object]) -> object:
-    """Return a number as a text with a percent sign if a member beside it, in `rest`,
-    states that unit.
+    """Return a number as a text with a percent sign, if a member beside it names that unit.
+
+    `rest` are the values of the members beside it. Any other value is returned as it is.
     """
     stated = any(
         isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest
@@ -200,15 +204,14 @@ def in_percent(value: object, rest: Sequence[object]) -> object:
 
 
 def is_placeholder(value: object) -> bool:
-    """Return whether a text is a prompt's placeholder for a number: p1, <number>, 0..1."""
+    """Return whether a value is a prompt's placeholder for a number: p1, <number>, 0..1."""
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
 
 
 def is_placeholder_text(text: str, shape: Shape) -> bool:
-    """Return whether a text stands in a prompt in place of a value:
-    max 12 words, <text>, low|medium.
+    """Return whether a text is a placeholder of a prompt: max 12 words, <text>, low|medium.
 
-    It is one of the prompt that asked, of any prompt, or several of the choices of one of these.
+    It is one of the prompt that asked, one that any prompt may use, or several choices of such.
     """
     if _WORDS.fullmatch(text.strip().strip(".").strip() or text.strip()):
         return True
