@@ -43,7 +43,11 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """Hold an agent's least TTC and PET since a decision, and the poses that are still needed."""
+    """Hold an agent's least TTC and PET since a decision, and the poses that are still needed.
+
+    `trail` has x, y and heading of V vehicles at the last T moments, (T, V, 3), and `box` a
+    bounding box around all positions of each so far, (4, V).
+    """
 
     ttc_s: float = np.inf  # least time to collision; inf where missing
     pet_s: float = np.inf  # least post-encroachment time; inf where missing

@@ -114,7 +114,7 @@ class Plan:
 
 
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
-    """Return the action sequences of each agent, by layout seed and then by agent index."""
+    """Return what each agent can do without touching traffic, by layout seed, then agent index."""
     starts = [world for seed in seeds for world in rehearsals(scenario, seed)]
     unharmed: list[Rehearsal] = []
     for group in by_scenario(starts):

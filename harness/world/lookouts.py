@@ -32,7 +32,10 @@ DANGER = "danger"
 
 @dataclass(frozen=True)
 class Draft:
-    """Hold one random draw of an episode's start, not yet checked for who sees the danger."""
+    """Hold one random draw of an episode's start, not yet checked for who sees the danger.
+
+    `phantoms` are the danger as it would come from each sector, whether or not it is in the layout.
+    """
 
     layout: Layout  # with the lookouts as helpers, and nobody in the blind seats
     # for each sector, the vehicle that would be its danger; it replaces the one with the same id

@@ -51,7 +51,7 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """Whether the ego reached its goal without a collision and without a forced failure."""
+        """Whether the ego reached its goal in time and without a collision."""
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":

@@ -43,7 +43,10 @@ Point = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """Hold n sequences of meta-actions that the planner tries."""
+    """Hold n sequences of meta-actions that the planner tries, with what each does to the ego.
+
+    `levels` is (n, decisions), `right_m` (n, steps of `STEP_S`), and all others are (n,).
+    """
 
     first: Sequence[str]  # first action of each, (n,)
     levels: Ints  # levels by which each decision changes the target speed, (n, decisions)

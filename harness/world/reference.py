@@ -130,7 +130,10 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
 def drive_apart(
     scenario: Scenario, seeds: Sequence[int], workers: Workers, progress: Callable[[int], None]
 ) -> list[dict[str, Outcome]]:
-    """Run `drive_all` on workers; `progress` is called with the number of episodes just done."""
+    """Run `drive_all` on workers; return, per seed, outcomes by driver.
+
+    `progress` is called with the number of episodes just done.
+    """
     return in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
 
 

@@ -132,7 +132,7 @@ class SceneGraph(Closed, frozen=True):
 
     @property
     def occluded(self) -> tuple[str, ...]:
-        """Names of the sectors that count as occluded."""
+        """Names of the sectors (directions of danger) of which the viewer sees less than half."""
         return tuple(sector.sector for sector in self.sectors if sector.occluded)
 
     @property

@@ -46,17 +46,17 @@ class VehicleState(Closed, frozen=True, omit_defaults=True):
 
     @property
     def indicator(self) -> str:
-        """What the turn indicator shows."""
+        """What the turn indicator shows: `left`, `right` or `off`."""
         return indicator(self.route)
 
     @property
     def length_m(self) -> float:
-        """Length from bumper to bumper."""
+        """Length from bumper to bumper (m)."""
         return SIZES_M[self.kind][0]
 
     @property
     def width_m(self) -> float:
-        """Width from side to side."""
+        """Width from side to side (m)."""
         return SIZES_M[self.kind][1]
 
     def corners(self) -> NDArray[np.float64]:

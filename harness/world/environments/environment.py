@@ -267,7 +267,7 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 
 
 def lane_of(v: Any) -> Lane:
-    """Return the lane that a vehicle steers for, in plain types (highway-env may use NumPy's).
+    """Return the index of the lane that a highway-env vehicle steers for: two nodes and a number.
 
     Raises UserError if it has none.
     """

@@ -54,7 +54,10 @@ class Parameters(Common):
 
 @dataclass(frozen=True)
 class Place:
-    """Hold the properties of a highway-env environment that are the same for every seed."""
+    """Hold what is the same for every seed of a highway-env environment: paths, road, actions.
+
+    `ends` has the x, y, x, y (m) of each lane's ends, and `kind` is the environment's class name.
+    """
 
     routes: Routes  # the paths of its network
     ends: Mapping[Lane, tuple[float, ...]]  # where the network's lanes begin and end, m

@@ -67,8 +67,8 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 class Frame(Image):
     """A picture of a vehicle's cameras, with the ids of the vehicles and buildings that it shows.
 
-    `owners` are the places in `ids` of what each pixel shows, (height, width);
-    -1 for road, grass and sky.
+    `owners`, (height, width), has for each pixel the index in `ids` of what it shows; -1 for road,
+    grass and sky.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:

@@ -63,7 +63,7 @@ def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
 
 
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
-    """Return the `truth_graph` of each state."""
+    """Return each state's `truth_graph`: the ego's graph with everything in view and no noise."""
     looks: list[Look] = []
     exact: list[list[Detection]] = []
     no_sectors: list[list[Sector]] = []
