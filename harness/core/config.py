@@ -75,8 +75,7 @@ _IN_WORDS = {
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
-    """Read the tables of a TOML file;
-    `where` names it in messages, such as `model card models/mine.toml`.
+    """Read a TOML file into tables; `where` names it in messages: `model card models/mine.toml`.
 
     Raises UserError if it cannot be read or is no TOML.
     """

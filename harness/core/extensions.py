@@ -143,7 +143,7 @@ def control_settings() -> dict[str, str]:
 
 
 def part_of(extension: str) -> str:
-    """Return the words that a missing command or name is part of an extension not installed."""
+    """Return the phrase, for messages, that something is part of an extension not installed."""
     return f"part of the extension {extension}, which is not installed"
 
 

@@ -65,8 +65,10 @@ class Unit:
         sign: str = "",
         digits: int | None = None,
     ) -> str:
-        """Write a value and its interval as `89.0 [81.4, 93.7]`;
-        a dash where the value is not known.
+        """Write a value and its interval as `89.0 [81.4, 93.7]`; a dash if the value is not known.
+
+        `sign` is a format option such as `+`, and `digits` the greatest number of significant
+        digits.
         """
         number, *ends = (self.number(each, sign, digits) for each in (value, low, high))
         return number if number == DASH else f"{number} [{', '.join(ends)}]"

@@ -22,7 +22,8 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 class Spread:
     """Hold how much a paired difference of success varies between episodes, by stratum.
 
-    The mean over the H strata is unweighted, as in `statistics.paired_difference`.
+    `shares`, (H,), of all episodes are in each of H strata, and `variances` are (..., H). The mean
+    over strata is unweighted, as in `statistics.paired_difference`.
     """
 
     shares: Floats  # share of all episodes that is in each stratum, (H,); they sum to 1

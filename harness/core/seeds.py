@@ -35,14 +35,12 @@ def purpose(first: int, count: int) -> Purpose:
 
 
 def stated(first: int, count: int) -> str:
-    """Describe a range of layout seeds as printed beside a number:
-    `layout seeds 0 to 239 (tune)`.
-    """
+    """Write a range of layout seeds with its purpose: `layout seeds 0 to 239 (tune)`."""
     return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 
 
 def purposes(first: int, count: int) -> list[Purpose]:
-    """Return all purposes of the layout seeds `first` to `first + count - 1`."""
+    """Return all purposes (`tune`, `train`, `report`) of a range of `count` layout seeds."""
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
     return [

@@ -66,10 +66,9 @@ def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
 
 
 def seed_interval(per_seed_means: Floats) -> Estimate:
-    """Return the mean over seeds `(S,)` with Student's t interval; t(4) = 2.776 for 5 seeds.
+    """Return the mean over seeds `(S,)` with Student's 95 % interval, as the paper's error bars.
 
-    These are the paper's error bars.
-    One seed, or seeds that all agree, have a value and no interval.
+    With one seed, or seeds that all agree, the ends are NaN.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)))
 
@@ -79,11 +78,10 @@ def episode_interval(
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    If all episodes are alike, nothing tells how far others would be from them, so the ends are NaN.
-    Values are `(E,)`, or `(E, ...)` with more axes such as steps, over which the mean of an
-    episode's known values is taken; an episode that is all NaN is excluded. Or they are `(n,)` with
-    the episode of each: the mean is then over values, and the variance is that of a ratio of totals
-    (Cochran 1977, section 6.3).
+    Values are `(E,)`, or `(E, ...)` with more axes such as steps, over which an episode's known
+    values are averaged; an episode that is all NaN is excluded. With `episodes`, (n,), they are
+    `(n,)`, of these episodes: the mean is over values, and the variance is that of a ratio of
+    totals (Cochran 1977, section 6.3). If all episodes are alike the ends are NaN.
     """
     values = values_by_episode.reshape(
         len(values_by_episode), math.prod(values_by_episode.shape[1:])
@@ -125,15 +123,13 @@ def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
 
 
 def seed_rate_interval(values: Floats) -> Estimate:
-    """Return the mean of shares over seeds, for these episodes, with an interval over other seeds.
+    """Return the mean of shares over seeds, for fixed episodes, with an interval over other seeds.
 
-    Draws are independent between seeds and between episodes, so the variance is that of seeds
-    inside each episode. It has E (S - 1) degrees of freedom, where the means of S seeds have only S
-    - 1. Two values that deviate from the rest of their episode are added, one each way (as Bonett
-    and Price 2012 do with pairs): even if no seed changed anything, another might.
-
-    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out.
-    The number of seeds is n; one seed has a value and no interval.
+    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out. The variance is
+    that between seeds within each episode, pooled, with E (S - 1) degrees of freedom. Two values
+    that deviate from the rest of their episode are added, one each way (as Bonett and Price 2012 do
+    with pairs), since seeds that were not drawn may differ. n is the number of seeds; with one seed
+    the ends are NaN.
     """
     from harness.core.special import stdtrit
 

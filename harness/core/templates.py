@@ -401,7 +401,7 @@ def _cost(body: Iterable[nodes.Node]) -> int:
 
 
 class Bounded(Template):
-    """A compiled template, each of whose renderings has the full number of steps."""
+    """A compiled template, each of whose renderings begins with the full budget of steps."""
 
     def render(self, *given: Any, **named: Any) -> str:
         begin()
@@ -549,7 +549,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return super().getattr(obj, attribute)
 
     def getitem(self, obj: Any, argument: Any) -> Any:
-        """Return an item as Jinja does; the budget is charged for a key of a large value."""
+        """Return an item as Jinja does, after charging the budget for a key that is not plain."""
         return super().getitem(obj, argument if type(argument) in (str, int) else read(argument))
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:

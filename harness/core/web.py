@@ -97,7 +97,7 @@ def server_of(app: ASGIApp, **limits: Any) -> uvicorn.Server:
 def serve(
     app: ASGIApp, host: str, port: int, listening: Callable[[str], None], **limits: Any
 ) -> None:
-    """Serve until Ctrl-C.
+    """Serve an application by HTTP until Ctrl-C.
 
     Args:
         app: the application.

@@ -116,7 +116,7 @@ def same(
 
 
 def held(out: Path) -> bool:
-    """Return whether another process is working in a folder."""
+    """Return whether another process is working in an output folder: it holds the lock."""
     try:
         with alone(out / WORK / LOCK, GONE_S):
             return False
