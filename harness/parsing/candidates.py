@@ -28,11 +28,14 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """Hold an object in a completion that is shaped like an answer."""
+    """Hold an object in a completion that is shaped like an answer.
+
+    `lost` are repairs to drop later: they would report as missing what merely could not be read.
+    """
 
     members: dict[str, Any]  # what it holds
     repairs: frozenset[Repair] = frozenset()  # the repairs that reading it took
-    # repairs to drop from the answer: they would report as missing what could only not be read
+    # repairs to drop later: they would report as missing what merely could not be read
     lost: frozenset[Repair] = frozenset()
 
 

@@ -90,8 +90,8 @@ def distribution(
 ) -> tuple[Intent, float]:
     """Return the probabilities in the order of `actions`, summing to 1, and their sum as stated.
 
-    `repairs` receives the repairs; with `divides` any sum above 0 is divided out. Raises Failure,
-    with all statuses that apply, if `value` is no such distribution.
+    Repairs that it took are added to `repairs`; with `divides` any sum above 0 is divided out.
+    Raises Failure, with all statuses that apply, if `value` is no such distribution.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -147,7 +147,7 @@ def _check_sum(mass: float, repairs: set[Repair], divides: bool) -> None:
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
     """Return a finite number, and whether a percent sign followed it; `name` is for messages.
 
-    `repairs` receives the repairs. Raises Failure for any other value.
+    Repairs that it took are added to `repairs`. Raises Failure for any other value.
     """
     percent = False
     if isinstance(value, str):
