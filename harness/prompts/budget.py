@@ -24,7 +24,11 @@ class Outside(NamedTuple):
 
 @dataclass(frozen=True)
 class Sizes:
-    """Hold the token counts of all rendered prompts, by call, and those outside the budget."""
+    """Hold the token counts of all rendered prompts, and those outside the version's budget.
+
+    `tokens` lists them by kind of call: `ego`, `helper`, `fusion` (the ego with messages) or
+    `repair`.
+    """
 
     # by call: a role, `FUSION` or `REPAIR`
     tokens: dict[str, list[int]] = field(default_factory=dict)

@@ -173,7 +173,7 @@ def _size(messages: Iterable[Mapping[str, str]]) -> int:
 
 
 def words(a: str, b: str) -> TextChange:
-    """Compare text A with text B word by word."""
+    """Compare text A with text B word by word; return the changes with the words around them."""
     before, after = WORD.findall(a), WORD.findall(b)
     hunks, removed, added = [], 0, 0
     for group in SequenceMatcher(None, before, after, autojunk=False).get_grouped_opcodes(CONTEXT):
