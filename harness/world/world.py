@@ -224,10 +224,10 @@ class World:
         lockstep.advance([self], [until_frame])
 
     def passed(self, poses: Floats) -> None:
-        """Record the beacons of the last frames.
+        """Add the beacons that vehicles sent in the last F frames.
 
-        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4),
-        from the origin of the scenario's road.
+        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the
+        origin of the scenario's road.
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
 
