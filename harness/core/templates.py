@@ -543,7 +543,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return given
 
     def getattr(self, obj: Any, attribute: str) -> Any:
-        """Return an attribute as Jinja does, but never at compile time, when nothing is charged."""
+        """Return an attribute as Jinja does.
+
+        While a template is compiled it raises jinja2's Impossible: nothing would be charged then.
+        """
         if _account.compiles:
             raise nodes.Impossible
         return super().getattr(obj, attribute)
