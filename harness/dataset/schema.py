@@ -165,9 +165,9 @@ def plain_type(scenario: Scenario) -> type[Record]:
 
 @lru_cache(maxsize=8)
 def record_type(scenario: Scenario) -> type[Record]:
-    """Return the type of a scenario's records, narrowed to the names of the road's paths.
+    """Return `Record` with only the names allowed that the scenario's road has.
 
-    The names of its sectors and facts are those of the scenario, too.
+    These are the names of its approaches, routes, sectors and facts.
     """
     road = scenario.road()
     approach = _choice(approach for approach, _ in road.paths)
