@@ -80,7 +80,8 @@ def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
 def counts(texts: Iterable[str]) -> dict[str, int]:
     """Return the number of alternatives of each mark in some templates, by the mark's name.
 
-    Raises ValueError if a mark has one alternative, too many parts, or differing numbers of them.
+    Raises ValueError if a mark has one alternative, too many parts, a reserved name, or other
+    numbers of alternatives elsewhere, and if there are more than `MOST_MARKS` marks.
     """
     sizes: dict[str, int] = {}
     for text in texts:
