@@ -14,10 +14,11 @@ GROUP = "swarmdrive.parts"
 
 
 def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
-    """Return the parts of all extensions by name, those that ship first;
-    `taken` are others' settings.
+    """Return the `Part` subclasses that installed extensions add to operating points, by name.
 
-    Of each part that does not work a line on stderr says what is wrong with it.
+    Those that ship with the harness come first. `taken` has the names of settings in use already. A
+    part that cannot be loaded, repeats a setting or refuses its own defaults is left out, and a
+    line on stderr says why.
     """
     kinds: dict[str, type[Part]] = {}
     settings = set(taken)

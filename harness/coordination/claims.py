@@ -12,7 +12,7 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Claims:
-    """The claimed places and speeds of H helpers, and what the ego can check them against."""
+    """Hold the positions and speeds that H helpers claim, and what the ego can check them by."""
 
     # claimed place, m to the east and to the south of the centroid of the conflict zone, `(...,
     # 1+H, 2)`, the ego first; NaN for a helper that is absent
@@ -34,7 +34,7 @@ class Claims:
         return self.from_road_m(self.xy_m[..., 1:, :])
 
     def take(self, at: Any) -> "Claims":
-        """Return the claims at these indices of the leading dimension."""
+        """Return the claims at indices `at` of the leading (decision) dimension."""
         return Claims(
             self.xy_m[at],
             self.speed_mps[at],
@@ -45,7 +45,10 @@ class Claims:
         )
 
     def of_helpers(self, places: Ints) -> "Claims":
-        """Return the claims of the helpers at these indices, `(..., H')`; one may be repeated."""
+        """Return the claims of the helpers at indices `places`, `(..., H')`, from 0.
+
+        An index may be repeated.
+        """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return replace(
             self,
@@ -55,7 +58,11 @@ class Claims:
         )
 
     def moved(self, movers: Bools, xy_m: Floats) -> "Claims":
-        """Return the claims with some helpers, `(..., H)`, moved to other places, `(..., H, 2)`."""
+        """Return the claims with the claimed positions of some helpers replaced.
+
+        `movers`, `(..., H)`, says which helpers; `xy_m`, `(..., H, 2)`, has their new positions in
+        m.
+        """
         ego, helpers = np.split(self.xy_m, [1], axis=-2)
         return replace(
             self, xy_m=np.concatenate([ego, np.where(movers[..., None], xy_m, helpers)], axis=-2)

@@ -17,7 +17,7 @@ from harness.core.arrays import Bools, Floats, summed
 
 @dataclass(frozen=True)
 class Messages:
-    """What an ego has to fuse. Index 0 is the ego, 1+h is helper h."""
+    """Hold what a consensus rule fuses in each decision: index 0 is the ego, 1+h is helper h."""
 
     # what each vehicle intends, `(..., 1+H, A)`; the row of a helper not heard may hold anything
     intents: Floats
@@ -38,7 +38,7 @@ class Messages:
 
 
 class Fused(NamedTuple):
-    """The result of a rule."""
+    """Hold what a consensus rule returns for each decision."""
 
     policy: Floats  # the distributions after fusion, `(..., A)`
     # each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights
@@ -51,12 +51,14 @@ class Fused(NamedTuple):
 
 @runtime_checkable
 class Rule(Protocol):
-    """A pure function of arrays, with its own memory for each episode.
+    """Describe a consensus rule: it fuses the action probabilities of the ego and its helpers.
 
-    The steps of an episode are fused in order, each from the state that the last one left. This
-    includes steps in which the ego hears nobody; there it acts on its own intent, whatever the rule
-    returns. A rule that uses `Messages.claims` has `needs = ("claims",)`. One that has `needs =
-    ("plans",)` reads what agents are themselves going to do, and no other rule does.
+    A rule is a pure function of arrays; its memory is an argument, one row an episode. The steps of
+    an episode are fused in order, each from the memory that the last one returned. This includes
+    steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns.
+    A rule that uses `Messages.claims` has `needs = ("claims",)`. With `needs = ("plans",)` it reads
+    what each agent itself plans to do, and the ego's own intent is then its plan; no other rule
+    sees plans.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
@@ -68,24 +70,27 @@ class Rule(Protocol):
 
 @dataclass(frozen=True)
 class Pool:
-    """A rule without memory: a function of (p, weights)."""
+    """Make a consensus rule without memory of a function `pool` of (intents, weights).
+
+    `pool` takes intents `(..., 1+H, A)` and weights `(..., 1+H)`, and returns policies `(..., A)`.
+    """
 
     pool: Callable[[Floats, Floats], Floats]
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return an empty memory."""
+        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`."""
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Apply the function; the state does not matter."""
+        """Return the pool of the messages' intents and weights; `state` is passed on unchanged."""
         return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
-    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2);
-    0 for a helper not heard.
+    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2).
 
-    If no helper is heard, the ego's weight is exactly 1: the paper's fall-back to its own intent.
+    It is 0 for a helper not heard. If no helper is heard, the ego's weight is exactly 1: the
+    paper's fall-back to its own intent.
 
     Args:
         distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
@@ -100,9 +105,10 @@ def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: f
 
 
 def capped(weights: Floats, most: float) -> Floats:
-    """Return weights `(..., 1+H)` with no helper's above `most`; the others share what it loses.
+    """Return weights `(..., 1+H)` in which no helper has more than the share `most`, from 0 to 1.
 
-    The ego's weight may grow beyond `most`. The sum of the weights stays 1.
+    What a capped helper loses goes to the other vehicles in proportion to their weights, so the sum
+    stays 1. The ego (index 0) is never capped and may end above `most`.
     """
     is_capped = np.zeros(weights.shape, dtype=bool)
     scaled = weights
@@ -116,8 +122,7 @@ def capped(weights: Floats, most: float) -> Floats:
 
 
 def linear_pool(p: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean of intents,
-    `(..., A)` (paper Eq. 1; the linear opinion pool of Stone 1961).
+    """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; opinion pool of Stone 1961).
 
     Args:
         p: intents, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
@@ -128,10 +133,10 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 
 
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
-    """Return the weighted geometric mean of intents,
-    `(..., A)` (logarithmic opinion pool, Genest 1984).
+    """Return the weighted geometric mean of intents, scaled to sum to 1, `(..., A)` (Genest 1984).
 
-    A probability below `floor` counts as `floor`, so that one rounded 0 is no veto.
+    Arguments as in `linear_pool`. A probability below `floor` counts as `floor`, so that one
+    rounded 0 is no veto.
     """
     row_weights = weights[..., None]
     logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
@@ -142,9 +147,9 @@ def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
 def median(p: Floats, weights: Floats) -> Floats:
     """Return the weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    If exactly half of the weight lies on either side, it is the mean of the two values in the
-    middle. All medians are 0 if each vehicle is sure of another action; then the linear pool
-    replaces them.
+    Arguments as in `linear_pool`. If exactly half of the weight lies on either side, it is the mean
+    of the two values in the middle. If all medians are 0, as where each vehicle is sure of another
+    action, the linear pool replaces them.
     """
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
@@ -153,10 +158,10 @@ def median(p: Floats, weights: Floats) -> Floats:
 
 
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean of each action's probability, scaled to sum to 1, `(..., A)`.
+    """Return the weighted trimmed mean of each action's probability, scaled to sum to 1.
 
-    The lowest and the highest quarter of the weight are left out. The rule lies between the median,
-    which leaves out all but the middle, and the linear pool, which leaves out nothing.
+    The result is `(..., A)`; arguments are as in `linear_pool`. The lowest and the highest quarter
+    of the weight are left out: more than the linear pool leaves out, and less than the median.
     """
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)
@@ -185,6 +190,9 @@ def _pick(values: Floats, reached: Bools) -> Floats:
 
 
 def scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
-    """Return a pool scaled to sum to 1, `(..., A)`; where all of it is 0, the linear pool."""
+    """Return `pooled`, `(..., A)`, scaled to sum to 1; a row of zeros becomes the linear pool.
+
+    That pool is of the intents `p`, `(..., 1+H, A)`, by `weights`, `(..., 1+H)`.
+    """
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))

@@ -44,64 +44,80 @@ BY_MODELS = frozenset((INTENTS, WORDS))  # what a helper's model is asked for
 
 
 class Call:
-    """A further question to the ego's model, with what it has heard."""
+    """Describe a second question to the ego's model, which shows it what it has heard from helpers.
 
-    name: ClassVar[str]  # marks it in the keys of what was heard
-    in_graph: ClassVar[bool] = False  # whether the ego's graph has what was heard
-    in_words: ClassVar[bool] = False  # whether the prompt has it
+    Some contents of messages have one (`Content.call`): the question adds the helpers' objects to
+    the ego's scene graph (`in_graph`) or their words to its prompt (`in_words`).
+    """
+
+    name: ClassVar[str]  # stands in the keys of the answers to it
+    in_graph: ClassVar[bool] = False  # whether what was heard is added to the ego's scene graph
+    in_words: ClassVar[bool] = False  # whether what was heard is added to the prompt as text
 
     def graphs(
         self, scenario: "Scenario", cases: Sequence["Heard"]
     ) -> Sequence["SceneGraph | None"]:
-        """Return the ego's graph of each case; None where its own stays. All are of one seat."""
+        """Return the scene graph to show the ego in each case, or None where its own graph stays.
+
+        Each case has what one ego sees and has heard; all are of the same vehicle of the scenario.
+        """
         return [None] * len(cases)
 
     def words(self, evidence: str) -> str:
-        """Return the line that the prompt shows of a helper's words."""
+        """Return one helper's free text (`evidence`) as the line that the ego's prompt shows."""
         return " ".join(evidence.split())
 
 
 class Content:
-    """What a message holds; plainly, a helper's intent, with its words beside it."""
+    """Describe what helpers' messages hold, an operating point's setting `content`.
+
+    This base class is a helper's intent with its words; subclasses hold objects, words alone, or
+    plans.
+    """
 
     holds: frozenset[str]  # some of the kinds above
     needs: tuple[str, ...] = ()  # what it needs of the world, some of `NEEDS`
-    call: Call | None = None  # what the ego is asked once more; None if it is not
+    call: Call | None = None  # second question to the ego's model; None without one
 
     @property
     def of_agents(self) -> bool:
-        """Whether its senders are agents, whose messages are made of what they decide now."""
+        """Whether senders are agents that decide for themselves, and send what they plan to do."""
         return PLANS in self.holds
 
     @property
     def asks_helpers(self) -> bool:
-        """Whether the helper's model is asked for it."""
+        """Whether a helper's model must be asked before it can send such a message."""
         return not self.holds.isdisjoint(BY_MODELS)
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        """Return why it cannot be played in a run, and what to do; None if it can."""
+        """Return why this content cannot be used under `point` in `run`, and remedy, or None."""
         return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        """Return what helpers intend, (n, ...), of whom only those are valid that can send it.
+        """Return `intents` of n decisions; only helpers that can send this content stay valid.
 
-        `senders` has the decision that each helper makes itself now, (n, H), if it needs `plans`.
+        `senders`, `(n, H)`, is needed where messages hold plans: row of the decision that each
+        helper makes itself at this time, -1 for none. May also change helpers' inference times.
+        Raises UserError if it needs `senders` and they are None.
         """
         return intents
 
     def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
-        """Return the size of each helper's reply, `(..., H)`."""
+        """Return the size of each helper's reply in bits, `(..., H)`.
+
+        `encoding` is one of `encodings.ENCODINGS`; `headers` adds those of network and transport.
+        """
         return intent_bits(encoding, intents, headers)
 
 
 class OfIntent(Content):
-    """The paper's."""
+    """The paper's content: a helper's intent for the ego, with its words."""
 
     holds = frozenset((INTENTS, WORDS))
 
 
 class OfPlan(Content):
-    """What its sender is itself going to do: the answer that it gave as an agent."""
+    """The content `plan`: the action probabilities by which the sender, an agent, acts itself."""
 
     holds = frozenset((PLANS,))
     needs = (PLANS,)
@@ -139,10 +155,10 @@ NO_AGENTS = (
 
 
 class Contents(Plugins[Content]):
-    """All contents, by name. A package's call has the name of its content."""
+    """Hold all contents of messages by name, those of installed packages included."""
 
     def check(self, name: str, plugin: Content) -> None:
-        """Raise ValueError for a package's content that says of itself what does not go."""
+        """Raise ValueError if a package's content contradicts itself, as in `holds` and `needs`."""
         if not NAME.fullmatch(name) or name == WHOLE:
             raise ValueError("its name is no plain word")
         if name in _own_calls():
@@ -194,7 +210,10 @@ def is_ours(call: Call) -> bool:
 
 
 def of_any_model() -> list[str]:
-    """Return the contents that helpers can send, and egos read, whatever answers for them."""
+    """Return the names of contents that work with every backend, language model or not.
+
+    Left out are plans, and contents whose words the ego's model must read.
+    """
     names = []
     for name, content in CONTENTS.usable().items():
         in_words = content.call is not None and content.call.in_words

@@ -33,7 +33,10 @@ MOST_CHARACTERS = 10_000  # of a helper's words
 
 
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
-    """Return why a condition's content cannot be played in a run; None if it can."""
+    """Return why the point's content cannot be used in `run`, in one line; None if it can.
+
+    Raises UserError if a package's content fails or returns no text.
+    """
     content, prompt = point.content, run.agents[0].prompt
     if point.has_fusion_call and content.call and content.call.in_words and not prompt.shows_words:
         return (
@@ -46,7 +49,11 @@ def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
 
 
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-    """Return what helpers intend, of whom only those are valid that can send the content."""
+    """Return `intents` with `valid` true only for helpers that can send the point's content.
+
+    As `Content.able`. Of a package's content only `valid`, helpers' inference times and `unasked`
+    may change; raises UserError if it fails or changes anything else.
+    """
     content = point.content
     if CONTENTS.is_ours(point.ask.content):
         return content.able(point, intents, senders)
@@ -72,7 +79,10 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
 
 
 def bits(point: "OperatingPoint", intents: Intents) -> Floats:
-    """Return the size of each helper's reply by its condition's content, `(..., H)`."""
+    """Return the size in bits of each helper's reply with the point's content, `(..., H)`.
+
+    Raises UserError if a package's content fails or gives sizes outside 0 to `MOST_BITS`.
+    """
     content, encoding, headers = point.content, point.radio.encoding, point.physical is not None
     if CONTENTS.is_ours(point.ask.content):
         return content.bits(encoding, intents, headers)
@@ -88,7 +98,10 @@ def bits(point: "OperatingPoint", intents: Intents) -> Floats:
 def graphs(
     call: Call, scenario: "Scenario", cases: Sequence["Heard"]
 ) -> Sequence[SceneGraph | None]:
-    """Return the ego's graph of each case, by what it has heard."""
+    """Return the scene graph that a second question shows the ego in each case; None keeps its own.
+
+    As `Call.graphs`. Raises UserError if a package's call fails or returns another vehicle's graph.
+    """
     if is_ours(call):
         return call.graphs(scenario, cases)
     with worded(_content(call.name)):
@@ -102,7 +115,10 @@ def graphs(
 
 
 def words(call: Call, evidence: str) -> str:
-    """Return the line that the prompt shows of a helper's words."""
+    """Return one helper's free text (`evidence`) as the line that the ego's prompt shows.
+
+    As `Call.words`. Raises UserError if a package's call fails or its line is too long.
+    """
     if is_ours(call):
         return call.words(evidence)
     with worded(_content(call.name)):

@@ -46,7 +46,7 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 
 @dataclass(frozen=True)
 class FusionInputs:
-    """What fusion needs beyond the messages."""
+    """Hold what `coordinate` and `fuse` need besides intents and draws; each may be None."""
 
     # the fusion call; required if the point's consensus is `ego-prompt`
     call: FusionCall | None = None
@@ -59,7 +59,10 @@ class FusionInputs:
 
 @dataclass(frozen=True)
 class Coordination(Exchange):
-    """What happened in each decision. Times are seconds from the start of the decision."""
+    """Hold all that happened in each decision: exchange, fused policy, action and latency.
+
+    Made by `coordinate` and `fuse`. Times are seconds from the start of the decision.
+    """
 
     # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
     weights: Floats
@@ -81,15 +84,18 @@ class Coordination(Exchange):
 
     @property
     def fusion_s(self) -> Floats:
-        """The part of the latency that fusion takes, `(...)`."""
+        """Seconds that fusion takes after the exchange, `(...)`; 0 without a fusion call."""
         return self.latency_s - self.exchange_s
 
 
 def coordinate(
     point: OperatingPoint, intents: Intents, draws: Draws, fusion: FusionInputs | None = None
 ) -> Coordination:
-    """Run trigger, channel and fusion for decisions `(...)` with up to H helpers and A actions
-    each.
+    """Play decisions `(...)` under one operating point, from asking helpers to the ego's action.
+
+    `intents` has up to H helpers and A actions in each decision; `draws` are the channel's random
+    numbers. `fusion` is needed where the point makes a fusion call, its rule has memory, or ties
+    are drawn. Raises UserError if a package's plug-in fails.
     """
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 
@@ -97,7 +103,12 @@ def coordinate(
 def fuse(
     point: OperatingPoint, heard: Exchange, intents: Intents, fusion: FusionInputs | None = None
 ) -> Coordination:
-    """Decide once it is known who was heard; the other arguments as in `coordinate`."""
+    """Return the fused policies, actions and latencies, given an exchange of messages.
+
+    The second half of `coordinate`: `heard` is the result of `exchange` on the same point and
+    intents. Raises ValueError if the point makes a fusion call and `fusion` has none, and UserError
+    if a package's rule fails.
+    """
     fusion = fusion or FusionInputs()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)
     distance_m = intents.distance_m

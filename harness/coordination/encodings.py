@@ -22,7 +22,10 @@ SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 
 
 def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
-    """Return the size of each helper's intent with its words, `(..., H)`."""
+    """Return the size in bits of each helper's message with its intent and its words, `(..., H)`.
+
+    `headers` adds those of network and transport, except under `json`.
+    """
     if encoding == JSON:
         return intents.payload_bits
     counts = Counts(actions=intents.own.shape[-1], text_bytes=_text_bytes(intents))
@@ -30,7 +33,10 @@ def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
-    """Return the size of each helper's words alone, `(..., H)`."""
+    """Return the size in bits of each helper's message with its words alone, `(..., H)`.
+
+    `headers` adds those of network and transport, except under `json`.
+    """
     if encoding == JSON:
         return 8 * (len(SAYS) + _text_bytes(intents))
     counts = Counts(text_bytes=_text_bytes(intents))
@@ -38,7 +44,11 @@ def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
-    """Return the size of each helper's list of objects, `(..., H)`, which `intents` has."""
+    """Return the size in bits of each helper's list of detected objects, `(..., H)`.
+
+    `intents` must have `objects` and `object_bits`. `headers` adds those of network and transport,
+    except under `json`.
+    """
     assert intents.object_bits is not None
     assert intents.objects is not None
     if encoding == JSON:
@@ -47,13 +57,14 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size of a request to so many helpers, by an encoding that is not `json`."""
+    """Return the size in bits of a request to `helpers` vehicles; `encoding` is `etsi` or `sae`."""
     return float(_packet(encoding, "request", Counts(helpers=helpers), headers))
 
 
 def beacon_bytes(encoding: str, rate_hz: float) -> int:
-    """Return the mean size of a vehicle's beacons by an encoding that is not `json`,
-    at so many a second.
+    """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
+
+    `encoding` is `etsi` (CAM) or `sae` (BSM).
     """
     return messages.beacon_bytes(_standard(encoding), rate_hz)
 

@@ -48,8 +48,9 @@ from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 
 @dataclass(frozen=True)
 class Exchange:
-    """What was sent and heard in each decision.
-    Times are seconds from the start of the decision.
+    """Hold who was asked, what was sent and who was heard in each decision.
+
+    Made by `exchange`. Times are seconds from the start of the decision.
     """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
@@ -86,29 +87,27 @@ class Exchange:
 
     @cached_property
     def normalised_entropy(self) -> Floats:
-        """Entropy of `own` over ln A, `(...)`."""
+        """Entropy of the ego's intent `own` over ln A, from 0 (sure) to 1 (uniform), `(...)`."""
         return normalised_entropy(self.own)
 
     @cached_property
     def messages(self) -> Ints:
-        """The number of scheduled replies of all rounds, `(...)`;
-        like the paper, without requests.
-        """
+        """Number of scheduled replies of all rounds, `(...)`; like the paper, without requests."""
         return count_of(self.asked) + self.repeats
 
     @cached_property
     def lost(self) -> Ints:
-        """The number of messages that did not arrive, `(...)`."""
+        """Number of asked helpers whose reply did not reach the ego, `(...)`."""
         return count_of(self.asked & ~self.delivered)
 
     @cached_property
     def late(self) -> Ints:
-        """The number of messages that arrived after the window, `(...)`."""
+        """Number of replies that arrived after the decision window and are not fused, `(...)`."""
         return count_of(self.delivered & ~self.on_time)
 
     @cached_property
     def observed_loss(self) -> Floats:
-        """The share of the messages that did not arrive, `(...)`; NaN without messages."""
+        """Share of asked helpers whose reply did not arrive, `(...)`; NaN if nobody was asked."""
         asked = count_of(self.asked)
         return np.where(asked > 0, self.lost / np.maximum(asked, 1), np.nan)
 
@@ -116,11 +115,11 @@ class Exchange:
 def exchange(
     point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None
 ) -> Exchange:
-    """Run schedule and channel for decisions `(...)` with up to H helpers.
-    An unknown time counts as 0.
+    """Play schedule and radio channel for decisions `(...)` with up to H helpers; nothing is fused.
 
-    If `asked`, `(..., H)`, is given, these of the helpers in the radius are asked instead of those
-    that the point's schedule chooses.
+    The point's schedule chooses whom the ego asks, unless `asked`, `(..., H)`, is given: then it
+    asks these of the helpers in the radius. An unknown inference time counts as 0 s. Raises
+    UserError if the point needs what `intents` or `draws` lack, or if a package's plug-in fails.
     """
     own_failed, known = _base_knowledge(point, intents)
     in_radius = known.may_ask
@@ -161,13 +160,12 @@ def exchange(
 
 
 def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
-    """Return the helpers whose answers decide what happens, `(..., H)`;
-    an unasked one counts as valid.
+    """Return which helpers' answers can change the outcome of each decision, `(..., H)`.
 
-    Once none of them is unasked, the answers of all others change nothing. They are the helpers
-    that are asked; those in the radius, too, if the channel's load or the schedule depends on who
-    would answer; and all that are present under an attack, which may use what any of them intends
-    now or later.
+    For asking models lazily: once the models of all these have answered, the answers of others
+    change nothing. They are the helpers that are asked; all in the radius, if the channel's load or
+    the schedule depends on who would answer; and all present ones, if a part (such as an attack)
+    needs them. A helper whose model was not asked yet counts as one with a valid answer.
     """
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
@@ -238,7 +236,11 @@ def _ask_helpers(
 
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Return what asking each helper is worth by the point's schedule, `(..., H)` or `(..., 1)`."""
+    """Return the point's schedule's value of asking each helper, in its own unit.
+
+    The shape is `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. The
+    schedule asks those above its threshold. Raises UserError if a package's schedule fails.
+    """
     return _worth(point, known_of(point, intents, draws))
 
 
@@ -255,7 +257,11 @@ def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
-    """Return what the ego knows before it asks, with what the point's schedule needs."""
+    """Return what the point's schedule is given: what the ego knows before it asks anybody.
+
+    Raises UserError if the schedule needs positions and the decisions have none (the paper's
+    study).
+    """
     return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 
 
@@ -333,8 +339,10 @@ def _ask_directly(
 
 
 def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Return the seconds until each vehicle has its intent, `(..., 1+H)`;
-    the ego's may come from a cloud.
+    """Return the seconds from a decision's start until each vehicle has its intent, `(..., 1+H)`.
+
+    The ego comes first; where its model runs in a cloud, its time has the network's round trip.
+    Raises UserError if that is to be drawn and `draws` are of no layouts (the paper's study).
     """
     ego_s: Floats | float = intents.inference_s[..., 0]
     if point.cloud.round_trip_s is not None:

@@ -17,8 +17,10 @@ from harness.radio.channel import Site
 
 @dataclass(frozen=True)
 class Intents:
-    """What every vehicle intends, and what the reply to a request would cost;
-    H helpers, A actions.
+    """Hold, for decisions `(...)` with H helpers and A actions, each vehicle's answer and its cost.
+
+    The intent of a vehicle is its probabilities of the ego's actions. Beside them are distances,
+    sizes of replies, inference times, and what optional parts of coordination need.
     """
 
     own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
@@ -59,7 +61,7 @@ class Intents:
     own_text_bytes: Floats | None = None
 
     def take(self, at: Any) -> "Intents":
-        """Return the decisions at these indices of the leading dimension."""
+        """Return the decisions at indices `at` of the leading dimension."""
         return replace(
             self,
             site=self.site and self.site.take(at),
@@ -70,15 +72,19 @@ class Intents:
         )
 
     def replaced(self, at: Ints, newer: "Intents") -> "Intents":
-        """Return the same with the decisions `newer` at these indices; places and claims stay."""
+        """Return a copy whose decisions at indices `at` have the arrays of `newer`.
+
+        `site`, `outlook`, `claims` and `plans` stay those of this object.
+        """
         arrays = {name: array.copy() for name, array in self.arrays().items()}
         for name, values in newer.arrays().items():
             arrays[name][at] = values
         return replace(self, **arrays)
 
     def without_models(self) -> "Intents":
-        """Return what helpers send whose messages hold objects alone:
-        whoever is present, and at once.
+        """Return the intents for messages that list objects and need no answer of a helper's model.
+
+        Every present helper is then valid, has an inference time of 0 s, and is not waited for.
         """
         own_s = self.inference_s[..., :1]
         return replace(
@@ -89,18 +95,20 @@ class Intents:
         )
 
     def with_words(self) -> "Intents":
-        """Return what helpers send whose messages hold words alone:
-        one without words sends nothing.
+        """Return the intents for messages of words alone: without a text a helper is not valid.
+
+        A helper whose model was not asked yet stays valid.
         """
         said = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
         unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
         return replace(self, valid=self.valid & ((said > 0) | unasked))
 
     def planned(self, senders: Ints) -> "Intents":
-        """Return what agents (n,) hear whose messages hold plans,
-        by the row of each sender (n, H) or -1.
+        """Return the intents of n agents, each with the plans of the H agents that it hears.
 
-        Only whoever decides now, and whose answer could be read, has a plan to send.
+        Decisions are of agents that decide at one time, one a row; `senders`, `(n, H)`, has the row
+        of each sender, -1 for a vehicle that does not decide now. Such a vehicle, and an agent
+        whose answer did not parse, is not valid. Needs `plans`, `own_bits` and `own_text_bytes`.
         """
         assert self.plans is not None
         assert self.own_bits is not None
@@ -121,8 +129,9 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Concatenate decisions with the same number of vehicles;
-        none has a site, an outlook or claims.
+        """Return the decisions of all `parts`, concatenated along the leading dimension.
+
+        All must have the same number of vehicles and no `site`, `outlook`, `claims` or `plans`.
         """
         arrays = [part.arrays() for part in parts]
         joint: dict[str, Any] = {}
@@ -131,7 +140,10 @@ class Intents:
         return cls(**joint)
 
     def of_first(self, helpers: int) -> "Intents":
-        """Return only the first helpers, of decisions without a site, an outlook or claims."""
+        """Return the decisions with only the first `helpers` helpers of each.
+
+        There must be no `site`, `outlook` or `claims`.
+        """
         cut = {
             name: array[..., : helpers + (name in WITH_EGO)]
             for name, array in self.arrays().items()
@@ -140,8 +152,9 @@ class Intents:
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
-        """Return the helpers at these indices `(n, H')`, of decisions `(n, H)`;
-        one may be repeated.
+        """Return decisions `(n, H)` with the helpers at indices `places`, `(n, H')`, from 0.
+
+        An index may be repeated: one vehicle then speaks with several voices.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         selected = {
@@ -161,7 +174,7 @@ class Intents:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return the arrays that are not None, by name."""
+        """Return the array fields that are not None, by field name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
             name: value for name, value in values.items() if name not in PARTS and value is not None

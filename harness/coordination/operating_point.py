@@ -78,14 +78,15 @@ IN_NO_TEXT = ("profile", "further")  # settings that a condition's text has in a
 
 @cache
 def more_parts() -> Mapping[str, type[Part]]:
-    """Return the parts that extensions add, by name; their packages are imported."""
+    """Return the `Part` subclasses of installed extensions, by name; imports their packages."""
     return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
 
 
 @cache
 def part_of_settings() -> Mapping[str, str]:
-    """Return the part of each setting,
-    in the order in which manifests and conditions have them, flat.
+    """Return for each setting of an operating point the name of its part.
+
+    The order is that of the flat records in manifests and run files.
     """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
     for part, kind in more_parts().items():
@@ -96,21 +97,23 @@ def part_of_settings() -> Mapping[str, str]:
 
 @cache
 def typed_settings() -> tuple[str, ...]:
-    """Return the settings that a condition's text has by their names."""
+    """Return the settings that can be typed in a condition such as `6g:tau=0.5`, by full name."""
     return tuple(key for key in part_of_settings() if key not in IN_NO_TEXT)
 
 
 @cache
 def settings_alone() -> Collection[str]:
-    """Return the settings of an ego that asks nobody."""
+    """Return the settings that still have an effect on an ego without a channel."""
     core = ("fallback", "round_trip", "round_trip_s", "window_s")
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
     return {*core, *chain(*of_extensions)}
 
 
 def change_of(text: str) -> Change:
-    """Return what is done to a message, by a text of its key.
-    Raises UserError for one that no part does.
+    """Return the change of messages that `text` names in the key of a fusion call's answer.
+
+    `text` is one that some part's `changes` gave, such as `liar:share=1/3` or `quoted`. Raises
+    UserError if no installed part knows it.
     """
     for kind in more_parts().values():
         if (change := change_by(kind, text)) is not None:
@@ -120,8 +123,9 @@ def change_of(text: str) -> Change:
 
 @cache
 def calls() -> Mapping[str, Call]:
-    """Return the further questions to the ego that contents ask, by name;
-    none of a package's by whose name a part changes messages.
+    """Return the second questions that contents of messages ask the ego's model, by name.
+
+    A package's call is left out if some part already changes messages by that name.
     """
     by_name: dict[str, Call] = {}
     for content in CONTENTS.usable().values():
@@ -137,13 +141,16 @@ def _changes_messages(text: str) -> bool:
 
 @cache
 def questions() -> Mapping[str, Question]:
-    """Return what helpers may be asked, by name; the plain question has an empty one."""
+    """Return the questions that helpers may be asked, by name; the ordinary one has the name ""."""
     others = chain(*(kind.questions for kind in more_parts().values()))
     return {"": PLAIN, **{question.name: question for question in others}}
 
 
 def question_under(settings: Mapping[str, Any]) -> Question:
-    """Return what helpers are asked under a recorded condition, whatever else it names."""
+    """Return the question that helpers were asked under a condition's recorded, flat settings.
+
+    Settings that belong to no installed part are ignored.
+    """
     for kind in more_parts().values():
         own = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
         if kind.questions and own:
@@ -152,13 +159,16 @@ def question_under(settings: Mapping[str, Any]) -> Question:
 
 
 class Rewrites(NamedTuple):
-    """How a fusion call shows messages."""
+    """Describe how a fusion call shows helpers' messages to the ego's model.
 
-    question: str = ""  # the name of what helpers are asked; empty for the plain question
-    changes: Changes = Changes()  # what is done to messages
-    call: str = ""  # the name of what the content asks the ego (`contents.Call`); empty for none
+    It becomes part of the key under which the call's answer is kept.
+    """
+
+    question: str = ""  # name of the question that helpers were asked; empty for the ordinary one
+    changes: Changes = Changes()  # changes by attacks and defences
+    call: str = ""  # name of the content's second question (`contents.Call`); empty for none
     whole: bool = True  # whether the prompt shows all of each message
-    elsewhere: bool = False  # whether they come from other scenes
+    elsewhere: bool = False  # whether messages come from other scenes
 
 
 AS_SENT = Rewrites()
@@ -166,14 +176,17 @@ AS_SENT = Rewrites()
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The settings of one condition, in parts. Raises UserError for what does not go together."""
+    """Hold the settings of one condition: all that a decision depends on besides scene and model.
+
+    Settings are grouped in parts, and also have flat names. Raises UserError if they contradict.
+    """
 
     name: str  # in reports
     radio: Radio = Radio()  # noqa: RUF009 (parts are frozen)
     ask: Ask = Ask()  # noqa: RUF009
     fusion: Fusion = Fusion()  # noqa: RUF009
     cloud: Cloud = Cloud()  # noqa: RUF009
-    # those of extensions that do something, in the order of `more_parts`
+    # extensions' parts that differ from their defaults, in the order of `more_parts`
     more: tuple[Part, ...] = ()
 
     def __post_init__(self) -> None:
@@ -236,16 +249,18 @@ class OperatingPoint:
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
-        """Return the point of flat settings.
-        Raises UserError for one that is unknown or not allowed.
+        """Return the operating point `name` with some flat settings; others have their defaults.
+
+        Raises UserError for an unknown channel profile, or a value that is not allowed.
         """
         return cls(name).changed(profile=profile, **settings)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
-        """Return the operating point of a configuration's table; without a profile it has no V2V.
+        """Return the operating point of a TOML or JSON table of flat settings, with its `name`.
 
-        Raises UserError for an unknown key, or for a value that is not allowed.
+        Without a `profile` it has no radio. Raises UserError for an unknown key, or for a value
+        that is not allowed.
         """
         allowed = ["name", *(RECORDED.get(key, key) for key in part_of_settings())]
         values = without_gone(values)
@@ -260,7 +275,7 @@ class OperatingPoint:
 
     @staticmethod
     def types() -> dict[str, Any]:
-        """Return the types of what `record` returns."""
+        """Return the type of each key of the table that `record` returns."""
         hints = {part: get_type_hints(kind) for part, kind in {**PARTS, **more_parts()}.items()}
         types: dict[str, Any] = {"name": str}
         for key, part in part_of_settings().items():
@@ -268,9 +283,10 @@ class OperatingPoint:
         return types
 
     def record(self) -> dict[str, Any]:
-        """Return the flat settings, as manifests have them; `from_dict` reads them.
+        """Return the name and all flat settings, as run files keep them; `from_dict` reads them.
 
-        Those of an extension are there where they do something: without it, others' runs are read.
+        Settings of an extension's part that has only its defaults are left out, so that runs
+        without that extension can be read where it is not installed.
         """
         active = {type(part) for part in self.more}
         idle = {name for name, kind in more_parts().items() if kind not in active}
@@ -281,7 +297,7 @@ class OperatingPoint:
         return record
 
     def setting(self, key: str) -> Any:
-        """Return a setting by its flat name."""
+        """Return the value of a setting by its flat name, such as `tau_nats`."""
         return getattr(self._part(part_of_settings()[key]), key)
 
     def _part(self, name: str) -> Part:
@@ -293,8 +309,9 @@ class OperatingPoint:
         return next((part for part in self.more if type(part) is kind), kind())
 
     def changed(self, **settings: Any) -> "OperatingPoint":
-        """Return the point with some settings changed by their flat names, or its name.
-        Raises UserError.
+        """Return a copy with some settings, or the `name`, changed; keywords are flat names.
+
+        Raises UserError for a value that is not allowed, or settings that contradict each other.
         """
         name = settings.pop("name", self.name)
         by_part: dict[str, dict[str, Any]] = {}
@@ -314,10 +331,10 @@ class OperatingPoint:
 
     @cached_property
     def channel(self) -> Channel:
-        """The profile's channel with the point's overrides;
-        its file is read once, when the point is made.
+        """The radio channel: that of the profile with this point's overrides, or one without V2V.
 
-        Raises UserError for an override of a setting that the profile does not have.
+        Read once, when the point is made. Raises UserError for an override of a setting that the
+        profile does not have.
         """
         radio = self.radio
         if radio.profile is None:
@@ -356,9 +373,7 @@ class OperatingPoint:
 
     @cached_property
     def physical(self) -> Physical | None:
-        """The channel if its losses follow from where vehicles are;
-        None if it has one loss for all links.
-        """
+        """The channel, if its losses follow from vehicles' positions; None if links are alike."""
         return self.channel if isinstance(self.channel, Physical) else None
 
     def _relayed(self, channel: Channel) -> Channel:
@@ -383,26 +398,30 @@ class OperatingPoint:
 
     @property
     def unit(self) -> Unit | None:
-        """The roadside unit; None if there is none, or none with a place."""
+        """Position and antenna height of the roadside unit; None without one, or without positions.
+
+        Links have positions only where the channel is `physical`.
+        """
         return self._unit if self.radio.edge != "none" and self.physical else None
 
     @cached_property
     def network(self) -> Network | None:
-        """The network to a cloud, or None; its file is read once.
-        Raises UserError if it is unknown.
+        """The network between the ego and its model in a cloud; None if round trips are not drawn.
+
+        Raises UserError if the setting `round_trip` names none.
         """
         return network(self.cloud.round_trip) if self.cloud.round_trip else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
-        """Return the point with these settings of its channel.
-        Raises UserError for an unknown setting.
+        """Return a copy with some settings of its channel changed: texts by name.
+
+        Raises UserError for an unknown setting or a value that is not allowed.
         """
         texts = {**pairs(self.radio.further), **settings}
         return self.changed(further=",".join(f"{key}={value}" for key, value in texts.items()))
 
     def idle(self, setting: str | None) -> str | None:
-        """Return why a setting changes nothing here, whatever its value;
-        None if it may change something.
+        """Return why changing one setting of this point cannot change a result; None if it may.
 
         Args:
             setting: a setting of the point or of its channel; None for the number of vehicles.
@@ -443,8 +462,9 @@ class OperatingPoint:
         return None
 
     def prepared(self, intents: Intents) -> Intents:
-        """Return what vehicles intend, (n, ...),
-        as its parts have it before anything is made of it.
+        """Return the intents of n decisions after each part of an extension has corrected them.
+
+        This is done first, before fallback, schedule and fusion: a calibration is such a part.
         """
         for part in self.more:
             intents = prepared(part, intents)
@@ -452,7 +472,7 @@ class OperatingPoint:
 
     @property
     def asks(self) -> bool:
-        """Whether an ego may ask a helper here at all."""
+        """Whether an ego may ask helpers at all: there are a channel and a schedule that asks."""
         return (
             self.radio.profile is not None
             and self.ask.max_helpers > 0
@@ -460,8 +480,9 @@ class OperatingPoint:
         )
 
     def needs(self, what: str) -> bool:
-        """Return whether its content, schedule, rule or a part needs `in_time`, `outlook`,
-        `lot`, `claims`, `objects` or `plans`.
+        """Return whether some part, schedule, rule or content needs an optional input named `what`.
+
+        That is `in_time`, `outlook` or `lot` of a schedule, or `claims`, `objects` or `plans`.
         """
         return what in self._needs
 
@@ -480,7 +501,7 @@ class OperatingPoint:
 
     @cached_property
     def needs_all(self) -> bool:
-        """Whether a part of it needs what every helper intends that is present."""
+        """Whether some part, such as an attack, needs the intents of all present helpers."""
         needing = []
         for part in self.more:
             with worded_part(part):
@@ -489,36 +510,39 @@ class OperatingPoint:
 
     @property
     def content(self) -> Content:
-        """What a message holds."""
+        """The content of helpers' messages, by the setting `content`."""
         return CONTENTS[self.ask.content]
 
     @property
     def request_bits(self) -> float:
-        """Size of a request."""
+        """Size of a request to helpers, in bits."""
         if self.radio.encoding == JSON:
             return self.ask.request_bits
         return request_bits(self.radio.encoding, self.ask.max_helpers, self.physical is not None)
 
     @property
     def has_fusion_call(self) -> bool:
-        """Whether fusion asks the ego's model a second time, with the messages or what they add."""
+        """Whether the ego's model is asked a second time, with what the ego has heard."""
         return self.radio.profile is not None and self.asks_again
 
     @property
     def asks_again(self) -> bool:
-        """The same of a point whatever its channel."""
+        """Whether the settings ask for such a second question, even if the point has no channel."""
         return self.fusion.consensus == EGO_PROMPT or self.content.call is not None
 
     @property
     def asks_twice(self) -> str:
-        """The setting by which the ego's model is asked a second time, in words."""
+        """The setting that causes a second question to the ego's model, in words for a message."""
         if self.content.call:
             return f"content is {self.ask.content}"
         return f"consensus is {EGO_PROMPT}"
 
     @cached_property
     def question(self) -> Question:
-        """What helpers are asked."""
+        """The question that helpers are asked: the ordinary one unless a part has another.
+
+        Raises UserError if a package's part returns a question that is not in its `questions`.
+        """
         if self.radio.profile is None:
             return PLAIN
         for part in self.more:
@@ -532,7 +556,7 @@ class OperatingPoint:
 
     @cached_property
     def elsewhere(self) -> Part | None:
-        """The part by which messages come from other scenes; None if they are helpers' own."""
+        """The part that takes messages from other scenes, as a control does; None without one."""
         for part in self.more:
             with worded_part(part):
                 elsewhere = bool(part.elsewhere)
@@ -542,7 +566,7 @@ class OperatingPoint:
 
     @property
     def rewrites(self) -> "Rewrites":
-        """How its fusion calls show messages."""
+        """How fusion calls under this point show helpers' messages to the ego's model."""
         call = self.content.call
         name = call.name if call else ""
         whole = self.fusion.consensus == EGO_PROMPT and not (call and call.in_words)
@@ -551,7 +575,7 @@ class OperatingPoint:
 
     @property
     def shows_words(self) -> bool:
-        """Whether the prompt of its fusion calls shows messages, or their words."""
+        """Whether the prompt of a fusion call has messages or their words, not only objects."""
         call = self.content.call
         return self.fusion.consensus == EGO_PROMPT or (call is not None and call.in_words)
 
@@ -567,7 +591,11 @@ class OperatingPoint:
         return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
 
     def speaker(self) -> Speaker:
-        """Return what says to the channel what vehicles intend, in one walk."""
+        """Return a new object that says what helpers send in one walk through the scenes.
+
+        It is that of a part, such as attackers, or one that sends the true intents. It may keep
+        state, so each walk needs its own.
+        """
         for part in self.more:
             if speaker := speaker_of(part):
                 return speaker
@@ -578,7 +606,11 @@ class OperatingPoint:
 
 
 def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
-    """Return what a run keeps of what its conditions' parts name, by folder and name."""
+    """Return what a run must store of the files and records that its conditions' parts name.
+
+    The keys are a folder of the run and a name in it. Raises UserError if a package's part fails,
+    or gives a name that is no plain file name.
+    """
     kept: dict[str, dict[str, Kept]] = {}
     for point in points:
         for part in point.more:
@@ -593,9 +625,9 @@ def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
 
 
 def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a recorded condition's settings without those of extensions that do nothing.
+    """Return a condition's recorded, flat settings without those of extensions at their defaults.
 
-    Raises UserError for one of an extension that is gone, where it does something.
+    Raises UserError for a setting that does something and whose extension is not installed.
     """
     here = without_gone(settings)
     for kind in more_parts().values():
@@ -608,10 +640,9 @@ def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's settings without those of extensions that are gone,
-    where these do nothing.
+    """Return a condition's flat settings without those of extensions that are not installed.
 
-    Raises UserError for one that does something.
+    Raises UserError if such a setting has another value than the one that does nothing.
     """
     kept: dict[str, Any] = {}
     for key, value in settings.items():
@@ -662,12 +693,11 @@ CLOUD = OperatingPoint("cloud", cloud=Cloud(round_trip_s=0.51))
 
 
 def named_point(text: str) -> OperatingPoint:
-    """Return an operating point by its name and changes,
-    such as `6g:consensus=ego-prompt,window_s=0.4`.
+    """Return an operating point by text, such as `6g:consensus=ego-prompt,window_s=0.4`.
 
-    The name is one of the paper's points, or a channel profile, which stands for a point with that
-    profile and the defaults. A setting may have its name in `SHORT`, and may be one of the
-    channel's own. The whole text becomes the point's name.
+    Before the colon is one of the paper's points, or a channel profile, which stands for a point
+    with that profile and the defaults. A setting may have its short name of `SHORT`, and may be one
+    of the channel's own. The whole text becomes the point's name.
 
     Raises:
         UserError: there is no such point or setting, or a value is not allowed.
@@ -723,9 +753,9 @@ def named_point(text: str) -> OperatingPoint:
 
 
 def misnamed(settings: Mapping[str, Any]) -> list[str]:
-    """Return the settings of a recorded condition that differ from what its name says.
+    """Return the recorded settings of a condition that differ from what its name stands for.
 
-    None where a name says nothing: it is a program's own, or its radio is not here.
+    The list is empty for a name that `named_point` cannot read, as of a point made in Python.
     """
     name = str(settings["name"])
     try:
@@ -743,7 +773,8 @@ SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("la
 
 
 def setting_of(key: str, text: str) -> object:
-    """Parse a setting's text by the type of its default;
-    another text stays text, which no setting allows.
+    """Return the value of setting `key` from its text, converted to the type of its default.
+
+    A text that cannot be converted is returned as it is, and refused where the point is made.
     """
     return value_of(POINTS["6g"].setting(key), text)

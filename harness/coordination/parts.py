@@ -45,7 +45,7 @@ Flag = Annotated[bool, Meta(description="true or false")]
 
 
 class Kept(NamedTuple):
-    """What a run keeps of something that a condition names."""
+    """Hold what a run stores of one thing that a condition names, such as a calibration."""
 
     record: Any  # plain values: its content, or the digest of its file
     file: Any = None  # path of its file, if it has one
@@ -53,7 +53,10 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True)
 class Question:
-    """What a helper is asked; plainly, what it intends, with what it sees before it."""
+    """Describe the question that a helper's model is asked: what the ego should do, as it sees it.
+
+    Subclasses ask it with a changed scene graph, as a control that shows nothing does.
+    """
 
     # ends the key of its answers, behind a `~`, and is their role; empty for the plain one
     name: str = ""
@@ -61,7 +64,7 @@ class Question:
     pictured: bool = True  # whether it shows what a camera sees
 
     def shown(self, graph: "SceneGraph") -> "SceneGraph":
-        """Return the scene graph that it shows of a helper's own."""
+        """Return the scene graph to put in the helper's prompt, given the helper's own."""
         return graph
 
 
@@ -69,28 +72,34 @@ PLAIN = Question()
 
 
 class Change(Protocol):
-    """What is done to the message that a voice sends."""
+    """Describe a change of helpers' messages before a fusion call shows them, such as an attack."""
 
     @property
     def adds(self) -> bool:
-        """Whether it adds what no other change is to touch, and so comes last."""
+        """Whether it adds text that no other change may touch, and so must be applied last."""
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return a message as a prompt shows it, with its `intent`."""
+        """Return a helper's message, a record with its `intent`, as the prompt is to show it.
+
+        `actions` has the names of the actions, in order.
+        """
 
     def graph(self, graph: "SceneGraph", scenario: Any, scene: Any) -> "SceneGraph":
-        """Return the graph that a message is made of, which its sender sees in a scene."""
+        """Return the sender's scene graph of `scene` as changed; its objects are what is sent."""
 
 
 class Changes(NamedTuple):
-    """What a part changes of messages, by what their keys then hold; text without `+` and `&`."""
+    """Hold the names of the changes that a part makes to messages before a fusion call shows them.
+
+    The names become part of the answer's key, so they hold no `+` and no `&`.
+    """
 
     of_attackers: str = ""  # of those of attackers, several joined by `&`
     of_all: tuple[str, ...] = ()
 
 
 class ActsOn(NamedTuple):
-    """A setting that does something with messages of some kinds, and nothing with others."""
+    """Describe a setting that needs messages of certain kinds, such as intents or words."""
 
     setting: str
     value: object  # of a text that names several things, one of them
@@ -101,13 +110,11 @@ class ActsOn(NamedTuple):
 
 
 class RunFacts(Protocol):
-    """What a part is told of the run in which its condition is played."""
+    """Describe the run in which a condition is to be played, so that a part can refuse it."""
 
     @property
     def agents(self) -> Sequence[Any]:
-        """The agents, the ego's first; each has `settings()`, a `card`, a `prompt`,
-        and what it `can`.
-        """
+        """The agents, the ego's first; each has `settings()`, `card`, `prompt` and `can`."""
 
     @property
     def scenario(self) -> Any:
@@ -115,7 +122,7 @@ class RunFacts(Protocol):
 
     @property
     def ego_alone(self) -> bool:
-        """Whether the model answers only for the ego."""
+        """Whether the model answers only for the ego, and helpers have other answers."""
 
     @property
     def several_decide(self) -> bool:
@@ -123,19 +130,20 @@ class RunFacts(Protocol):
 
     @property
     def frozen(self) -> bool:
-        """Whether its scenes are frozen."""
+        """Whether scenes are recorded (`harness eval`), not a simulation that actions change."""
 
     @property
     def device_profile(self) -> Any:
-        """The device on which energy is counted; None if it is not."""
+        """The computer by whose profile energy is counted; None if it is not counted."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
-    """Settings that are checked as they are made;
-    whole numbers become floats where a float is meant.
+    """Base class of a group of an operating point's settings, checked when made.
 
-    A part with its defaults does nothing. Those that an extension adds (`adds={"parts": ...}`) are
-    called in the order of what follows, and only where they do something.
+    An extension adds a subclass (`adds={"parts": ...}`); the hooks below do nothing unless
+    overridden, and are called in their order here, only for a part that differs from its defaults.
+    Whole numbers become floats where a float is declared. Raises ValueError for a value that is not
+    allowed.
     """
 
     behind: ClassVar[str] = ""  # the setting behind which its own stand in records
@@ -164,71 +172,80 @@ class Part(Struct, frozen=True, kw_only=True):
             self.check()
 
     def check(self) -> None:
-        """Raise ValueError or UserError for what no single setting's type says."""
+        """Raise ValueError or UserError if this part's settings contradict each other."""
 
     @property
     def acts_on(self) -> Collection[ActsOn]:
-        """Its settings that need messages of some kind."""
+        """The settings, as they are now, that need messages of some kind; empty by default."""
         return ()
 
     def check_with(self, point: "OperatingPoint") -> None:
-        """Raise ValueError for what does not go together with other settings of its condition."""
+        """Raise ValueError if this part's settings contradict others of the operating point."""
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
-        """Return why it cannot be played in a run, and what to do; None if it can."""
+        """Return why this part cannot be used under `point` in `run`, and the remedy; else None."""
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
-        """Return what a run keeps of what it names, by folder and by name."""
+        """Return what a run must store of what this part's settings name, by folder and by name."""
         return {}
 
     @property
     def needs(self) -> Collection[str]:
-        """What it needs of the world: `claims`, `in_time`, `lot` or `outlook`."""
+        """Optional inputs that this part needs: of `claims`, `in_time`, `lot` and `outlook`."""
         return ()
 
     @property
     def needs_all(self) -> bool:
-        """Whether it needs what every helper intends that is present, whoever is heard."""
+        """Whether it needs the intents of all present helpers, not only of those that are asked."""
         return False
 
     @property
     def question(self) -> Question:
-        """What helpers are asked."""
+        """The question that helpers' models are asked; one of `questions`, or the ordinary one."""
         return PLAIN
 
     @property
     def elsewhere(self) -> bool:
-        """Whether messages come from other scenes."""
+        """Whether the ego hears helpers of other scenes, chosen by `sources`, as a control."""
         return False
 
     def speaker(self) -> "Speaker | None":
-        """Return what says to the channel what vehicles intend, in one walk; None if they do."""
+        """Return a new object that says what helpers send in one walk; None for the truth."""
 
     def changes(self, words: bool, objects: bool) -> Changes:
-        """Return what it changes of the `words` and the `objects` that a fusion call shows."""
+        """Return the changes of messages before a fusion call shows them.
+
+        `words` and `objects` say whether the call shows messages' words and their objects.
+        """
         return Changes()
 
     @classmethod
     def change(cls, text: str) -> Change | None:
-        """Return what is done to a message by a text of `changes`; None if it is no such text."""
+        """Return the change that one text of `changes` names; None if this part has none by it."""
 
     def after_call(self, fused: "Floats", intents: "Floats", heard: "Bools") -> "Floats":
-        """Return the policies (..., A) that a fusion call answered, by the intents (..., 1+H, A)
-        of the ego and its helpers, of whom some were heard in time, (..., H).
+        """Return the policies, `(..., A)`, to use instead of those of a fusion call.
+
+        Args:
+            fused: the call's answers, `(..., A)`; NaN where one failed.
+            intents: those of the ego and its helpers, `(..., 1+H, A)`.
+            heard: which helpers were heard in time, `(..., H)`.
         """
         return fused
 
     def sources(self, episodes: "Ints", seeds: "Ints") -> "Ints":
-        """Return the decision whose helpers each decision hears, (n,), by these places; its own.
+        """Return for each of n decisions the index of the decision whose helpers it hears, `(n,)`.
 
-        Asked where messages come from elsewhere. All are of one step, with the number of their
-        episode and the seed of their draws, (n,).
+        Called only where `elsewhere` is true. All decisions are of one step; `episodes` and
+        `seeds`, `(n,)`, have the number of each one's episode and the seed of its draws. By default
+        each hears its own.
         """
         return np.arange(len(episodes))
 
     def before(self, intents: "Intents") -> "Intents":
-        """Return what vehicles intend, (n, ...), as it is before anything is made of it;
-        NaN may be there.
+        """Return the intents of n decisions, corrected before anything else uses them.
+
+        Only `own` and `helpers` may change; a failed or missing answer is a row of NaN.
         """
         return intents
 
@@ -243,15 +260,13 @@ def is_ours(part: Part) -> bool:
 
 
 def worded_part(part: Part) -> AbstractContextManager[None]:
-    """Let a part act: what fails in a package's is one line, a UserError."""
+    """Return a context in which what fails in a package's part becomes a one-line UserError."""
     return worded(PACKAGES_PARTS.get(type(part), ""), built_in=is_ours(part))
 
 
 @contextmanager
 def telling(part: Part) -> Iterator[None]:
-    """Let a part say what does not go, by ValueError;
-    what else fails in a package's is one line, a UserError.
-    """
+    """Enter a context as `worded_part`, but let a ValueError through: the part's own refusal."""
     refused = None
     with worded_part(part):
         try:
@@ -263,7 +278,7 @@ def telling(part: Part) -> Iterator[None]:
 
 
 def wrong(key: str, value: object, allowed: str) -> ValueError:
-    """Return the error of a setting that is not allowed."""
+    """Return the ValueError that setting `key` has `value` and must be `allowed`."""
     return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
 
 
@@ -276,7 +291,7 @@ def _lacking(setting: str, name: str, plugins: Plugins[Any]) -> UserError:
 
 
 class Ask(Part, frozen=True, kw_only=True):
-    """Whom the ego asks, when, and what it hears."""
+    """Settings of whom the ego asks, when, and what helpers' messages hold."""
 
     # The rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`.
     schedule: Text = PAPER
@@ -331,7 +346,7 @@ class Ask(Part, frozen=True, kw_only=True):
 
     @property
     def above(self) -> float:
-        """The worth above which the ego asks, in the schedule's unit."""
+        """The worth above which the ego asks: nats under `entropy`, else the schedule's unit."""
         if self.schedule == PAPER:
             return self.tau_nats
         default = SCHEDULES[self.schedule].threshold
@@ -339,7 +354,7 @@ class Ask(Part, frozen=True, kw_only=True):
 
 
 class Radio(Part, frozen=True, kw_only=True):
-    """The channel, what replaces its profile's settings, and a roadside unit."""
+    """Settings of the radio: a channel profile, overrides of it, and a roadside unit."""
 
     profile: Text | None = None  # channel profile; None disables V2V
     # Probability that one transmission is lost; None keeps that of the profile or of the link.
@@ -382,7 +397,7 @@ class Radio(Part, frozen=True, kw_only=True):
 
 
 class Fusion(Part, frozen=True, kw_only=True):
-    """How the ego fuses what it has heard in time."""
+    """Settings of how the ego fuses its own intent with those that it heard in time."""
 
     consensus: Text = "linear"  # consensus rule, or `ego-prompt`
     # Decision window, from the start of the decision; a later reply is not fused.
@@ -415,7 +430,7 @@ class Fusion(Part, frozen=True, kw_only=True):
 
 
 class Cloud(Part, frozen=True, kw_only=True):
-    """Where the ego's model runs, if not in the vehicle; at most one of the two is set."""
+    """Settings of where the ego's model runs, if not in the vehicle; at most one may be set."""
 
     # From the ego's question to the answer of a model in a cloud; replaces the ego's own inference.
     round_trip_s: Seconds | None = None

@@ -52,7 +52,11 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
 
 
 def prepared(part: Part, intents: Intents) -> Intents:
-    """Return what vehicles intend as a part has it; it changes distributions alone."""
+    """Return `intents` as the part's `before` corrects them.
+
+    Raises UserError if a package's part fails, changes more than `own` and `helpers`, or returns no
+    distribution for an answer.
+    """
     if is_ours(part):
         return part.before(intents)
     with worded_part(part):
@@ -100,7 +104,10 @@ def speaker_of(part: Part) -> Speaker | None:
 
 
 def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
-    """Return the decision whose helpers each hears, one of those that there are."""
+    """Return for each of n decisions the index of the decision whose helpers it hears, `(n,)`.
+
+    As `Part.sources`. Raises UserError if a package's part fails or returns no valid indices.
+    """
     if is_ours(part):
         return part.sources(episode, seed)
     with worded_part(part):
@@ -112,7 +119,10 @@ def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
 
 
 def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floats:
-    """Return the policies of a fusion call as a part has them."""
+    """Return the policies, `(..., A)`, to use instead of those that a fusion call answered.
+
+    As `Part.after_call`. Raises UserError if a package's part fails or returns no distributions.
+    """
     if is_ours(part):
         return part.after_call(fused, intents, heard)
     with worded_part(part):

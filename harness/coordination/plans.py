@@ -14,9 +14,10 @@ STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
 
 @dataclass(frozen=True)
 class Plans:
-    """What an agent and the H others say of themselves, `(..., 1+H)`, the agent itself first.
+    """Hold what an agent and the H others say of their own motion, `(..., 1+H)`, the agent first.
 
-    All is what the sender itself states, so all who hear it compare the same numbers.
+    Agents are vehicles that decide for themselves. Every value is stated by its sender, so all who
+    hear it compare the same numbers.
     """
 
     # the row of the decision that each other makes itself now, among those made together, `(...,
@@ -35,7 +36,10 @@ class Plans:
         return Plans(self.row[at], self.vehicle[at], self.reaches_s[at], self.lost_s[at])
 
     def of_helpers(self, places: Ints) -> "Plans":
-        """Return those of the helpers at these indices, `(..., H')`; one may be repeated."""
+        """Return the plans with the others at indices `places`, `(..., H')`, from 0.
+
+        The agent's own stays first. An index may be repeated.
+        """
         at = np.insert(places + 1, 0, 0, axis=-1)
 
         def of(array: Any) -> Any:
@@ -45,8 +49,10 @@ class Plans:
         return Plans(row, of(self.vehicle), of(self.reaches_s), of(self.lost_s))
 
     def among(self, senders: Ints) -> "Plans":
-        """Return what agents (n, 1) hear of each other, (n, 1+H),
-        by the row of each sender (n, H) or -1.
+        """Return the plans `(n, 1+H)` that n agents hear, from their own, `(n, 1)`.
+
+        `senders`, `(n, H)`, has the row of each sender among these agents, -1 for one without a
+        plan.
         """
 
         def heard(own: Any, unknown: float) -> Any:

@@ -18,12 +18,11 @@ from harness.core.arrays import Floats
 
 @dataclass(frozen=True)
 class Precedence:
-    """An agent takes its most careful action if one that goes before it is near,
-    and plans to go on.
+    """A consensus rule in which an agent waits for a near one of lower rank that plans to go on.
 
-    Else it acts by its own intent. Who plans the most careful action waits already, and who stands
-    or has passed the conflict is near nobody, so nobody waits for these. Agents of the same rank go
-    by their number in the world.
+    To wait is to take action 0, the most careful one; else the agent acts by its own intent. An
+    agent that itself plans action 0, stands, or has passed the conflict makes nobody wait. Equal
+    ranks go by the vehicles' numbers in the world.
     """
 
     rank: Callable[[Plans], Floats]  # of each vehicle, `(..., 1+H)`; the lowest goes first
@@ -33,11 +32,14 @@ class Precedence:
     needs: ClassVar[tuple[str, ...]] = ("plans",)
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return an empty memory."""
+        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`."""
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Let each agent go on or wait; there are no weights."""
+        """Return each agent's own intent, or certainty of action 0 where it waits; weights are NaN.
+
+        Raises ValueError if `messages.plans` is None.
+        """
         if (plans := messages.plans) is None:
             raise ValueError("a rule that reads plans needs them")
         p, rank = messages.intents, self.rank(plans)

@@ -22,13 +22,17 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median 
 
 @dataclass(frozen=True)
 class Heads(Pool):
-    """A pool in which all who are heard weigh the same,
-    and no helper flips what all others agree on.
+    """A consensus rule that pools with equal weights, and that no single helper can turn.
+
+    The pool is overruled by the mean intent of a majority that the ego is in, of all voices but
+    one.
     """
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Apply the pool; if it departs from what all but one want,
-        return the mean of their intents.
+        """Return the pool with equal weights of all heard, or the majority's mean if it departs.
+
+        The mean is of the intents of those in the majority, which is of all voices but one, at
+        least two.
         """
         voices = messages.weights > 0
         heads = np.sum(voices, axis=-1)
@@ -40,10 +44,10 @@ class Heads(Pool):
 
 
 def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
-    """Return the policy, or the mean of the majority's intents where a majority wants another
-    action.
+    """Return the policy, replaced where a majority of votes wants another action, `(..., A)`.
 
-    A majority counts only if the ego is in it.
+    The replacement is the mean intent of the vehicles in the majority, which counts only if the ego
+    is in it. A vehicle votes for its likeliest action.
 
     Args:
         policy: the policy to check, `(..., A)`.
@@ -67,11 +71,11 @@ def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
 
 
 def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
-    """Return each action's mean probability without the highest and the lowest head,
-    scaled to sum to 1.
+    """Return each action's mean probability without its lowest and highest voice, `(..., A)`.
 
-    With fewer than three heads, none is left out.
-    The k-truncated mean of Guo and Kong (2024) with k = 1.
+    It is scaled to sum to 1 (k-truncated mean with k = 1, Guo and Kong 2024). With fewer than three
+    voices, none is left out. `p` are intents, `(..., 1+H, A)`; of `weights`, `(..., 1+H)`, only
+    whether they are above 0 counts, which marks the voices heard.
     """
     voices = weights > 0
     heads = np.sum(voices, axis=-1)[..., None, None]
@@ -86,8 +90,10 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
 
 
 def geometric_median(p: Floats, weights: Floats) -> Floats:
-    """Return the distribution with the least sum of distances to messages,
-    `(..., A)` (Weiszfeld 1937).
+    """Return the distribution with the least weighted sum of L2 distances to intents, `(..., A)`.
+
+    Computed by Weiszfeld's iteration (1937). `p` are intents, `(..., 1+H, A)`; `weights`, `(...,
+    1+H)`, are 0 for a helper not heard.
     """
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
@@ -99,11 +105,11 @@ def geometric_median(p: Floats, weights: Floats) -> Floats:
 
 
 def centred_clipping(p: Floats, weights: Floats) -> Floats:
-    """Return the ego's intent, moved by the mean of the steps to all messages, `(..., A)`,
-    in some rounds.
+    """Return the ego's intent, moved `CLIP_ROUNDS` times by the weighted mean of clipped steps.
 
-    No step is longer than `CLIP`. Karimireddy, He and Jaggi (2021),
-    starting from the ego's intent instead of the last round's aggregate.
+    A step leads to another vehicle's intent and is at most `CLIP` long (L2); the result is `(...,
+    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. Arguments as in
+    `geometric_median`.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
@@ -115,16 +121,15 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
 
 
 def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY) -> Floats:
-    """Return the product of all messages,
-    each true with a probability and else uninformative, `(..., A)`.
+    """Return the posterior of the action by all intents as independent evidence, `(..., A)`.
 
-    A message counts as `r p + (1 - r) / A`, so no voice weighs more than `(1 - r + A r) / (1 - r)`
-    to one. The ego's intent counts as it is. The prior is uniform over the actions. Voices are
-    taken as independent, which those of vehicles that see the same are not.
+    Each helper is right with probability r (`reliability`) and else uninformative, so its intent
+    counts as `r p + (1 - r) / A`; the ego's counts as it is, and the prior is uniform. Vehicles
+    that see the same are not independent, which this ignores.
 
     Args:
         p: intents, `(..., 1+H, A)`.
-        weights: 0 for a helper not heard.
+        weights: 0 for a helper not heard, `(..., 1+H)`; nothing else of them counts.
         reliability: reliability of the helpers, `(..., H)` or one for all.
     """
     actions = p.shape[-1]

@@ -27,7 +27,10 @@ EGO_PROMPT = "ego-prompt"
 
 
 def reads(name: str) -> frozenset[str]:
-    """Return the kinds of message that a rule fuses, or that `ego-prompt` shows, each alone."""
+    """Return the kinds of messages (`contents.KINDS`) of which a consensus rule can use any one.
+
+    `name` is that of a rule or `ego-prompt`.
+    """
     if name == EGO_PROMPT:
         return frozenset((WORDS, PLANS))
     of_agents = PLANS in getattr(RULES[name], "needs", ())
@@ -35,5 +38,5 @@ def reads(name: str) -> frozenset[str]:
 
 
 def names() -> tuple[str, ...]:
-    """Return the allowed values of an operating point's `consensus`."""
+    """Return the allowed values of the setting `consensus`: all rules, and `ego-prompt`."""
     return (*RULES, EGO_PROMPT)

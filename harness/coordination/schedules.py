@@ -23,7 +23,7 @@ def _is_threshold(value: Any) -> bool:
 
 
 class Schedules(FilesAndPlugins[Schedule]):
-    """All schedules, by name."""
+    """Hold all schedules by name: built in, of installed packages, and of files."""
 
     folder = "schedules"
     stated: ClassVar = {
@@ -32,8 +32,10 @@ class Schedules(FilesAndPlugins[Schedule]):
     }
 
     def read(self, file: Any) -> Schedule:
-        """Return the schedule in a file.
-        Raises UserError if it is wrong, or no extension reads it.
+        """Return the schedule that a file describes.
+
+        Raises UserError if the file is wrong, or the extension that reads such files is not
+        installed.
         """
         if not READERS.is_ours(self.folder):
             owner = owner_of_plugin("readers", self.folder)
@@ -42,7 +44,7 @@ class Schedules(FilesAndPlugins[Schedule]):
         return READERS[self.folder](file)
 
     def file_sha256(self, name: str) -> str | None:
-        """Return the digest of the file that holds a schedule; None if it is not in a file."""
+        """Return the SHA-256 hex digest of a schedule's file; None if no file holds it."""
         file = self.file(name)
         return sha256_file(file) if file else None
 

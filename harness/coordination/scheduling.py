@@ -17,7 +17,7 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Outlook:
-    """What the ego sees of the scenario's R regions, and what it can infer that its helpers see."""
+    """Hold how much of the scenario's R regions the ego sees, and what helpers would add to it."""
 
     unseen: Floats  # share of each region that the ego does not see, `(..., R)`
     # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from
@@ -33,15 +33,17 @@ class Outlook:
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
-        """Return the outlook with the helpers at these indices, `(..., H')`;
-        one may be repeated.
+        """Return the outlook with the helpers at indices `places`, `(..., H')`, from 0.
+
+        An index may be repeated.
         """
         return replace(self, added=np.take_along_axis(self.added, places[..., None], axis=-2))
 
 
 @dataclass(frozen=True)
 class ScheduleInputs:
-    """What the ego knows before it asks.
+    """Hold what the ego knows before it asks anybody, the input of a schedule.
+
     Values for a helper that may not be asked are arbitrary.
     """
 
@@ -59,18 +61,17 @@ class ScheduleInputs:
 
 @runtime_checkable
 class Schedule(Protocol):
-    """A pure function of arrays: what asking each helper is worth."""
+    """Describe a schedule: a pure function of arrays that says what asking each helper is worth."""
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Which of `in_time`, `outlook` and `lot` it uses;
-        the others are None in `ScheduleInputs`.
-        """
+        """Which of `in_time`, `outlook` and `lot` it uses; others are None in `ScheduleInputs`."""
 
     @property
     def threshold(self) -> float | None:
-        """The worth above which the ego asks, unless the operating point has its own;
-        None without one.
+        """The worth above which the ego asks, unless the operating point sets another; or None.
+
+        None means that the schedule has no threshold, and a point may set none.
         """
 
     def worth(self, known: ScheduleInputs) -> Floats:
@@ -93,17 +94,17 @@ class Formula:
     by_presence: bool = False
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Apply the function."""
+        """Return the formula's worth of asking each helper, `(..., H)` or `(..., 1)`."""
         return self.formula(known)
 
 
 def never(known: ScheduleInputs) -> Floats:
-    """No helper is worth asking."""
+    """Return a worth of minus infinity, `(..., 1)`, so that nobody is ever asked."""
     return np.full((*known.entropy_nats.shape, 1), -np.inf)
 
 
 def entropy(known: ScheduleInputs) -> Floats:
-    """Return the entropy of the ego's intent, in nats (paper Eq. 3)."""
+    """Return the entropy of the ego's intent in nats, `(..., 1)`, as the worth (paper Eq. 3)."""
     return known.entropy_nats[..., None]
 
 
@@ -114,8 +115,10 @@ ORACLE = "oracle"  # a bound that only a study of frozen scenes can play
 
 
 def chosen(worth: Floats, threshold: float, may_ask: Bools, range_m: Floats, most: int) -> Bools:
-    """Return who is asked, `(..., H)`:
-    at most `most` above the threshold, by worth, then the nearest.
+    """Return which helpers are asked, `(..., H)`: at most `most`, each worth more than `threshold`.
+
+    Those worth the most come first, and of equals the nearest. `worth` is `(..., H)` or `(..., 1)`;
+    `may_ask` and `range_m`, the distance to the ego in m, are `(..., H)`.
     """
     asked = may_ask & (worth > threshold)
     if most >= asked.shape[-1]:

@@ -12,7 +12,7 @@ from harness.radio.channel import Draws
 
 @dataclass(frozen=True)
 class SentIntents:
-    """What H voices say to the channel in decisions (n,)."""
+    """Hold what H voices send in n decisions; an attacker may have several voices."""
 
     intents: Intents  # the intents and claims of each voice
     draws: Draws  # the channel's draws for each voice
@@ -23,19 +23,22 @@ class SentIntents:
 
 
 class Speaker(Protocol):
-    """What is said in a walk under one condition; it may remember."""
+    """Describe who decides what helpers send during one walk under one condition.
+
+    The usual one sends the truth, attackers do not. It may keep state from step to step.
+    """
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
-        """Return what is said in decisions (n,), given what the vehicles intend.
+        """Return what the voices send in n decisions of one step, given the vehicles' true intents.
 
-        `truth` is what every vehicle intends, of H helpers; `episode` and `seed` are the number and
-        the seed of each decision's episode, (n,).
+        `episode` and `seed`, `(n,)`, are each decision's episode number and seed of channel draws.
+        The number of voices may differ from that of the helpers in `truth`.
         """
         ...
 
 
 class Honest:
-    """Says what it intends."""
+    """A speaker that sends every helper's true intent; there are no attackers."""
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         return SentIntents(truth, draws, np.zeros(truth.valid.shape, dtype=bool))

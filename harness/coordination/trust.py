@@ -32,7 +32,8 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 
 @dataclass(frozen=True)
 class Trust:
-    """Reputation with memory.
+    """A consensus rule that learns during an episode which helpers to trust, and pools only those.
+
     All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
     """
 
@@ -52,16 +53,18 @@ class Trust:
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the initial memory: for and against each helper,
-        its last intent and its last claim.
+        """Return the memory before the first step, `(*batch, K)`, flattened.
+
+        For each helper: evidence for and against it, its last intent, and its last claim.
         """
         state = np.full((*batch, helpers, 2 + actions + CLAIM), np.nan)
         state[..., :2] = self.faith
         return state.reshape(*batch, -1)
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the linear pool of those trusted;
-        the trust takes the present messages into account.
+        """Return the linear pool of the helpers that are trusted after this step's checks.
+
+        `Fused.trust` has each helper's reputation, from 0 to 1, with the present message counted.
         """
         p, heard = messages.intents, messages.heard
         remembered = state.reshape(*heard.shape, -1)
@@ -147,8 +150,9 @@ def _claims_of(messages: Messages) -> Floats:
 
 
 def divergence(p: Floats, q: Floats) -> Floats:
-    """Return the Jensen-Shannon divergence of distributions `(..., A)`:
-    0 if equal, 1 if disjoint.
+    """Return the Jensen-Shannon divergence of distributions `(..., A)`, `(...)`.
+
+    It is 0 if they are equal and 1 if they are disjoint (base 2).
     """
     gained_nats = entropy_nats((p + q) / 2) - (entropy_nats(p) + entropy_nats(q)) / 2
     return np.asarray(gained_nats / np.log(2))
