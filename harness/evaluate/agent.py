@@ -18,7 +18,10 @@ ImageMode = Literal["own", "blank", "another", "none"]
 
 @dataclass(frozen=True)
 class Agent:
-    """Answers for a vehicle: a model, its prompt and how it answers."""
+    """Describe who answers for a vehicle: a model, its prompt, and how it is asked.
+
+    Raises UserError for settings that the model or the prompt does not support.
+    """
 
     card: Card  # the model
     prompt: Prompt  # the prompt version
@@ -121,23 +124,24 @@ class Agent:
 
     @property
     def samples(self) -> bool:
-        """Whether its answers are sampled at a temperature; a bare distribution is not."""
+        """Whether its answers are drawn at a temperature; a read-out or decision is not."""
         return self.can.samples and self.answer not in BARE
 
     @property
     def name(self) -> str:
-        """Model, prompt and answer mode, for people and tables."""
+        """Model, prompt version and answer mode, as text for people and tables."""
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"
 
     def most_tokens(self, role: Role) -> int:
-        """Return the most tokens that an answer may have,
-        the thought included if the model thinks first.
-        """
+        """Return the most tokens of one answer in a role, a thought before it included."""
         answer = self.card.max_new_tokens or self.prompt.most_answer_tokens(role)
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
-        """Return a request in a role, without what differs between such requests."""
+        """Return a request in a role that lacks all that differs from scene to scene.
+
+        The caller fills in `id`, `messages` and the like (`Request.alike`). `actions` are in order.
+        """
         return Request(
             id="",
             messages=(),
@@ -160,11 +164,16 @@ class Agent:
         words: Mapping[str, str],
         heard: Sequence[Mapping[str, Any]] = (),
     ) -> dict[str, Any]:
-        """Return the chat about a scene graph and what was heard in the agent's answer mode,
-        for a request.
+        """Return the fields of a request that hold its prompt, by field name.
 
-        They are the `messages`, those of the further `orders` and the `flips` of a read-out's
-        letters, and the `question` of a decision.
+        They are `messages`; for a read-out in several orders of its list of actions also `orders`
+        and `flips`; and for a decision its `question`.
+
+        Args:
+            graph: scene graph of the vehicle that is asked.
+            actions: names of the actions, in order.
+            words: the scenario's words, which templates take by name.
+            heard: helpers' messages to show, as `fusion.messages_of` returns them.
         """
         rendered = self.rendered(graph, actions, heard, words)
         if self.answer != "decision":
@@ -181,8 +190,10 @@ class Agent:
         actions: tuple[str, ...],
         chat: Callable[[Sequence[str]], tuple[Mapping[str, str], ...]],
     ) -> dict[str, Any]:
-        """Return a chat in each order of the actions in which letters are read,
-        as fields of a request.
+        """Return a chat for each order of the action list to be asked, as fields of a request.
+
+        `chat` makes the messages for one order. The fields are `messages`, and where there are
+        further orders `orders`, and with `flip` the same of the reversed list, `flips`.
         """
 
         def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
@@ -204,15 +215,16 @@ class Agent:
         heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:
-        """Return the chat about a scene graph and the messages heard,
-        before the answer mode changes it.
-        """
+        """Return the chat messages before the answer mode changes them; arguments as in `chats`."""
         return shown(
             self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE)
         )
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that decides its answers, as plain values."""
+        """Return all that decides this agent's answers, as plain values for a run's record.
+
+        The keys are `model`, `prompt`, `thinking`, `answer`, `image`, `letters`, `sums` and `flip`.
+        """
         return {
             "model": self.card.record(),
             "prompt": {k: getattr(self.prompt, k) for k in ("version", "sha256", "released")},
@@ -223,7 +235,7 @@ class Agent:
 
 
 def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat in an image mode; `none` removes the picture."""
+    """Return a prompt's chat messages, without their pictures if `image` is `none`."""
     if image != "none":
         return tuple(messages)
     without = []
@@ -240,10 +252,11 @@ def in_mode(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat about a scene graph in an answer mode.
+    """Return a prompt's chat messages with the question of an answer mode.
 
-    In a read-out, the examples answer by a letter, too.
-    A decision keeps of the chat what it says of the scene; the scenario's `words` ask.
+    In `readout`, the examples answer by a letter, too, and the question is for one. In `decision`,
+    what the chat says of the scene stays, and the scenario's `words` ask. Other modes change
+    nothing.
     """
     if answer == "decision":
         asked = decision.question(messages, graph, actions, words)
@@ -254,8 +267,9 @@ def in_mode(
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """Return the likeliest action of a role's examples.
-    Raises UserError if one parses with repairs only.
+    """Return the likeliest action in the answer of each of a role's examples.
+
+    Raises UserError if such an answer cannot be parsed without repairs.
     """
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):

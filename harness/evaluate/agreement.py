@@ -9,11 +9,10 @@ from harness.evaluate.walk import Decided
 
 
 def broken_words(decided: Decided[Any]) -> Floats:
-    """Return whether each agent breaks its word, (n,):
-    its action is not the likeliest of the plan it sent.
+    """Return for n agents' decisions whether each contradicts the plan that the agent sent, `(n,)`.
 
-    It breaks its word if that holds for anybody who got a plan,
-    of the last that this one fused. NaN for an agent whose plan nobody got.
+    It is 1 if the action taken is not the likeliest of the plan that some receiver last got, else
+    0; NaN for an agent whose plan nobody received.
     """
     broken, intents = np.full(len(decided.due.at), np.nan), decided.said.intents
     if decided.due.senders is None or intents.plans is None:

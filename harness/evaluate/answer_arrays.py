@@ -20,8 +20,10 @@ def intents_of(
     answers: Sequence[list[Answer | None]],
     width: int = 1,
 ) -> Intents:
-    """Return the answers of scenes, the ego's first in each, as arrays of at least `width`
-    vehicles; NaN without an intent.
+    """Return the answers of n scenes as arrays of at least `width` vehicles.
+
+    `answers` has the ego's first, then the helpers' in order of `Scene.viewers`; None for one that
+    was not asked yet. An answer that is missing or did not parse is a row of NaN.
     """
     width = max([width, *[len(row) for row in answers]])
     unknown = (math.nan,) * len(spec.actions)
@@ -61,7 +63,10 @@ def intents_of(
 
 
 def models_of(spec: Spec, scene: Scene, width: int) -> list[int]:
-    """Return whose model each viewer has, by place; with one for all, as if the ego decided."""
+    """Return for each vehicle in a scene the place whose model answers for it, up to `width`.
+
+    Places are those of `Latency.speed`: 0 is the ego's model. The order is that of `Scene.viewers`.
+    """
     there = range(len(scene.viewers))
     places = [scene.place(n) for n in there] if spec.helpers else [*there]
     return [*places, *range(len(places), width)]
@@ -82,10 +87,9 @@ def _bits(scene: Scene, answer: Answer | None) -> int:
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Return the bits of a helper's message:
-    id, position, intent, evidence and risk, as compact JSON.
+    """Return the size in bits of a helper's message as compact JSON, sent from `xy_m`.
 
-    Positions have one decimal and probabilities two at most.
+    It holds id, position (one decimal), intent (two decimals), evidence and risk.
     """
     intent = "null"
     if answer.intent:

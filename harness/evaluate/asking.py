@@ -88,7 +88,7 @@ def _say_unread(card: Card, prompt: str) -> None:
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """Parse a completion into an answer."""
+    """Return the answer that a completion of a request gives: its text parsed, with its facts."""
     raw = completion.text
     scene, _, viewers = request.id.partition("/")
     key, *heard = viewers.split("+")
@@ -140,7 +140,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
 
 
 def digests(request: Request) -> tuple[str, str | UnsetType]:
-    """Return the digests of a request's chat and of its picture; unset without one."""
+    """Return SHA-256 digests of a request's chat and of its picture; unset without a picture."""
     return sha256_bytes(_TEXTS.encode(request.messages)), request.image_sha256 or UNSET
 
 
@@ -149,9 +149,10 @@ def _or_unset(value: T | None) -> T | UnsetType:
 
 
 class Asker:
-    """Asks for the answers that are missing, and turns answers into arrays of intents.
+    """Ask models for the answers that a run still lacks, and give answers as arrays.
 
-    A question that gets no answer is never kept, so that it is asked again when the work goes on.
+    It is the `Ask` of a walk through scenes. A question that got no answer is never kept, so that
+    it is asked again when the work goes on.
 
     Attributes:
         spec: the evaluation.
@@ -193,7 +194,7 @@ class Asker:
         self._unread: int | None = None if self.answers else 0
 
     def ask(self, asked: Sequence[Request]) -> None:
-        """Ask for the missing answers, each once, and keep each chunk as soon as it is answered.
+        """Ask the requests whose answers are missing, each once, and keep each chunk of answers.
 
         Raises Unanswered if a question of the ego or a fusion call got no answer, once all others
         of these were asked; or if none of the first questions was answered, or none of the last
@@ -266,7 +267,7 @@ class Asker:
         return name in self.answers and name not in self._unasked
 
     def asked(self) -> dict[str, Answer]:
-        """Return the answers without those that were kept and that nothing asked for."""
+        """Return all answers by request id, except kept ones whose question was not asked here."""
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
@@ -353,13 +354,15 @@ class Asker:
         return self.laid_out(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return what every viewer intends, all of whom are asked."""
+        """Return the intents of n scenes after asking every vehicle in them, helpers included."""
         self._ask_at(scenes)
         return self.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return intents where helpers are asked another question;
-        NaN for those of scenes not in `at`.
+        """Return the intents of n scenes where helpers are asked `question` instead.
+
+        Only scenes at the indices `at` are asked, and only if a run asks all helpers; NaN
+        elsewhere.
         """
         if self.spec.asks_all:
             self._ask_at([scenes[n] for n in at.tolist()], question=question)
@@ -368,9 +371,7 @@ class Asker:
     def helpers(
         self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers wanted, (n, H),
-        and return the intents of the scenes where any is wanted.
-        """
+        """Ask the helpers marked in `wanted`, `(n, H)`; return the intents of scenes with any."""
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, question)
         return self.laid_out(scenes, question, 1 + wanted.shape[1])
@@ -381,8 +382,10 @@ class Asker:
         question: Question = PLAIN,
         places: Places | None = None,
     ) -> list[bool]:
-        """For each scene, whether an answer of these viewers is missing;
-        to another `question`, a helper's.
+        """Return for each scene whether an answer is missing.
+
+        `places` restricts this to some vehicles of each scene, the ego at 0; None for all. With
+        another than the ordinary `question`, only helpers count.
         """
         return list(self._lacking(scenes, self._has, question, places))
 
@@ -422,8 +425,9 @@ class Asker:
     def laid_out(
         self, scenes: Sequence[Scene], question: Question = PLAIN, width: int = 1
     ) -> Intents:
-        """Return the answers so far as arrays of at least `width` vehicles;
-        NaN without an intent.
+        """Return the answers that there are, of n scenes, as arrays of at least `width` vehicles.
+
+        Nothing is asked. A vehicle without an intent has NaN.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
         return intents_of(self.spec, self.latency, scenes, answers, width)
@@ -480,7 +484,11 @@ class Asker:
     def fusion_requests(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
-        """Return the requests of the fusion calls with these sets of messages."""
+        """Return a fusion request for each set of messages heard, one code a set.
+
+        `codes`, `(K,)`, are those of `fusion.codes_of`, for these scenes in their order; `rewrites`
+        says how the messages are shown.
+        """
         sets = list(heard_sets(scenes, codes, rewrites))
         lacks = [not self._has(fusion_id(*each)) for each in sets]
         by_id = {scene.id: scene for scene in scenes}
@@ -499,7 +507,7 @@ class Asker:
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
-        """Announce the requests whose answers were not given, and ask for what is missing."""
+        """Announce requests to `more`, and ask those whose answers are missing; raises as `ask`."""
         # Requests whose answers were kept stay, so that the chunks begin at the same places as
         # before.
         asked = [request for request in requests if request.id not in self._given]

@@ -19,7 +19,7 @@ from harness.world.world import Target, World
 
 @dataclass
 class Decision:
-    """A decision of an agent, and when it acts."""
+    """Hold one agent's chosen action and the simulation frame in which it takes effect."""
 
     action: str  # the meta-action
     frame: int  # the frame in which it acts
@@ -32,7 +32,7 @@ class Decision:
 
 @dataclass
 class Course:
-    """One layout under one condition and seed."""
+    """Hold one episode under one condition and channel seed, while it is driven."""
 
     point: OperatingPoint  # the condition
     seed: int  # seed of the channel's draws
@@ -46,7 +46,7 @@ class Course:
 
 @dataclass
 class Trajectory:
-    """A world, and the courses that share it so far."""
+    """Hold a simulated world and the episodes that still share it, having acted alike so far."""
 
     number: int  # the episode's number
     world: World  # the world
@@ -54,13 +54,16 @@ class Trajectory:
 
     @property
     def under_way(self) -> list[int]:
-        """The agents whose journey is not decided."""
+        """Places of the agents whose episode has not ended."""
         return [
             agent for agent, journey in self.world.journeys.items() if not journey.outcome.ended
         ]
 
     def measure(self) -> None:
-        """Add each agent's conflicts to its last decision in each course, and begin them anew."""
+        """Add the conflicts since the last call to each agent's last decision, and count anew.
+
+        Conflicts are the least time to collision and the least post-encroachment time, in s.
+        """
         for agent, journey in self.world.journeys.items():
             for decision in (course.last[agent] for course in self.courses if agent in course.last):
                 decision.ttc_s = min(decision.ttc_s, journey.conflicts.ttc_s)
@@ -68,8 +71,9 @@ class Trajectory:
             journey.conflicts = journey.conflicts.anew()
 
     def act(self) -> list["Trajectory"]:
-        """Let the decisions that are ready act;
-        return one trajectory for each set of targets that follow.
+        """Apply decisions whose frame has come, and return a trajectory for each way to go on.
+
+        Episodes that now aim at different speeds or lanes part: the world is copied for each.
         """
         world, agents = self.world, tuple(self.world.journeys)
         now = tuple(world.target(agent) for agent in agents)
@@ -109,9 +113,9 @@ class Trajectory:
 
 
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
-    """Simulate up to a frame or the end of each episode; decisions act when they are ready.
+    """Simulate each trajectory to a frame, or to its end, and apply decisions in their frames.
 
-    There is one trajectory for each way in which an episode continues, in the order of those given.
+    Returns one trajectory for each way in which the episodes went on, in the order given.
     """
     running: list[tuple[tuple[int, ...], Trajectory]] = [
         ((n,), t) for n, t in enumerate(trajectories)

@@ -14,7 +14,10 @@ Form = Literal["json", "readout"]
 
 @dataclass(frozen=True)
 class Asking:
-    """How viewers are asked: alone, without messages of others."""
+    """Describe how single vehicles are asked outside of a run, without messages of others.
+
+    Raises UserError if the prompt shows pictures or does not fit the scenario.
+    """
 
     scenario: Scenario
     prompt: Prompt
@@ -35,13 +38,14 @@ class Asking:
 
     @classmethod
     def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Ask by a prompt version, the scenario's own for None.
-        Raises UserError if that cannot be.
+        """Return this for a prompt version by name, the scenario's own if None.
+
+        Raises UserError if there is no such version, or it cannot be used.
         """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 
     def chat(self, graph: SceneGraph) -> list[dict[str, str]]:
-        """Return the chat messages about a viewer's scene graph."""
+        """Return the chat messages, with `role` and `content`, about one vehicle's scene graph."""
         actions, words = self.scenario.actions, self.scenario.prompt_words
         sent = self.prompt.render(graph, actions, (), words, letter=self.answer == "readout")
         return [{**m} for m in in_mode(self.answer, self.prompt, sent, graph, actions, words)]

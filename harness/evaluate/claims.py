@@ -20,7 +20,7 @@ NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
 
 def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
-    """Return the claims of each scene, (n, ...)."""
+    """Return what helpers claim in n scenes, `(n, ...)`, and what the ego's sensors say of it."""
     road, p = scenario.road(), scenario.parameters
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     xy_m = np.full((n, 1 + helpers, 2), np.nan)

@@ -31,29 +31,29 @@ FILE = "costs.jsonl"
 
 
 class Asked(msgspec.Struct, frozen=True):
-    """Some completions that a model was asked for together."""
+    """Hold how many tokens some completions took that a model was asked for together."""
 
     model: str
-    asked: int
-    uncounted: int  # of these, so many whose tokens nobody says: failed ones, as a rule
+    asked: int  # number of completions
+    uncounted: int  # how many of them have no token counts: failed ones, as a rule
     read: int  # tokens of the others' prompts
     written: int  # tokens of their answers
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The most that one command may spend, whose processes add up what they spent in a file."""
+    """Hold the most money that a command may spend; its processes add up amounts in a file."""
 
-    most: float
+    most: float  # amount, in `currency`
     currency: str
-    file: Path
+    file: Path  # the amounts spent, one a line
 
     def spend(self, amount: float) -> None:
         with appending(self.file) as file:
             file.write(f"{amount!r}\n".encode())
 
     def check(self) -> None:
-        """Raise Unanswered if it is spent."""
+        """Raise Unanswered if the budget is spent."""
         spent = math.fsum(map(float, text_of(self.file, "rows").split()))
         if spent >= self.most:
             raise Unanswered(
@@ -64,11 +64,11 @@ class Budget:
 
 @contextmanager
 def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | None]:
-    """Give the evaluations of a command what they may spend together;
-    None for as much as they like.
+    """Enter a context with the budget that a command's evaluations share, of `most` money.
 
-    Says on stderr which servers' models it does not count, since their cards state no price. Raises
-    UserError if it is not above 0, or no card states a price, or several currencies.
+    It is None if `most` is None. A line on stderr names the servers' models that have no price and
+    so do not count. Raises UserError if `most` is not above 0, or no card or cards in several
+    currencies state a price.
     """
     if most is None:
         yield None
@@ -99,9 +99,10 @@ def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | Non
 def metered(
     cards: Sequence[Card], backends: Sequence[Backend], work: Path | None, limit: Budget | None
 ) -> list[Backend]:
-    """Put a meter before each backend whose card has a price.
+    """Return the backends, each whose card has a price wrapped so that its cost is counted.
 
-    It counts into a file of the working folder `work`; None counts for the limit alone.
+    Counts go to a file in the working folder `work`, and to `limit` if there is one; with `work`
+    None, only to `limit`.
     """
     return [
         backend if card.price is None else Metered(backend, card.name, card.price, work, limit)
@@ -110,10 +111,10 @@ def metered(
 
 
 class Metered:
-    """A backend whose completions are counted; it is like the backend in all else.
+    """Wrap a backend and count the tokens and the price of its completions.
 
     `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many
-    tokens the last answers took, which a budget would never notice.
+    tokens the last answers took, which a budget would never notice. All else is as in the backend.
     """
 
     def __init__(
@@ -158,8 +159,9 @@ class Metered:
 
 
 def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]:
-    """Return what the working folders' questions cost, by model;
-    none without a price or a question.
+    """Return what the questions counted in working folders cost, by model name.
+
+    `settings` are a run's record. A model without a price or without a question is left out.
     """
     prices = {}
     for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
 
 
 def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> list[DeviceRow]:
-    """Return the row of a device profile that times each agent: `model`'s, or that of its own card.
+    """Return for each agent the row of a device profile that times its answers.
 
-    Raises UserError if an agent counts no tokens, or the profile has no row or no rates for it.
+    That is the row of `model`, or if None that of the agent's own model. Raises UserError if an
+    agent counts no tokens, or the profile has no such row or no rates in it.
     """
     rows, flag = [], f"--device-profile {printable(device.name)}"
     for agent in agents:
@@ -51,8 +52,9 @@ def rows_of(device: Device, model: str | None, agents: "Sequence[Agent]") -> lis
 
 
 def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> Latency:
-    """Return the latency of answers timed by their own tokens on a device;
-    arguments as in `rows_of`.
+    """Return a latency by which answers take time by their own tokens on a device.
+
+    Arguments and errors as in `rows_of`.
     """
     rows, descriptions = rows_of(device, model, agents), []
     for agent, row in zip(agents, rows, strict=True):
@@ -73,10 +75,9 @@ def of_device(device: Device, model: str | None, agents: "Sequence[Agent]") -> L
 
 
 def answer_s(speed: Speed, answer: Answer) -> float:
-    """Return the seconds of one answer by its tokens, its repair turn included;
-    NaN if the engine failed.
+    """Return the seconds of one answer by its tokens, with its repair turn; NaN if it failed.
 
-    Raises UserError if the answer has no token counts, and its model's time goes by them.
+    Raises UserError if the answer has no token counts and `speed` needs them.
     """
     if speed.answer_s is not None:
         return (
@@ -86,17 +87,20 @@ def answer_s(speed: Speed, answer: Answer) -> float:
 
 
 def answer_j(speed: Speed, answer: Answer) -> float:
-    """Return the joules of one answer; NaN and errors as in `answer_s`."""
+    """Return the joules of one answer; NaN if it failed, or its time does not go by tokens.
+
+    Raises UserError if the answer has no token counts and `speed` needs them.
+    """
     return math.nan if speed.answer_s is not None else devices.joules(speed, *tokens(answer))
 
 
 def vehicles_j(
     latency: Latency, scenes: "Sequence[Scene]", answers: Mapping[str, Answer]
 ) -> Floats:
-    """Return the joules of each vehicle's own answer, (n, 1+H), the ego first.
+    """Return the joules of each vehicle's answer in n scenes, `(n, 1+H)`, the ego first.
 
-    It is NaN for an answer that is missing or that no tokens are known of,
-    and 0 where there is no vehicle.
+    `answers` are by request id. NaN for an answer that is missing or has no known tokens, 0 where
+    there is no vehicle.
     """
     joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
     for n, scene in enumerate(scenes):
@@ -107,10 +111,10 @@ def vehicles_j(
 
 
 def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
-    """Return the joules of the helpers that infer, (n,).
+    """Return the joules of all helpers that infer for each decision, `(n,)`.
 
-    `infers` (n, H) says who does; an attacker's further voices, behind the H vehicles, run no
-    model. `vehicles` (n, 1+H) has the joules of each vehicle's answer, the ego first.
+    `infers`, `(n, H)`, says who does; columns beyond the vehicles (an attacker's further voices)
+    run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's answer, the ego first.
     """
     count = min(infers.shape[1], vehicles.shape[1] - 1)
     own = vehicles[:, 1 : 1 + count]
@@ -120,8 +124,9 @@ def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
 def decided_helpers_j(
     latency: Latency, decided: "Sequence[Decided[Scene]]", answers: Mapping[str, Answer]
 ) -> Floats:
-    """Return the joules of the helpers that infer for each decision, (n,),
-    in the order of `decided`.
+    """Return the joules of all helpers that infer for each decision, `(n,)`, in given order.
+
+    `answers` are by request id.
     """
     of: dict[int, Floats] = {}
     parts = []
@@ -133,10 +138,9 @@ def decided_helpers_j(
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
-    """Return an answer's tokens in and out, of both turns if there were two;
-    NaN if the engine failed.
+    """Return an answer's prompt and completion tokens, of both turns if it has a repair turn.
 
-    Raises UserError if the answer has no token counts.
+    NaN if the engine failed. Raises UserError if the answer has no token counts otherwise.
     """
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
         return answer.prompt_tokens, answer.completion_tokens
@@ -155,12 +159,12 @@ def energy(
     decisions: Decisions,
     answers: Mapping[str, Answer],
 ) -> dict[str, Floats]:
-    """Return the energy of each decision as columns (n,) by name;
-    NaN where a part of it is unknown.
+    """Return the energy of n decisions as columns `(n,)` by name; NaN where a part is unknown.
 
     `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call; `radio_mj`
     millijoules to send the request and the replies; `waiting_j` joules of the ego's computer while
-    it waits for messages and does not infer. The decisions have `helpers_j` (`decided_helpers_j`).
+    it waits for messages and does not infer. `decisions` must have the column `helpers_j`;
+    `answers` are by request id.
     """
     ego_j, ego_s, call_j = _inference(latency, points, decisions, answers)
     sent_mj, idle_watts = np.full(len(decisions), np.nan), np.nan
@@ -185,11 +189,10 @@ def energy(
 
 
 def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages: Floats) -> Floats:
-    """Return the joules to send messages, (n,), from their number and their total time on air.
+    """Return the joules to send messages, `(n,)`, from their number and total time on air.
 
-    A radio model has frames of its own, with what they hold besides a message. A declared channel
-    has bits and a bandwidth alone, so there each message takes a frame of the device profile at
-    least.
+    Where the channel has only bits and a bandwidth, each message takes at least one frame of the
+    device profile. A physical radio counts its own frames, with headers.
     """
     if device.frame_ms is not None and not point.physical:
         airtime_s = np.maximum(airtime_s, messages * device.frame_ms.value / 1000)
@@ -197,8 +200,10 @@ def radio_j(device: Device, point: "OperatingPoint", airtime_s: Floats, messages
 
 
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
-    """Return the watts of a sending radio, by the channel's power or else the profile's;
-    NaN if unknown.
+    """Return the electric watts of a sending radio; NaN if the device profile states no power.
+
+    From the channel's transmit power in dBm if it has one, else the profile's, and the amplifier's
+    efficiency.
     """
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan

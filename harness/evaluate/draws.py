@@ -21,11 +21,10 @@ def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> 
 
 
 def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
-    """Return the channel's draws for decisions (n,).
+    """Return the channel's random draws for n decisions of episodes with `steps` decisions.
 
-    A link is up or down for a whole episode; jitter is drawn for each decision. The key is the seed
-    and the episode's layout, so every condition, prompt and model has the same draws, frozen and in
-    the closed loop.
+    `seed`, `layout_seed` and `step` are `(n,)`; they are the key, so every condition, prompt and
+    model has the same draws. Whether a link is up is drawn once an episode, jitter at each step.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)
@@ -51,9 +50,10 @@ def _tie_uniforms(seed: int, layout_seed: int, steps: int) -> Floats:
 
 
 def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
-    """Return what decides ties in decisions (n,): None where the `first` action is taken.
+    """Return the function that draws among equally likely actions, for n decisions.
 
-    The key is the seed, the episode's layout and the step, as in `channel_draws`.
+    None if `ties` is `first`, or the draws are of no layouts: the first such action is then taken.
+    The key is seed, layout and step, as in `channel_draws`.
     """
     trips = draws.trips
     if ties == "first" or trips is None:

@@ -16,13 +16,12 @@ from harness.evaluate.spec import Spec
 
 
 def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any]:
-    """Return the settings, how many requests would be asked about the scenes,
-    and the tokens of prompts.
+    """Return how many requests an evaluation would make, and how long and dear its prompts are.
 
-    Who asks a helper depends on answers: unless all are asked, helpers are asked as often at most.
-    So are fusion calls, of which there is one for each set of helpers that may be heard. `cost`
-    has, by model with a price, what the prompts cost, if their tokens can be counted, and answers
-    of the greatest length; fusion calls and repair turns are not in it.
+    The dict has the settings, `requests`, `requests_by_role`, `scenes`, `prompt_tokens` by role
+    (None without a `tokenizer`) and, if a card has a price, `cost` by model, with the longest
+    answers. Who asks a helper depends on answers, so numbers of helpers' requests and fusion calls
+    are the most possible unless all are asked. `cost` has no fusion calls and no repair turns.
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
@@ -64,10 +63,10 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
 def lacking(
     spec: Spec, dataset: Dataset, scenes: Sequence[str], answers: Container[str]
 ) -> dict[str, int]:
-    """Return how many questions about some scenes have no answer yet, by role;
-    `answers` are request ids.
+    """Return how many questions about some scenes have no answer yet, by role.
 
-    All are counted that may be asked there, whoever is heard.
+    `scenes` are ids, `answers` request ids. All questions count that any condition may ask there,
+    whoever is heard.
     """
     lacks, sends = (
         Counter[str](),

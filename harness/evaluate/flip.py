@@ -14,14 +14,15 @@ STEP = 1.5e-6
 
 
 def wanted(request: Request, answer: Answer) -> bool:
-    """Return whether the reversed list is to be asked for:
-    there is an answer to compare it with.
+    """Return whether a read-out is to be asked again with its list of actions reversed.
+
+    That needs an answer to compare with, and a request that has the reversed chats (`flips`).
     """
     return bool(request.flips) and answer.intent is not None and answer.flipped is UNSET
 
 
 def asked(request: Request) -> Request:
-    """Return the request whose list of actions is reversed."""
+    """Return the request with its list of actions reversed."""
     messages, *orders = request.flips
     return request.alike(
         messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1]
@@ -29,9 +30,9 @@ def asked(request: Request) -> Request:
 
 
 def compared(answer: Answer, mirror: Answer) -> Answer:
-    """Return an answer that says whether no action is the likeliest in both lists.
+    """Return `answer` with `flipped` set: whether its likeliest action differs in `mirror`.
 
-    Nothing is known if the reversed list, `mirror`, got no answer.
+    `mirror` is the answer to the reversed list. `answer` stays as it is if either did not parse.
     """
     if answer.intent is None or mirror.intent is None:
         return answer

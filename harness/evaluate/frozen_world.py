@@ -33,7 +33,7 @@ MOST_KNOWN = 20
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """A dataset that is walked."""
+    """Describe recorded scenes of a dataset to evaluate on, as `harness eval` does."""
 
     dataset: Dataset  # the dataset, cut to the selected episodes
     selection: Selection = ALL  # how they were selected
@@ -73,11 +73,11 @@ class FrozenSource:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes that are walked at most."""
+        """Numbers of the episodes to evaluate, fewer if the run stops early (`until`)."""
         return self.dataset.episodes
 
     def stopped(self, looks: Looks) -> "FrozenSource":
-        """Return what was walked when it was looked at last."""
+        """Return this source cut to the episodes after which a run stopped by its rule."""
         numbers, selection = self.dataset.episodes[: looks.at[-1]], self.selection
         if len(numbers) < looks.layouts:
             selection = replace(selection, limit=len(numbers))
@@ -88,10 +88,10 @@ class FrozenSource:
         return FrozenSource(dataset, selection, until)
 
     def layouts(self, asked: int) -> list[Layout]:
-        """Return how hard the layouts are that might have been asked;
-        the source's first so many were.
+        """Return how hard each layout is, of those asked and of others that might have been asked.
 
-        There are none if no others might have been, or so few were that nothing can be corrected.
+        The first `asked` are the source's own episodes. The list is empty if there are no others,
+        or too few were asked to correct anything.
         """
         if asked < LEAST:
             return []
@@ -106,7 +106,7 @@ class FrozenSource:
         return [Layout(*each) for each in zip(pool.episodes, dangers, *known, strict=True)]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield the first decision point of each of up to `most` episodes, of whatever vehicles."""
+        """Yield the first decision point of each of up to `most` episodes, with all graphs."""
         forest = self.dataset.forest
         for root in forest.root[:most].tolist():
             yield from self.dataset.scenes([forest.ids[root]])
@@ -151,10 +151,10 @@ class _Layout(NamedTuple):
 
 
 class FrozenWorld(SceneWorld):
-    """Walks every episode of a dataset under all conditions and seeds.
+    """A world of recorded scenes: it walks each layout's decision tree under all conditions.
 
-    An action always takes effect one lag of the dataset after its decision point,
-    however long it took.
+    There is one walk for each episode, condition and channel seed. An action takes effect one
+    decision lag of the dataset after its decision point, however long the decision took.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class FrozenWorld(SceneWorld):
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return a decision for each walk of the condition that is not at its end."""
+        """Return a condition's decisions in the scenes just shown, one for each open walk."""
         walks, forest = self._walks[point], self._forest
         undecided = walks.at >= 0
         seed_index, tree = np.nonzero(undecided)
@@ -201,7 +201,10 @@ class FrozenWorld(SceneWorld):
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:
-        """End the walks that are at these of the decision points just shown; no result has them."""
+        """End the walks of a condition at some of the scenes just shown, and drop their results.
+
+        `at` says of each scene whether it is one of them.
+        """
         walks = self._walks[point]
         undecided = walks.at >= 0
         ended = np.zeros_like(undecided)
@@ -222,8 +225,10 @@ class FrozenWorld(SceneWorld):
             self._decided.append((at, action, part.result.latency_s))
 
     def columns(self) -> dict[str, Any]:
-        """Return as columns what each decision and every other action was worth,
-        in decision order.
+        """Return columns, in decision order, of what each decision and its alternatives were worth.
+
+        By name: whether success was possible (`value`), whether the action was safe, its regret,
+        delay in s, misses and false alarms, conflicts, and safety and delay of every action.
         """
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
@@ -243,14 +248,14 @@ class FrozenWorld(SceneWorld):
 
     @property
     def numbers(self) -> Ints:
-        """The episodes' numbers, (E,)."""
+        """Episode numbers, `(E,)`."""
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
-        """Return success, failure and lateness under a condition, (S, E);
-        NaN where a walk was left out.
+        """Return how each walk of a condition ended, arrays `(S, E)` of 0 and 1 by metric name.
 
-        Success with a danger and without is NaN in the other episodes as well.
+        S are channel seeds, E episodes; NaN where a walk was left out. Success with a danger and
+        without is NaN in the other episodes as well.
         """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])

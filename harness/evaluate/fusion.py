@@ -28,7 +28,7 @@ FROM = "from:"  # in a key, before the id of the other scene that a message come
 
 @dataclass(frozen=True)
 class FusionAnswers:
-    """The ego's answers to K sets of messages; H helpers, A actions."""
+    """Hold the ego's answers to K sets of heard messages; H helpers, A actions."""
 
     # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
     codes: Ints
@@ -36,8 +36,12 @@ class FusionAnswers:
     seconds: Floats  # time of each fusion call, (K,)
 
     def at(self, points: Ints, attackers: Bools | None = None) -> FusionCall:
-        """Return the call for decisions at points (n,),
-        with attackers (n, H) if the text shows them.
+        """Return a function that answers n decisions, given who was heard in each, `(n, H)`.
+
+        `points`, `(n,)`, has each decision's point in the codes, and `attackers`, `(n, H)`, who
+        attacks, if the prompt depends on it. The function returns intents `(n, A)` and seconds
+        `(n,)`, NaN where nobody was heard; it raises LookupError for a set of messages that the ego
+        was never asked about.
         """
         return partial(self._of_heard, points, attackers)
 
@@ -60,17 +64,19 @@ class FusionAnswers:
 
 
 def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> Ints:
-    """Encode points (n,) and who was heard in each (n, H) as one number each, (n,).
+    """Return for n decisions one integer, `(n,)`, of a point and the set of helpers heard there.
 
-    With attackers (n, H), the number also says which of those heard attack.
+    `on_time`, `(n, H)`, says who was heard and `points`, `(n,)`, where. With `attackers`, `(n, H)`,
+    the integer also says which of those heard attack. `heard_in` decodes it.
     """
     flags = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
     return np.asarray(points << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
 
 
 def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
-    """Decode a number: the decision point, the helpers heard, from 0,
-    and those of them that attack.
+    """Decode an integer of `codes_of` into the point, and lists of who was heard and who attacks.
+
+    Helpers are numbered from 0. `attacked` says whether the code was made with `attackers`.
     """
     bits = helpers * (1 + attacked)
     heard = [h for h in range(helpers) if code >> h & 1]
@@ -78,11 +84,11 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 
 
 def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
-    """Return the key of a helper's message in a fusion call.
+    """Return the text that names a helper's message, and how it is shown, in a fusion call's id.
 
-    Such as `v2`, `v2~blind`, `v3!liar&schema`, `v2!text` where it holds words alone, `v2!objects`
-    where the ego's graph has its objects, or `v2!objects&from:00012-3` where it comes from another
-    scene, the `source`.
+    Such as `v2`, `v2~blind` (another question), `v3!liar&schema` (changed by attack and defence),
+    `v2!text` where it holds words alone, `v2!objects` where the ego's graph has its objects, or
+    `v2!objects&from:00012-3` where it comes from the scene `source`.
     """
     of_attackers, of_all = rewrites.changes
     changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]
@@ -95,11 +101,11 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
 
 
 def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools) -> list[str]:
-    """Return the keys of the plans that an agent, the one of this row,
-    has heard by `on_time`, (H,).
+    """Return the texts that name the plans that one agent has heard, for its fusion call's id.
 
-    Such as `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: its sender's number, its intent, and the seconds in
-    which it reaches the conflict, and that it has lost.
+    The agent is that of `row` in `intents`; `on_time`, `(H,)`, says whom it heard. Such as
+    `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: the sender's number, its intent, and the seconds in which it
+    reaches the conflict, and that it has lost.
     """
     plans = intents.plans
     assert plans is not None
@@ -136,7 +142,7 @@ def _plan_of(key: str) -> dict[str, Any] | None:
 
 
 class Marks(NamedTuple):
-    """What the key of a message says of it, behind its sender's name."""
+    """Hold what a message's key (`key_of`) says after its sender's name."""
 
     changes: list[str]  # how it was changed
     call: Call | None  # what the ego was asked with it; None if with all of it and nothing else
@@ -144,7 +150,7 @@ class Marks(NamedTuple):
 
 
 def marks_of(key: str) -> Marks:
-    """Return what the key of a message says of it, but for the scene that it comes from."""
+    """Return what a message's key says of it, except for the scene that it comes from."""
     changes, call, whole, named = [], None, False, calls()
     for mark in filter(None, key.partition(REWRITTEN)[2].split("&")):
         if mark == WHOLE:
@@ -157,7 +163,10 @@ def marks_of(key: str) -> Marks:
 
 
 def source_of(scene: str, senders: Sequence[str]) -> str:
-    """Return the id of the scene whose helpers sent the messages that an ego heard in a scene."""
+    """Return the id of the scene whose helpers sent what an ego heard, by the messages' keys.
+
+    That is `scene`, the ego's own, unless a key says otherwise.
+    """
     changes = (change for key in senders for change in key.partition(REWRITTEN)[2].split("&"))
     return next((change.removeprefix(FROM) for change in changes if change.startswith(FROM)), scene)
 
@@ -165,12 +174,12 @@ def source_of(scene: str, senders: Sequence[str]) -> str:
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return these helpers' messages as a prompt takes them;
-    `answers` are those of their scene, by key.
+    """Return the messages of these keys as a prompt template takes them.
 
-    One that holds words alone has a `sender` and `evidence`, in one line. An agent's plan has a
-    `sender`, its `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`; it
-    needs no answer.
+    `answers` has the senders' answers by key. A message has `sender`, `intent` and the fields of
+    its answer; one of words alone `sender` and `evidence`, in one line. An agent's plan has
+    `sender`, `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`. A
+    message whose objects are in the ego's graph, or whose answer failed, is left out.
     """
     messages = []
     for sender in senders:

@@ -34,26 +34,25 @@ SAID_S = 3.0  # after which it is said that a hook is waited for
 
 @runtime_checkable
 class Hook(Protocol):
-    """What follows a command's runs, one run after the other; it may raise anything.
+    """Describe a plug-in that follows a command's runs, such as an experiment tracker.
 
-    One that needs modules of an extra (`harness.core.extras.OPTIONAL`) states these as its `needs`.
+    It gets one run after the other and may raise anything. One that needs modules of an optional
+    extra (`harness.core.extras.OPTIONAL`) states these as its `needs`.
     """
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Take note of a run, before the first answer counts.
+        """Take note that a run begins, before its first answer is counted.
 
-        `settings` are plain values, as they stand in the run's `run.json`.
+        `folder` is the run's; `settings` are plain values, as in its `run.json`.
         """
         ...
 
     def answered(self, total: int) -> None:
-        """Take note that there are so many answers, or in closed loop episodes,
-        kept ones included.
-        """
+        """Take note of how many answers there are now (episodes in closed loop), kept ones too."""
         ...
 
     def end(self, done: "Evaluated | None") -> None:
-        """Take note that the run is finished, with its page; None if it was stopped."""
+        """Take note that the run is finished, with its page; `done` is None if it stopped."""
         ...
 
 
@@ -132,8 +131,9 @@ class _Caller:
 
 
 class Followers:
-    """Some hooks during one run. It begins for them with its first answer,
-    or when it ends with none new.
+    """Call hooks during one run; a hook that fails is reported on stderr and called no more.
+
+    The run begins for them with its first new answer, or when it ends without any.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Followers:
         self._folder, self._settings = folder, settings
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
-        """Return a function that counts answers, for the hooks as well."""
+        """Return a function of a number of new answers that calls `progress` and the hooks."""
 
         def count(new: int) -> None:
             progress(new)
@@ -181,7 +181,7 @@ class Followers:
 def following(
     hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]
 ) -> Iterator[Followers]:
-    """Have hooks follow a run; if it is stopped, they learn that it ended so."""
+    """Enter a context in which hooks follow a run; if it raises, they are told that it stopped."""
     followers = Followers(hooks, folder, settings)
     try:
         yield followers

@@ -20,8 +20,9 @@ _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
 class KeptAnswers:
-    """A file of answers, one a line, whose last chunk may be torn;
-    one process at a time may append.
+    """A file of a stopped run's answers, one JSON line each, written in chunks that may be torn.
+
+    Only one process at a time may append.
     """
 
     def __init__(self, file: Path) -> None:
@@ -29,11 +30,10 @@ class KeptAnswers:
         self._read_b, self._on_disk_s = 0, -math.inf  # bytes that were read or written here
 
     def recall(self, cut: bool = False) -> dict[str, Answer]:
-        """Read the answers by request id; none if the file has nothing new.
-        `cut` removes a torn chunk.
+        """Return the answers in the file by request id; none if nothing is new since the last call.
 
-        A question without an answer does not count, wherever the file comes from.
-        Raises UserError if the file is damaged.
+        `cut` removes a chunk at the end that was written in part. Engine errors do not count as
+        answers. Raises UserError if the file is damaged.
         """
         if not self.file.is_file() or (size_b := self.file.stat().st_size) == self._read_b:
             return {}
@@ -53,7 +53,7 @@ class KeptAnswers:
         return {answer.id: answer for answer in answers if answer.error is None}
 
     def append(self, answers: Sequence[Answer]) -> None:
-        """Append a chunk of answers."""
+        """Append answers as one chunk, which a later `recall` reads whole or not at all."""
         lines = _ENCODER.encode_lines(answers)
         chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
         with appending(self.file) as file:
@@ -66,5 +66,5 @@ class KeptAnswers:
 
 
 def read_kept(file: Path) -> dict[str, Answer]:
-    """Read the answers of a file by request id, as `KeptAnswers.recall` does."""
+    """Return the answers in a file by request id; raises as `KeptAnswers.recall`."""
     return KeptAnswers(file).recall()

@@ -31,8 +31,7 @@ EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 def known(
     choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]
 ) -> Latency | None:
-    """Return the latency that `--latency` chooses for the ego's agent, then the helpers';
-    None to measure it.
+    """Return the latency that `--latency` chooses for agents, the ego's first; None to measure it.
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
     """
@@ -56,7 +55,10 @@ def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
 
 
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
-    """Combine the ego's times with those of the helpers' own agents, if there are any."""
+    """Return the ego's latency with the helpers' times replaced by those of their own models.
+
+    Without helpers' latencies it is the ego's. Raises UserError if one goes by tokens on a device.
+    """
     if not helpers:
         return ego
     if any(each.speeds for each in (ego, *helpers)):
@@ -76,11 +78,10 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
 
 
 def declared(text: str) -> Latency:
-    """Parse a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds;
-    a role left out has the ego's.
+    """Return the latency of a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds.
 
-    Several helper models have one time each: `helper=0.164:0.2`.
-    Raises UserError for any other text.
+    A role left out has the ego's time. Several helper models have one time each:
+    `helper=0.164:0.2`. Raises UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     seconds: dict[str, list[float]] = {}
@@ -106,7 +107,7 @@ def declared(text: str) -> Latency:
 
 
 def as_declared(latency: Latency) -> str:
-    """Return a latency as a text that `declared` parses."""
+    """Return the text by which `declared` gives these times."""
     helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))
     return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
@@ -114,9 +115,9 @@ def as_declared(latency: Latency) -> str:
 def inference_s(
     latency: Latency, answers: Sequence[Sequence[Answer | None]], places: Sequence[Sequence[int]]
 ) -> Floats:
-    """Return the seconds of inference, (n, 1+H), of who decides first; NaN without an answer.
+    """Return the seconds in which each vehicle's answer is ready, `(n, 1+H)`, NaN without one.
 
-    `places` say whose model answers, as in `Latency.speed`: with one model for all, the role alone
+    `places` say whose model answers, as in `Latency.speed`: with one model for all, only the role
     counts. A repair turn takes the time of one more answer. An answer's own declared delay
     (`slow_s`) is added.
     """
@@ -135,9 +136,9 @@ def inference_s(
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int]) -> Floats:
-    """Return the seconds of each fusion call, (K,), counted as in `inference_s`.
+    """Return the seconds of K fusion calls, `(K,)`, counted as in `inference_s`.
 
-    A vehicle with a helper model takes as long as for any other answer.
+    A vehicle with a helper's model takes as long as for any other answer.
     """
     if latency.speeds:
         return np.array(
@@ -149,8 +150,9 @@ def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int])
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """Return, by role, how long answers took;
-    only those that were timed and came at the first attempt.
+    """Return percentiles by role of the seconds that answers took, with intervals.
+
+    Only answers that were timed and came at the first attempt count.
     """
     by_role: dict[str, list[Answer | AnswerFacts]] = {}
     for answer in answers:

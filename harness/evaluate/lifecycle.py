@@ -23,7 +23,7 @@ from harness.runs.settings import EXTENSIONS, PLAIN, difference, of_words, words
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
-    """The record that a run begins with, and keeps when it resumes."""
+    """Hold what a run begins with, kept in its working folder so that it resumes alike."""
 
     created: str  # when the run began, UTC, ISO 8601
     command: tuple[str, ...] = ()  # words of the command that repeats the run
@@ -39,9 +39,7 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
         msgspec.structs.force_setattr(self, "versions", formats.versions(self.versions))
 
     def facts(self) -> dict[str, Any]:
-        """Return what must be the same in all shards of a run,
-        by the name that an error gives it.
-        """
+        """Return what must be equal in all shards of a run, by the name that an error gives it."""
         versions = {
             f"version of {name}": v for name, v in self.versions.items() if name != "platform"
         }
@@ -56,7 +54,7 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A finished run: its folder, its manifest and its summary."""
+    """Hold a finished run: its folder, its manifest and its scores."""
 
     out: Path
     manifest: Manifest
@@ -71,7 +69,10 @@ def begin(
     latency: Latency,
     shard: str = "",
 ) -> RunStart:
-    """Return `begun`, or a new record. Raises UserError if the run began with another model."""
+    """Return the record of a run that begins, or `begun` if it resumes.
+
+    Raises UserError if the run was begun with a model of another identity.
+    """
     if begun is None:
         return RunStart(
             settings=spec.record(),
@@ -92,17 +93,16 @@ def begin(
 
 
 def another_model(spec: Spec) -> str:
-    """Return the words of an error for a model that is not the one a run began with."""
+    """Return words for an error: that a model is not the one that a run began with."""
     names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
 def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunStart:
-    """Return the record of a run that finishes:
-    tags of both commands, and where its dataset is now.
+    """Return the record of a run as it finishes, to write into its manifest.
 
-    One that was looked at states the layouts that it stopped after;
-    its command still says when to stop.
+    It has the tags of all commands, the dataset's present path, and measured times as declared
+    ones. A run that stopped early (`looks`) also states after how many layouts.
     """
     spec = spec.changed(tag=tuple(dict.fromkeys((*begun.tags, *spec.settings.tag))))
     # A repeat must not measure: other times would make other rows.
@@ -123,8 +123,9 @@ def _stopped(spec: Spec, looks: Looks | None) -> Spec:
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
-    """Return the record of a stopped run in a folder, or None.
-    Raises UserError if it is another run.
+    """Return the record of a stopped run in a folder; None if there is none.
+
+    Raises UserError if it is a run with other settings.
     """
     begun = work.begun(out, RunStart)
     if begun:
@@ -153,7 +154,10 @@ def _rules(versions: Mapping[str, str]) -> dict[str, str]:
 
 
 def resumable(spec: Spec, out: Path) -> bool:
-    """Return whether this run was stopped in a folder and no process is working there."""
+    """Return whether this command can go on with the work in `out`, and no process works there.
+
+    That is this run, stopped, or any run that was stopped before its first answer.
+    """
     try:
         return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
     except UserError:
@@ -170,7 +174,10 @@ def refuse_finished(out: Path) -> None:
 
 
 def finished(spec: Spec, out: Path) -> Evaluated:
-    """Return the finished run in a folder. Raises UserError if it is another run, or damaged."""
+    """Return the finished run in a folder.
+
+    Raises UserError if it has other settings than `spec`, or is damaged.
+    """
     looks = folder.read(out).manifest.world.looks if spec.source.until else None
     return finished_with(_stopped(spec, looks).record(), out, partial(_options, spec))
 
@@ -178,10 +185,10 @@ def finished(spec: Spec, out: Path) -> Evaluated:
 def finished_with(
     settings: Mapping[str, Any], out: Path, typed: Callable[[str], str] = lambda command: ""
 ) -> Evaluated:
-    """Return the finished run in a folder, checked against settings.
-    Raises UserError as `finished`.
+    """Return the finished run in a folder, compared with settings as `Spec.record` returns them.
 
-    `typed` says of the run's command in which options this one differs.
+    Raises UserError if they differ or the run is damaged. `typed` takes the run's command and
+    returns in which options this one differs, for the error.
     """
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))

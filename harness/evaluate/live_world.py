@@ -45,10 +45,10 @@ from harness.world.world import World
 
 @dataclass(frozen=True)
 class LiveSource:
-    """The layouts of a scenario that are driven; episode e has layout seed `first_seed` + e.
+    """Describe the layouts of a scenario to drive in closed loop, as `harness drive` does.
 
-    With a `sample`, only that many of the episodes are driven:
-    those that `harness eval` draws from as many.
+    Episode e has layout seed `first_seed` + e. With a `sample`, only that many of the episodes are
+    driven, drawn as `harness eval` draws from as many.
     """
 
     first_seed: int
@@ -66,8 +66,9 @@ class LiveSource:
 
     @cached_property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes that are driven.
-        Raises UserError if there are fewer than the sample.
+        """Numbers of the episodes to drive, fewer if the run stops early (`until`).
+
+        Raises UserError if there are fewer episodes than the sample.
         """
         numbers = range(self.episodes)
         if self.sample is None:
@@ -98,7 +99,7 @@ class LiveSource:
         )
 
     def stopped(self, looks: Looks) -> "LiveSource":
-        """Return what was driven when it was looked at last."""
+        """Return this source cut to the episodes after which a run stopped by its rule."""
         return replace(self, episodes=looks.at[-1], until=self.until and self.until.after(looks))
 
     def settings(self) -> DriveSettings:
@@ -113,7 +114,10 @@ class LiveSource:
         )
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield one decision point of each of up to `most` episodes, at different times."""
+        """Yield one decision point of each of up to `most` episodes, at different times.
+
+        With `ego_alone` it has no scene graph of a helper.
+        """
         p = self.scenario.parameters
         for number in self.numbers[:most]:
             trajectory = Trajectory(
@@ -124,7 +128,11 @@ class LiveSource:
 
 
 class LiveWorld(SceneWorld):
-    """Drives episodes under all conditions and seeds; those that act alike share a world."""
+    """A world that simulates episodes under all conditions and channel seeds.
+
+    Episodes of one layout that have acted alike so far share a simulation. A decision takes effect
+    in the first frame after its latency.
+    """
 
     def __init__(
         self,
@@ -135,9 +143,8 @@ class LiveWorld(SceneWorld):
         seeds: Sequence[int],
         ego_alone: bool,
     ) -> None:
-        """Start the episodes.
+        """Start the episodes of these `numbers`; episode 0 has layout seed `first_seed`.
 
-        Episode 0 has layout seed `first_seed`.
         With `ego_alone` helpers are never asked, and no scene graphs of theirs are made.
         """
         self.scenario, self._p = scenario, scenario.parameters
@@ -268,8 +275,9 @@ class LiveWorld(SceneWorld):
         self._going = [part for part in parts if not part.world.ended]
 
     def columns(self) -> dict[str, Any]:
-        """Return when each decision acts, whether it did, and conflicts,
-        in the order of decisions.
+        """Return columns, in decision order, of when each decision took effect, and of conflicts.
+
+        By name: `acts_at_s`, `acted`, and the least TTC and PET until the agent's next decision.
         """
         ttc_s = np.array([decision.ttc_s for decision in self._decisions])
         pet_s = np.array([decision.pet_s for decision in self._decisions])
@@ -284,9 +292,10 @@ class LiveWorld(SceneWorld):
 
 
 def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episode]:
-    """Return how each ended; late is against a full-view driver whose decisions act after the lag.
+    """Return the record of each ended episode, one for each trajectory and course.
 
-    Where several can decide nobody is late: there is no such driver for all of them together.
+    A success is late if it takes too long against a full-view driver whose decisions act after the
+    lag. Where several agents decide nobody is late: no such driver exists for all of them together.
     """
     if agent_share(scenario):
         alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))
@@ -303,14 +312,19 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
 
 
 def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:
-    """Return an agent's decision point in the world of an episode with this number."""
+    """Return the decision point of one agent in a simulated world, now.
+
+    `agent` is its place in the world, 0 the ego; `number` is the episode's. With `ego_alone` it has
+    no scene graph of a helper.
+    """
     [scene] = looks([(world, agent, number)], step, ego_alone)
     return scene
 
 
 def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
-    """Return the decision point of each agent in its world, of an episode with this number,
-    at this step.
+    """Return the decision point of each (world, agent, episode number), now, as step `step`.
+
+    With `ego_alone` they have no scene graphs of helpers.
     """
     states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
     scenes = dict[int, Scene]()

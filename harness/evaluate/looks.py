@@ -21,20 +21,20 @@ MORE = 1.25  # times as many at each next one
 
 @dataclass(frozen=True)
 class Until:
-    """What is enough in every condition:
-    a narrow interval of success, or a difference to another run.
+    """Describe when a run may stop early: every condition's success is known well enough.
 
-    Layouts come in their order, which no answer changes,
-    and intervals hold at every look (`core.sequences`).
+    That is a confidence interval no wider than `width`, or a difference to another run's success
+    whose interval excludes 0. Layouts come in a fixed order, and intervals hold at every look
+    (`core.sequences`).
     """
 
-    width: float | None = None  # a share
-    against: Run | None = None
+    width: float | None = None  # widest interval that is enough, a share; None to compare instead
+    against: Run | None = None  # the run to compare with; None for a width
     folder: Path | None = None  # of `against`, as it was typed
     looked: Looks | None = None  # how often the run was looked at, once it has stopped
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings of a run, by name, that ask for this rule of stopping."""
+        """Return the run settings that ask for this rule, by name; the width is in points."""
         width = None if self.width is None else round(100 * self.width, 9)
         return {
             "until_width": width,
@@ -42,7 +42,7 @@ class Until:
         }
 
     def record(self, layouts: int) -> Looks:
-        """Return this as a run's record has it, of so many layouts at most."""
+        """Return the record of this rule in a manifest, of a run over at most `layouts` layouts."""
         run = self.against
         return self.looked or Looks(
             layouts=layouts,
@@ -52,7 +52,7 @@ class Until:
         )
 
     def after(self, looks: Looks) -> "Until":
-        """Return this of a run that has stopped."""
+        """Return this rule with the record of a run that has stopped by it."""
         return replace(self, looked=looks)
 
     def check(
@@ -62,8 +62,10 @@ class Until:
         conditions: Sequence[str],
         seeds: Sequence[int],
     ) -> None:
-        """Raise UserError unless another run has these scenes and seeds,
-        and all layouts and conditions.
+        """Raise UserError unless the run to compare with fits: same scenes and channel seeds.
+
+        It must also have all of these episode numbers and conditions. Without such a run nothing is
+        checked.
         """
         run = self.against
         if run is None:
@@ -87,8 +89,9 @@ class Until:
             )
 
     def enough(self, grid: Grid, episodes: Sequence[Episode]) -> bool:
-        """Return whether the episodes so far, in the grid's order,
-        are enough in every condition.
+        """Return whether a run may stop: all conditions are known well enough by these episodes.
+
+        `episodes` are those finished so far, in the grid's order.
         """
         success, values = by_condition(grid, episodes)
         if self.width is not None:
@@ -111,9 +114,7 @@ class Until:
 
 
 def looks(layouts: int) -> list[int]:
-    """Return after how many layouts a run of at most so many is looked at;
-    the last is all of them.
-    """
+    """Return after how many layouts a run checks whether it may stop; the last is `layouts`."""
     at = [min(FIRST, layouts)]
     while at[-1] < layouts:
         at.append(min(math.ceil(at[-1] * MORE), layouts))
@@ -121,8 +122,10 @@ def looks(layouts: int) -> list[int]:
 
 
 def until(width: float | None, against: str | None) -> Until | None:
-    """Return what the settings ask for, or None.
-    Raises UserError if both ask, or for what is no run.
+    """Return the rule by which a run stops early, from its settings; None without one.
+
+    `width` is in percent points, `against` a run's folder. Raises UserError if both are given, one
+    is out of range, or there is no such run.
     """
     if width is None and against is None:
         return None

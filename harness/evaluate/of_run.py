@@ -31,10 +31,9 @@ DRIVER = "driver"  # the engine of what has no model and no prompt
 
 
 def spec_of(run: Run, source: FrozenSource) -> Spec:
-    """Return the evaluation of a run's frozen scenes, with all that decides its answers;
-    without conditions.
+    """Return the evaluation by which a run's frozen scenes were answered, without conditions.
 
-    Raises UserError if a prompt of it is not here.
+    Raises UserError if a prompt of it is not installed here.
     """
     manifest = run.manifest
     ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
@@ -44,16 +43,14 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
 
 
 def card_here(card: Card) -> Card:
-    """Return a card that a run states;
-    of a driver the one that is here, which says what it may see.
-    """
+    """Return the card of a model; of a rule-based driver the installed one instead of the run's."""
     return cards.load(card.name) if card.engine == DRIVER else card
 
 
 def points_of(run: Run) -> dict[str, OperatingPoint]:
-    """Return a run's operating points by name.
+    """Return a run's operating points by condition name.
 
-    Raises UserError if a channel, network, schedule or what else they name has changed since.
+    Raises UserError if a channel, network, schedule or other file that they name has changed since.
     """
     manifest = run.manifest
     points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
@@ -80,7 +77,7 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
 
 
 def check_prompts(run: Run, spec: Spec) -> None:
-    """Raise UserError if a prompt of a run has changed since."""
+    """Raise UserError if a prompt's files here differ from those that the run was made with."""
     stated = (run.manifest.agent(0), *run.manifest.helpers)
     for agent, each in zip(spec.agents, stated, strict=True):
         if agent.prompt.sha256 != each["prompt"]["sha256"]:

@@ -21,8 +21,10 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
-    """Return the outlook of each scene, (n, ...);
-    a road with fewer sectors than others sees the rest.
+    """Return how much of the scenario's regions the ego of each scene sees, `(n, ...)`.
+
+    It also says what helpers would add. On a road with fewer regions than others, the rest counts
+    as seen.
     """
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]

@@ -20,10 +20,10 @@ GREY = 127
 def picture(
     spec: Spec, index: int, scene: Scene, viewer: str, pictured: bool = True
 ) -> Image | None:
-    """Return the picture that a viewer's agent is shown; None if its prompts show none.
+    """Return the picture that a vehicle's agent is shown; None if its prompt shows none.
 
-    `index` says which agent answers. It is blank for a viewer that is not to be shown what it sees.
-    Raises UserError if there is no other scene to take a picture from.
+    `index` says which agent answers. The picture is grey if `pictured` is false. Raises UserError
+    if it must come from another scene and there is none.
     """
     agent = spec.agents[index]
     vision = agent.card.vision
@@ -40,14 +40,15 @@ def picture(
 
 @lru_cache(maxsize=4)
 def blank(size_px: tuple[int, int]) -> Image:
-    """Return a picture that is grey all over."""
+    """Return a grey picture of a size (width, height) in pixels."""
     width, height = size_px
     return Image(np.full((height, width, 3), GREY, dtype=np.uint8))
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """Return a decision point of the same step in another episode,
-    drawn with the scene's id as the key.
+    """Return a random scene of the same step in another episode, keyed by this scene's id.
+
+    Raises UserError if there is none.
     """
     assert isinstance(spec.source, FrozenSource), "Spec refuses another scene in the closed loop"
     dataset = spec.source.dataset

@@ -59,7 +59,10 @@ RULES = (DRIVER, "proxy")  # engines that are no models
 
 
 class Held:
-    """Asks a rule, which is here, and counts the answers that a run states otherwise."""
+    """A backend that asks a rule, and counts its answers that differ from those a run states.
+
+    Identity and latency are the run's.
+    """
 
     def __init__(self, rule: Backend, kept: Kept) -> None:
         self._rule, self._kept, self.wrong = rule, kept, 0
@@ -79,8 +82,10 @@ class Held:
 def computed(
     stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]
 ) -> tuple[Run, int]:
-    """Compute a run again, and count the answers that the rule here gives otherwise;
-    0 of other models.
+    """Compute a run again from its stored answers into folder `out`.
+
+    Returns the new run, and the number of stored answers that differ from what the rule installed
+    here gives; 0 for models that are no rules. `progress` gets the number of answers.
     """
     kept, held = Kept(stated), list[Held]()
 
@@ -102,9 +107,10 @@ def computed(
 def differences(
     run: Run, dataset: Dataset, out: Path, progress: Callable[[int], None]
 ) -> tuple[list[str], list[str]]:
-    """Compute a run of frozen scenes again, in an empty folder.
+    """Compute a run of frozen scenes again, in an empty folder, and compare.
 
-    Returns what its tables say otherwise, and which columns it lacks, as a run by older rules may.
+    Returns sentences on what its tables say otherwise, and on which columns it lacks, as a run by
+    older rules may.
 
     Args:
         run: the run, which is not changed.
@@ -112,8 +118,8 @@ def differences(
         out: the folder, which is written.
         progress: called with the number of answers that were read again.
 
-    Raises UserError if a prompt, a channel or the like is not here as it was,
-    or an answer is missing.
+    Raises UserError if a prompt, a channel or the like is not here as it was, or an answer is
+    missing.
     """
     world = run.manifest.world
     assert isinstance(world, FrozenScenes)
@@ -182,10 +188,10 @@ def _null(table: Any, name: str) -> bool:
 
 
 def driven_otherwise(run: Run) -> Iterator[str]:
-    """Yield what episodes.csv says otherwise of a few episodes than the simulator,
-    by the recorded actions.
+    """Yield sentences on what a closed-loop run's latency and episodes.csv get wrong.
 
-    Raises UserError if the scenario is not here as it was.
+    A few episodes are simulated again with the recorded actions. Raises UserError if the scenario
+    is not here as it was.
     """
     from harness.evaluate.replay import driven_again, played
 
@@ -217,9 +223,7 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
 
 
 def of_card(run: Run) -> Iterator[str]:
-    """Yield a sentence where a run names its card as the source of a latency that the card here has
-    not.
-    """
+    """Yield a sentence if a run's latency is said to be its card's, and the card here differs."""
     latency, name = run.manifest.latency, run.manifest.model["name"]
     if latency.source != "card" or name not in cards.names():
         return

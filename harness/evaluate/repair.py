@@ -21,8 +21,9 @@ _CONTROL = re.compile(r"[<＜](?=\S)|[\[［](?=/?[A-Za-z])")
 
 
 def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
-    """Return whether to ask again: a model answered in free text,
-    and no intent can be parsed from it.
+    """Return whether to ask again because no intent could be parsed from a free-text answer.
+
+    The prompt must have a repair turn for the role, and the engine must not have failed.
     """
     return (
         request.answer == "json"
@@ -33,9 +34,7 @@ def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
 
 
 def asked(request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]) -> Request:
-    """Return the second request: the chat so far, the answer,
-    and the prompt's words about its error.
-    """
+    """Return the request of the repair turn: the chat so far, the answer, and what was wrong."""
     correction = prompt.repair(
         request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words
     )
@@ -47,21 +46,18 @@ def asked(request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, 
 
 
 def quoted(raw: str) -> str:
-    """Return an answer as a chat quotes it:
-    without its thought, as text, cut to `QUOTED` characters.
-    """
+    """Return an answer as text to put in a chat: no thought, cut to `QUOTED` characters."""
     text = as_text(raw.rpartition("</think>")[2].strip())
     return text if len(text) <= QUOTED else text[: QUOTED - 1] + "…"
 
 
 def as_text(text: str) -> str:
-    """Return a text with a space inside whatever a chat template may read as a special token."""
+    """Return a text in which no chat template finds a special token: a space is put into each."""
     return _CONTROL.sub(lambda begins: f"{begins[0]} ", text)
 
 
 def together(first: Answer, second: Answer) -> Answer:
-    """Return the second turn's answer with the first turn's text and the tokens,
-    time and retries of both.
+    """Return the second answer with the first one's text, and tokens, time and retries of both.
 
     The times to the first and between tokens describe one request, so they are left out.
     """

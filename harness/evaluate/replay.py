@@ -29,7 +29,7 @@ AT_ONCE = 128  # decision points that are replayed together, which bounds memory
 
 @dataclass(frozen=True)
 class ReplayedEpisode:
-    """One episode of a finished closed-loop run."""
+    """Hold the recorded decisions of one episode of a finished closed-loop run."""
 
     manifest: Manifest  # the run's manifest
     condition: str  # name of the condition
@@ -44,7 +44,7 @@ class ReplayedEpisode:
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode:
-    """Return an episode of a run that is known to have it."""
+    """Return one episode of a closed-loop run, which must have it, with its decisions."""
     world, table = run.manifest.world, run.decisions
     assert isinstance(world, ClosedLoop)
     is_episode = (table.whole("episode") == episode) & (table.whole("seed") == seed)
@@ -57,9 +57,9 @@ def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode
 
 
 def scenes_of(run: Run, names: Sequence[str]) -> list[Scene]:
-    """Return decision points' scenes, by replaying together one of the episodes that reach each.
+    """Return the scenes of decision points by id, simulating an episode that reaches each.
 
-    A scene's id equals its decision point's only if this simulator behaves as the run's did.
+    A returned scene has its id only if this simulator behaves as the run's did.
     """
     return [
         scene
@@ -97,13 +97,13 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
 
 
 def due_frame(world: World, decision: Decision) -> int:
-    """Return the frame in which a decision begins."""
+    """Return the simulation frame in which a decision begins."""
     offset = offset_of(world.scenario, world.seed, _place(world, decision.agent))
     return world.scenario.parameters.due_frame(decision.step) + offset
 
 
 def actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
-    """Return the decisions that acted, by the frame in which they did, in the order of time."""
+    """Return an episode's decisions that took effect, by simulation frame, in order of time."""
     p, acting = played.scenario.parameters, dict[int, list[Decision]]()
     for decision in sorted(
         (d for d in played.decisions if d.acted), key=lambda d: acting_frame(d, p)
@@ -113,12 +113,12 @@ def actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
 
 
 def acting_frame(decision: Decision, p: Parameters) -> int:
-    """Return the frame in which a decision acts; 0 if it never did."""
+    """Return the simulation frame in which a decision took effect; 0 if it never did."""
     return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
 def act(world: World, decisions: Sequence[Decision]) -> None:
-    """Have the agents take what they decided."""
+    """Let agents in a world take the actions of these decisions."""
     for decision in decisions:
         world.take(decision.action, _place(world, decision.agent))
 
@@ -129,8 +129,9 @@ def _place(world: World, agent: str | None) -> int:
 
 
 def driven_again(played: ReplayedEpisode) -> Episode:
-    """Drive an episode to its end with the recorded actions;
-    return how it ended, without its decisions.
+    """Simulate an episode with the recorded actions to its end, and return how it ended.
+
+    The record lacks what follows from decisions alone.
     """
     world = World.start(played.scenario, played.layout_seed)
     for frame, acting in actions_by_frame(played).items():

@@ -31,9 +31,10 @@ def requests(
     question: Question = PLAIN,
     places: Places | None = None,
 ) -> Iterator[Request]:
-    """Yield the requests of scenes, the ego's first; only helpers are asked another `question`.
+    """Yield what vehicles in scenes are asked, the ego's request first in each scene.
 
-    With `places`, only those of the viewers at these places of each scene, the ego at 0.
+    With another than the ordinary `question`, only helpers are asked. With `places`, only vehicles
+    at these places in each scene, the ego at 0.
     """
     agents, actions = spec.agents, spec.actions
     privileged, sees = (
@@ -63,15 +64,16 @@ def requests(
 
 
 def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
-    """Return the scenes where a helper is wanted, (n, H),
-    and the places of those helpers in each.
+    """Return the scenes where some helper is wanted, and the places of these helpers in each.
+
+    `wanted` is `(n, H)`; the first helper is at place 1.
     """
     rows = np.flatnonzero(wanted.any(axis=1)).tolist()
     return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
 
 
 def request_id(scene: Scene, viewer: str, question: Question) -> str:
-    """Return the id of a viewer's request in a scene; of a helper's to another question."""
+    """Return the id of the request that asks a vehicle a question in a scene."""
     return f"{scene.id}/{asked_key(viewer, question.name)}"
 
 
@@ -91,10 +93,14 @@ def fusion_request(
     senders: Sequence[str],
     graph: SceneGraph | None = None,
 ) -> Request:
-    """Return the fusion call with these senders' messages;
-    `answers` has the same keys as `senders`.
+    """Return the request that asks the ego once more, with messages of these keys.
 
-    With a `graph`, the ego is asked with this one instead of its own.
+    Args:
+        spec: the evaluation.
+        scene: the ego's.
+        answers: helpers' answers by key, without what says how a message is shown.
+        senders: keys of the messages, as of `fusion.key_of`.
+        graph: scene graph to show instead of the ego's own; None for its own.
     """
     heard = messages_of(answers, senders, spec.actions)
     scenario, index = spec.scenario_of(scene), spec.agent(scene.agent)
@@ -113,14 +119,17 @@ def fusion_request(
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
-    """Return the id of the fusion call with the messages of these keys."""
+    """Return the id of the request with messages of these keys (`fusion.key_of`) in a scene."""
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
 def heard_sets(
     scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:
-    """Yield the scene of each set of messages and the keys of its senders."""
+    """Yield the ego's scene and the messages' keys of each set of messages, by code.
+
+    `codes` are those of `fusion.codes_of`, for these scenes in their order.
+    """
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():
         at, heard, attacking = heard_in(code, helpers, bool(rewrites.changes.of_attackers))

@@ -34,8 +34,9 @@ NO_MESSAGES = {"no-messages": "loss=1"}
 
 
 def spec(settings: Settings, source: Source) -> Spec:
-    """Return the evaluation of a world under these settings.
-    Raises UserError for what is not allowed.
+    """Return the evaluation of a source of scenes under a run's settings, with all files opened.
+
+    Raises UserError for a name that there is not, or settings that are not allowed together.
     """
     ego, helpers = agents(settings, source.scenario)
     profile = settings.device_profile
@@ -51,7 +52,10 @@ def spec(settings: Settings, source: Source) -> Spec:
 
 
 def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
-    """Return the selected episodes of a dataset, by its name or folder."""
+    """Return the selected episodes of a dataset, given by name or folder.
+
+    Raises UserError if there is no such dataset, or the selection is not allowed.
+    """
     selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
     whole = load.load(load.find(dataset), None if selection.given else world.limit)
     return FrozenSource(
@@ -60,8 +64,7 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
 
 
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
-    """Return the layouts that are driven;
-    by default as many, and the same, as the shipped dataset has.
+    """Return the layouts to drive in closed loop, by default those of the shipped dataset.
 
     Raises UserError if an episode or seed is out of range or mixed with those of another purpose,
     or if the scenario is an environment that cannot be driven.
@@ -103,7 +106,10 @@ def _shipped(scenario: str) -> dict[str, Any]:
 
 
 def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, ...]]:
-    """Return the agents that answer for the ego and for the helpers in a scenario."""
+    """Return the ego's agent, and those of the helpers, by a run's settings.
+
+    Raises UserError for models, prompts or answer modes that do not exist or do not fit.
+    """
     own, version = settings.helpers, settings.prompt or scenario.prompt
     card = cards.resolve(settings.model, settings.engine)
     # Agent checks the modes.
@@ -140,9 +146,10 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
 
 @contextmanager
 def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
-    """Name a helper's option in what is wrong with a helper.
+    """Enter a context in which a UserError about a helper's setting names its own option.
 
-    `typed` is what was given as the helper's own, by the ego's option; None where the ego's holds.
+    `typed` has the helper's own values by the ego's option, such as `--answer`; None where the
+    ego's holds.
     """
     try:
         yield
@@ -158,8 +165,10 @@ def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
 def points(
     conditions: Sequence[str], controls: Sequence[str] = (), attacks: Sequence[str] = ()
 ) -> tuple[OperatingPoint, ...]:
-    """Return operating points by name, each once,
-    and of those with a channel the controls and attacks.
+    """Return the operating points of conditions, each once, and their controls and attacks.
+
+    Each control and attack is added to every condition with a channel, as a condition of its own.
+    Raises UserError for an unknown name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     known = {**NO_MESSAGES, **control_settings()} if controls else {}

@@ -28,13 +28,15 @@ def further_rounds(
     heard: Exchange,
     fused: Callable[[Exchange, Intents], Coordination],
 ) -> tuple[SentIntents, Exchange]:
-    """Return what is known after the last round, and the exchange of all rounds together.
+    """Play the negotiation rounds after the first, in which agents exchange revised plans.
+
+    Returns the last plans that each agent knows, and one exchange that sums all rounds.
 
     Args:
         point: the condition.
-        said: what was said in the first round, in decisions (n,).
+        said: what was sent in the first round, in decisions (n,).
         heard: the exchange of the first round.
-        fused: decides by an exchange and by the intents that it brought.
+        fused: returns the decisions by an exchange and the intents known after it.
     """
     for number in range(2, point.fusion.rounds + 1):
         intents, draws = said.intents, said.draws

@@ -85,11 +85,10 @@ def evaluate(
     opens: Opens | None = None,
     given: Mapping[str, Answer] = NOTHING,
 ) -> Evaluated:
-    """Evaluate a model with a prompt and write the run's folder,
-    whose bytes do not depend on the workers.
+    """Evaluate a model with a prompt, and write the run's folder.
 
-    A stopped run in that folder resumes. The working folder stays until the caller calls
-    `work.tidy`; until then the caller may add files to the run.
+    Its bytes do not depend on the workers. A stopped run in that folder resumes. The working folder
+    stays until the caller calls `work.tidy`; until then the caller may add files to the run.
 
     Args:
         spec: what is evaluated.
@@ -97,7 +96,7 @@ def evaluate(
         progress: called with the number of new answers (frozen scenes) or of episodes just driven
             (closed loop); what an earlier, stopped run kept is included.
         cache: completion cache for language models, a file; None for no cache.
-        more: called with the number of answers that are due next; frozen scenes only.
+        more: called with the number of requests to be asked next; frozen scenes only.
         workers: processes or a cluster. They drive the closed loop, and walk frozen scenes if rules
             or served models answer; each worker opens its own backend. Other models answer frozen
             scenes in this process. The workers together have as many requests at once at a server
@@ -135,11 +134,11 @@ def evaluate(
 def evaluate_shard(
     spec: Spec, out: Path, shard: Shard, progress: Progress, workers: Workers = 1
 ) -> int:
-    """Drive one shard of a closed-loop run, which `harness run merge` combines;
-    a stopped shard resumes.
+    """Drive one shard of a closed-loop run, or resume it; return its number of episodes.
 
-    `progress` counts episodes, those that a stopped shard kept included. Returns how many the shard
-    has. Raises UserError as `evaluate`, or if the latency is to be measured.
+    `harness run merge` combines shards. `progress` counts episodes, those that a stopped shard kept
+    included. Raises UserError as `evaluate`, or if the latency is to be measured or the run may
+    stop early.
     """
     metrics_of(spec.source.kind)
     refuse_finished(out)
@@ -160,8 +159,7 @@ def evaluate_shard(
 
 
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
-    """Combine the shards of a closed-loop run into the run that `evaluate` would have written,
-    byte for byte.
+    """Combine the shards of a closed-loop run into one run, byte for byte as without shards.
 
     Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two
     hold different bytes for the same part, or `out` holds something else.
@@ -291,10 +289,10 @@ def _frozen(
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
-    """Return the workers that walk frozen scenes:
-    1 unless rules answer, or servers are asked by processes.
+    """Return the workers by which frozen scenes can be walked, 1 for this process alone.
 
-    Of these there are no more than a server may have requests at once.
+    More than one serve where rules answer (all of `workers`), or models on servers, of which there
+    are no more than a server may have requests at once (`batch_size`).
     """
     if _reproducible(spec):
         return workers
@@ -632,11 +630,10 @@ def read_or_evaluate(
     opens: Opens,
     given: Mapping[str, Answer] = NOTHING,
 ) -> folder.Run:
-    """Read the finished run in a folder, or run it with `evaluate` first;
-    for studies of several runs.
+    """Return the run in a folder, which `evaluate` makes first unless it is finished.
 
-    Raises UserError if a finished one is another evaluation, or states answers that its texts
-    do not say.
+    For studies of several runs. Raises UserError if a finished one is another evaluation, or states
+    answers that its texts do not say; else as `evaluate`.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)

@@ -16,21 +16,22 @@ FILE = "servers.jsonl"
 
 
 def lines(served: Iterable[Served]) -> bytes:
-    """Return one line of JSON for each answer."""
+    """Return one JSON line for each answer, with the server that gave it."""
     return msgspec.json.Encoder().encode_lines(list(served))
 
 
 def keep(work: Path, served: Iterable[Served] | bytes) -> None:
-    """Append answers, or their lines, to the file in a working folder."""
+    """Append which server gave each answer, or such JSON lines, to a file in a working folder."""
     if data := served if isinstance(served, bytes) else lines(served):
         with appending(work / FILE) as file:
             file.write(data)
 
 
 def write(out: Path, works: Iterable[Path]) -> None:
-    """Write a run's file from those of working folders; none if no answer came from a server.
+    """Write which server gave each answer to a run's folder, from its working folders.
 
-    An answer that was asked for twice has the server that gave it last.
+    No file is written if no answer came from a server. An answer that was asked for twice has the
+    server that gave it last.
     """
     last: dict[str, Served] = {}
     for work in works:

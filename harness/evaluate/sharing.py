@@ -22,11 +22,15 @@ from harness.world.scene_graph import SceneGraph
 def shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
-    """Return the ego's graph for each scene and the keys of those who were heard in it
-    (`fusion.key_of`).
+    """Return the ego's scene graph with the objects that it heard, for each set of messages.
 
-    None where their messages leave it as it is. All sets have messages of one content;
-    `scenes` has the scenes that these come from, by id.
+    It is None where the messages add nothing to the graph.
+
+    Args:
+        scenario: the ego's.
+        sets: the ego's scene and the keys of the messages heard (`fusion.key_of`), all of one
+            content.
+        scenes: the scenes that the messages come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
     for seat, places in by_seat([scene for scene, _ in sets], scenario).items():
@@ -74,7 +78,7 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
 def as_asked(
     scenario: Scenario, scene: Scene, answer: Answer, source: Scene | None = None
 ) -> Scene:
-    """Return a decision point as it was shown to who gave an answer.
+    """Return a scene as it was shown to the vehicle that gave `answer`.
 
     A helper may have been asked another question; an ego that was asked again may have had the
     objects of others, of the scene `source` (`fusion.source_of`) if messages came from elsewhere.
@@ -101,7 +105,7 @@ def as_asked(
 
 
 def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
-    """Return how many objects each helper lists, and in how many bits as compact JSON, both (n, H).
+    """Return how many objects each helper lists, and their size in bits as JSON, both `(n, H)`.
 
     Each object has its id, class, place in metres to one decimal, heading in degrees, speed and
     indicator; each region the share that is in sight. Both are 0 where there is no helper.

@@ -16,10 +16,10 @@ from harness.runs import devices
 
 
 def sources(spec: Spec) -> dict[str, bytes]:
-    """Return the files behind an evaluation by their path in a project, each once,
-    and its answers' schemas.
+    """Return the files that an evaluation was made from, by path in a project: name to bytes.
 
-    What is in no file, such as the card of a hub id or a package's channel, `run.json` has alone.
+    They are prompts, answer schemas, cards, channels, networks, schedules and devices. What is in
+    no file, such as the card of a hub id or a package's channel, only `run.json` has.
     """
     texts: dict[str, bytes] = {}
     paths: dict[str, Path | None] = {}

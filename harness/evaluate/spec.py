@@ -50,21 +50,21 @@ ASKS = ("used", "all")  # what --ask takes, the default first
 
 
 class Source(Protocol):
-    """Describes the world that is walked."""
+    """Describe where the scenes of an evaluation come from: a dataset, or layouts to drive."""
 
     @property
     def kind(self) -> World:
-        """The world's kind, as a run's manifest has it."""
+        """Kind of the evaluation, as a run's manifest has it: `frozen` or `closed-loop`."""
         ...
 
     @property
     def name(self) -> str:
-        """What stands for this world in the name of a run's folder."""
+        """Word for the source in the name of a run's folder."""
         ...
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions, in the environment's order."""
+        """Names of the meta-actions, in the environment's order."""
         ...
 
     @property
@@ -72,39 +72,43 @@ class Source(Protocol):
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes that are walked at most."""
+        """Numbers of the episodes to evaluate, fewer if the run stops early (`until`)."""
         ...
 
     @property
     def until(self) -> Until | None:
-        """When the episodes are enough; None if all are walked."""
+        """The rule by which the run stops early; None if all episodes are evaluated."""
         ...
 
     def stopped(self, looks: Looks) -> "Source":
-        """Return what was walked when it was looked at last."""
+        """Return this source cut to the episodes after which a run stopped by its rule."""
         ...
 
     @property
     def layout_seeds(self) -> Iterable[int]: ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
-        """Return the world's record in a run's manifest."""
+        """Return the source's record for a run's manifest."""
         ...
 
     def settings(self) -> FrozenSettings | DriveSettings:
-        """Return the settings that select this world."""
+        """Return the run settings that select this source."""
         ...
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield a decision point of each of up to `most` episodes;
-        with `ego_alone`, no graph of a helper.
+        """Yield one scene of each of up to `most` episodes, such as to time a model on.
+
+        With `ego_alone`, helpers' scene graphs may be left out.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Spec:
-    """One evaluation."""
+    """Describe one evaluation completely: agents, scenes, conditions, seeds and settings.
+
+    Raises UserError for what is not allowed, or does not go together.
+    """
 
     ego: Agent  # the agent that answers for the ego
     source: Source  # the world that is walked
@@ -116,8 +120,8 @@ class Spec:
     # the computer that every vehicle has; it replaces `--latency`: the time of an answer follows
     # from its own tokens. None for no profile
     device_profile: Device | None = None
-    # all settings, from which `resolve.spec` makes this evaluation: those of what stands above are
-    # made of it
+    # all settings as typed, of which `resolve.spec` makes this evaluation; those that fields above
+    # hold opened are rewritten to agree with them
     settings: Settings = USUAL
     budget: Budget | None = None  # what may be spent on answers; it changes nothing in the run
 
@@ -331,7 +335,7 @@ class Spec:
 
     @property
     def fusion_obstacle(self) -> str | None:
-        """Why the ego's prompt cannot hold the helpers' messages; None if it can."""
+        """Why the ego's prompt cannot show helpers' messages; None if it can."""
         if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
             return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
         version, form = self.ego.prompt.version, self.ego.prompt.helper_answer
@@ -349,16 +353,17 @@ class Spec:
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """The agents' cards; the served model's has the servers that were given."""
+        """The agents' model cards, with the servers of the settings put into a served model's."""
         return tuple(agent.card.at(self.settings.server) for agent in self.agents)
 
     def scenario_of(self, scene: Scene) -> Scenario:
-        """Return the scenario of who decides in a scene."""
+        """Return the scenario from the view of the vehicle that decides in a scene."""
         return scene.seat or self.scenario
 
     def agent(self, place: int) -> int:
-        """Return the index of the agent of the vehicle at this place (`Scene.place`);
-        the ego is at 0.
+        """Return the index in `agents` of who answers for the vehicle at a place, 0 the ego.
+
+        Places are those of `Scene.place`. Helpers take the helpers' agents in turn.
         """
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
@@ -372,24 +377,26 @@ class Spec:
 
     @property
     def several_decide(self) -> bool:
-        """Whether vehicles beside the ego decide, too."""
+        """Whether other vehicles decide for themselves, too, as agents."""
         return agent_share(self.scenario) > 0
 
     @property
     def asks_all(self) -> bool:
-        """Whether the answers of all are asked at once;
-        with a device profile the joules of all count.
+        """Whether all helpers are asked, not only those whose answers a condition uses.
+
+        It is so with `ask = "all"`, with a device profile, which counts the joules of all, and for
+        a driver (`ego_alone`).
         """
         return self.settings.ask == "all" or self.ego_alone or self.device_profile is not None
 
     @property
     def frozen(self) -> bool:
-        """Whether its scenes are frozen."""
+        """Whether scenes are recorded (`harness eval`), not simulated with the actions taken."""
         return self.source.kind == "frozen"
 
     @property
     def ego_alone(self) -> bool:
-        """Whether the model answers only for the ego, as a driver does."""
+        """Whether the model, a rule-based driver, answers only for the ego; no helper is asked."""
         return not self.ego.can.asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
@@ -397,8 +404,10 @@ class Spec:
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def changed(self, **settings: Any) -> "Spec":
-        """Return this evaluation with other settings, such as `temperature=0.5`,
-        that open nothing.
+        """Return this evaluation with other values of plain settings, such as `temperature`.
+
+        Raises ValueError for a setting that opens a file or model, which a field of this object
+        holds.
         """
         spec = replace(self, settings=structs.replace(self.settings, **settings))
         if lost := [
@@ -408,9 +417,7 @@ class Spec:
         return spec
 
     def record(self) -> dict[str, Any]:
-        """Return the settings, and what they opened, as plain values:
-        a part of a run's `run.json`.
-        """
+        """Return the settings and a record of all opened files, for a run's `run.json`."""
         settings = msgspec.to_builtins(self.settings)
         profiles = [point.radio.profile for point in self.points]
         schedules = {
@@ -484,7 +491,7 @@ class Spec:
 
     @property
     def ties(self) -> str:
-        """How ties fall: if nothing is stated, as in the run that is replayed, if one is."""
+        """How ties between actions fall, `drawn` or `first`: by default as in a replayed run."""
         if self.settings.ties is not None:
             return self.settings.ties
         if self.ego.can.own_latency:
@@ -494,7 +501,7 @@ class Spec:
 
     @property
     def opening(self) -> dict[str, Any]:
-        """The options with which the models are opened."""
+        """Options with which the models are opened: `device`, `dtype` and `batch_size`."""
         return {name: getattr(self.settings, name) for name in ("device", "dtype", "batch_size")}
 
     @property

@@ -16,14 +16,18 @@ from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 @lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
-    """Return the channel busy ratio under the background load;
-    NaN if the channel has no such figure.
+    """Return the channel's busy ratio, 0 to 1, under its background load.
+
+    NaN if the channel model has no such figure.
     """
     return point.physical.busy_ratio() if point.physical else float("nan")
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:
-    """Return the numeric columns of decisions (n,) by name; NaN where unknown."""
+    """Return the numeric columns of the decision table for n decisions of one condition.
+
+    Arrays are `(n,)`, by column name; NaN where unknown.
+    """
     c, point = decided.result, decided.point
     anybody = any_of(c.on_time)
     return {
@@ -50,9 +54,10 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
 def table(
     decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]
 ) -> Decisions:
-    """Return the table of decisions, sorted by episode, step, decision point, condition and seed.
+    """Return a row for each decision, sorted by episode, step, decision point, condition and seed.
 
-    The decisions may be in any order; further columns (n,), `more`, are in that order.
+    `decided` may be in any order; `more` has further columns `(n,)` in that order, by name.
+    `actions` are the names of actions, in order.
     """
     points_by_id = {id(part.decision_points): part.decision_points for part in decided}
     lengths = [len(decision_points) for decision_points in points_by_id.values()]
@@ -127,9 +132,7 @@ def table(
 
 
 def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
-    """Return tables of the same episodes and of different seeds, in their order,
-    as `table` makes one.
-    """
+    """Return one table of several of the same episodes under different seeds, sorted as `table`."""
     if len(tables) == 1:
         return tables[0]
     whole = Decisions.concat(tables)

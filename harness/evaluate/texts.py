@@ -25,9 +25,9 @@ OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what
 
 
 def refuse_others(run: Run) -> None:
-    """Raise UserError if an answer of a run states what its text does not say.
+    """Raise UserError if an answer of a run states what its raw text does not say.
 
-    Also if a prompt of the run is neither here nor kept, so that nothing can be read again.
+    Also if a prompt of the run is neither here nor kept in it, so that nothing can be parsed again.
     """
     if gone := lacking(run):
         raise UserError(
@@ -50,9 +50,10 @@ def refuse_others(run: Run) -> None:
 def refuse_other_kept(
     file: Path, answers: Iterable[Answer], agents: Sequence[Agent], actions: tuple[str, ...]
 ) -> None:
-    """Raise UserError if an answer that a file keeps states what its text says to none of `agents`.
+    """Raise UserError if an answer in `file` states what its raw text says by no agent's parsing.
 
-    So a run that somebody else began goes on from what its answers say.
+    So a run that somebody else began goes on from what its answers say. Also if it states a delay
+    that no agent's card declares.
     """
     readers = []
     for agent in agents:
@@ -72,7 +73,7 @@ def refuse_other_kept(
 
 
 def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:
-    """Return whether two readings agree in a field of `OF_TEXTS`."""
+    """Return whether a stated and a newly parsed answer agree in a field of `OF_TEXTS`."""
     a, b = getattr(stated, name), getattr(here, name)
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(close, a, b))

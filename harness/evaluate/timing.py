@@ -21,7 +21,7 @@ IDLE = 0.25  # highest load of an idle machine, in processes a core
 
 
 def refuse_busy() -> None:
-    """Raise UserError unless the machine was idle for the last minute."""
+    """Raise UserError if the machine was busy in the last minute, or does not say so."""
     load = load_a_core()
     if load is None or load > IDLE:
         reason = (
@@ -37,7 +37,7 @@ def refuse_busy() -> None:
 
 
 def load_a_core() -> float | None:
-    """Return the load of the last minute, in processes a core; None if the system does not say."""
+    """Return the mean number of running processes a core, of the last minute; None if unknown."""
     try:
         return os.getloadavg()[0] / (os.cpu_count() or 1)
     except (OSError, AttributeError):
@@ -45,17 +45,16 @@ def load_a_core() -> float | None:
 
 
 def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
-    """Return `SCENES` scenes or fewer, evenly spread."""
+    """Return at most `SCENES` of these scenes, evenly spread."""
     return scenes[:: max(1, len(scenes) // SCENES)][:SCENES]
 
 
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
-    """Return the median time of the answers in each role, over these scenes;
-    each request is sent alone.
+    """Return a latency of the median seconds of answers by role, each request sent alone.
 
-    A role in which no answer can be timed gets the ego's time. The backend is the model itself; a
-    cache would answer in no time. Raises UserError if no answer of the ego can be timed, and
-    Unanswered.
+    A role in which no answer can be timed gets the ego's time. `backend` must be the model itself:
+    a cache would answer in no time. Raises Unanswered if the ego's requests got no answer, and
+    UserError if none of its answers could be timed.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first request of a process includes the warm-up

@@ -42,7 +42,7 @@ AskedPoint = TypeVar("AskedPoint", contravariant=True)
 
 @dataclass(frozen=True)
 class Due:
-    """The decisions that are due now under one condition."""
+    """Hold the n decisions to be made now under one condition, in all episodes and seeds."""
 
     at: Ints  # the index of each decision among the decision points that the world shows, (n,)
     episode: Ints  # the episode's number of each, (n,)
@@ -54,71 +54,77 @@ class Due:
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
-        """Number and seed of each decision's episode."""
+        """Number and seed of the episode of each decision; together they name a walk."""
         return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class Decided(Generic[DecisionPoint]):
-    """Decisions made under one condition."""
+    """Hold the n decisions that were made at one step under one condition."""
 
     point: OperatingPoint  # the condition
     decision_points: Sequence[DecisionPoint]  # the decision points that the world showed
     due: Due  # the decisions that were due
     result: Coordination  # what was decided, (n, ...)
-    said: SentIntents  # what vehicles said to the channel, as the attacks leave it
+    said: SentIntents  # what vehicles sent over the channel, attackers' lies included
 
 
 class World(Protocol[DecisionPoint]):
-    """Where decision points come from, and where actions lead."""
+    """Describe where decision points come from and where actions lead, as `walk` needs it.
+
+    Worlds are recorded scenes, a simulation, and points that are drawn at random.
+    """
 
     def observe(self) -> Sequence[DecisionPoint]:
-        """Return each distinct decision point that is due now; none if all episodes are decided."""
+        """Return each distinct decision point to be decided now; none once all episodes ended."""
         ...
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return the decisions of a condition that are due in the points just shown."""
+        """Return a condition's decisions in the points that `observe` returned last."""
         ...
 
     def site(self, units: Collection[Unit]) -> Site | None:
-        """Return where vehicles and units are in the points just shown, (n, ...);
-        None without places.
+        """Return true positions of vehicles and roadside units at the last observed points.
+
+        The shape is `(n, ...)`. None in a world without positions.
         """
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return what egos see in the points just shown, (n, ...);
-        None in a world without places.
+        """Return what egos see of their regions at the last observed points, `(n, ...)`.
+
+        None in a world without positions.
         """
         ...
 
     def claims(self) -> Claims | None:
-        """Return what helpers claim in the points just shown, (n, ...);
-        None in a world without places.
+        """Return what helpers claim of themselves at the last observed points, `(n, ...)`.
+
+        None in a world without positions.
         """
         ...
 
     def plans(self) -> Plans | None:
-        """Return what each agent says of itself in the points just shown, (n, 1);
-        None for one ego.
+        """Return what agents say of their motion at the last observed points, `(n, 1)`.
+
+        None in a world where only one ego decides.
         """
         ...
 
     def listed(self) -> tuple[Floats, Floats] | None:
-        """Return how many objects helpers list, and in how many bits, (n, H);
-        None without places.
+        """Return how many objects each helper lists, and their size in bits, both `(n, H)`.
+
+        They are of the n last observed points. None in a world without positions.
         """
         ...
 
     def step(self, decided: Sequence[Decided[DecisionPoint]]) -> None:
-        """Act on the decisions, one `Decided` a condition,
-        and advance to the next decision points.
-        """
+        """Act on the decisions, one `Decided` a condition, and go on to the next points."""
         ...
 
 
 class SceneWorld:
-    """A world whose decision points are scenes."""
+    """Base class of worlds whose decision points are scenes of a scenario."""
 
     scenario: Scenario  # the scenario of the scenes
     scenes: Sequence[Scene]  # the scenes just shown
@@ -137,54 +143,57 @@ class SceneWorld:
         return None
 
     def listed(self) -> tuple[Floats, Floats]:
-        """Return how many objects the helpers of each scene list, and in how many bits."""
+        """Return how many objects each helper lists, and their size in bits, both `(n, H)`."""
         return listed(self.scenes)
 
 
 class Fuses(Protocol):
-    """The answered fusion calls of some decision points."""
+    """Describe the ego's answers to the sets of messages heard at some decision points."""
 
     def __call__(self, decision_points: Ints, attackers: Bools | None = None, /) -> FusionCall:
-        """Return the call for decisions at points (n,),
-        with the attackers (n, H) if messages show them.
+        """Return the fusion call of n decisions, by the decision point of each, `(n,)`.
+
+        `attackers`, `(n, H)`, is needed where messages show who attacks.
         """
         ...
 
 
 class Ask(Protocol[AskedPoint]):
-    """The source of intents: it asks the agents."""
+    """Describe the source of intents in a walk: it asks the models, or has their answers."""
 
     def __call__(self, points: Sequence[AskedPoint], /) -> Intents:
-        """Return what every vehicle intends in these decision points, (n, ...);
-        helpers may be `unasked`.
+        """Return what every vehicle intends at n decision points, `(n, ...)`.
+
+        Helpers may be `unasked`: their models are asked once a condition needs them.
         """
         ...
 
     def others(self, points: Sequence[AskedPoint], /, question: Question, at: Ints) -> Intents:
-        """Return the same where helpers are asked another question, (n, ...);
-        only the points `at` need values.
+        """Return the intents, `(n, ...)`, where helpers are asked another question.
+
+        Only the points at the indices `at` need values.
         """
         ...
 
     def helpers(
         self, points: Sequence[AskedPoint], /, wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers wanted, (n, H),
-        and return the intents of the points where any is wanted.
-        """
+        """Ask the helpers marked in `wanted`, `(n, H)`; return the intents of points with any."""
         ...
 
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers to these sets of messages (`codes_of`),
-        rewritten as `rewrites` says.
+        """Return the ego's answers to sets of messages, by their codes (`codes_of`), `(K,)`.
+
+        `rewrites` says how the messages are shown.
         """
         ...
 
     def plan_call(self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents) -> FusionCall:
-        """Return the call of agents, in the points `at` (n,),
-        that hear the plans in `intents`, (n, ...).
+        """Return the fusion call of the agents at the points `at`, `(n,)`.
+
+        It asks them again with the plans in `intents`, `(n, ...)`, that each has heard.
         """
         ...
 
@@ -195,10 +204,10 @@ def walk(
     ask: Ask[DecisionPoint],
     ties: str,
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
-    """Walk a world under some conditions until every episode is decided;
-    yield the decisions of each step.
+    """Yield the decisions of each step, until every episode under every condition has ended.
 
-    Of actions that are equally likely, `ties` takes the `first`, or one that is `drawn`.
+    `ask` gives the intents, `points` are the conditions. Of actions that are equally likely, `ties`
+    takes the `first`, or one that is `drawn`.
     """
     steps = _steps(world, points, ask, ties)
     while True:
@@ -341,10 +350,11 @@ def _asked(
 
 
 def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) -> Intents:
-    """Return the intents that each decision works with, of all answers by question.
+    """Return the intents of n decisions with what their helpers send under a condition.
 
-    Those of helpers may be answers to another question, or come from other scenes; a decision with
-    no other to hear from hears nobody. Who is asked, the distances and the times stay the same.
+    `answers` has the intents at all decision points, by question. Helpers' may be answers to
+    another question, or come from another decision's scene; who has no other to hear from hears
+    nobody. Distances and inference times stay the decision's own.
     """
     own = _able(point, answers[PLAIN], due)
     if point.question != PLAIN:
@@ -372,7 +382,7 @@ def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return what helpers send by the point's content and encoding."""
+    """Return the intents with the sizes of replies by the point's content and encoding."""
     sizes = bits(point, intents)
     return intents if sizes is intents.payload_bits else replace(intents, payload_bits=sizes)
 
@@ -387,17 +397,17 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
 
 
 class Memory:
-    """What a condition's consensus rule remembers of each episode and seed."""
+    """Keep the state of a condition's consensus rule between steps, for each episode and seed."""
 
     def __init__(self) -> None:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """Return the state of each decision's episode, (n, K); None at the first step."""
+        """Return the rule's state for n decisions, `(n, K)`; None at the first step."""
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
-        """Store the state for the next step, (n, K), if the rule has one."""
+        """Store the rule's state after n decisions, `(n, K)`; nothing if K is 0."""
         if state.shape[-1]:
             self._state |= dict(zip(due.episodes, state, strict=True))
 
@@ -430,10 +440,10 @@ def heard_codes(
     sent: Mapping[OperatingPoint, Exchange],
     n: int,
 ) -> Ints:
-    """Return the sets of messages that the conditions with fusion calls hear (`codes_of`),
-    ascending.
+    """Return the codes (`codes_of`) of all sets of messages that some condition's ego hears.
 
-    There are `n` decision points.
+    They are sorted and distinct, `(K,)`. Only conditions with a fusion call count. The mappings
+    have decisions, messages and exchanges by condition; `n` is the number of decision points.
     """
     codes = [np.empty(0, dtype=int)]
     for point, due_here in due.items():
@@ -447,14 +457,14 @@ def heard_codes(
 
 
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
-    """Return a number for each decision, (n,):
-    of its point, and of that of its helpers if they are elsewhere.
+    """Return for each decision the number of its point that is used in codes, `(n_decisions,)`.
 
-    With `n` decision points, the number of such a one is n times the first and the second.
+    It is the point's index, or where messages come from another point, `n` times that plus the
+    other's index, with `n` the number of points.
     """
     return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
 
 def shown(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
-    """Return who attacks, (n, H), if the text of a fusion call depends on it; else None."""
+    """Return who attacks, `(n, H)`, if the prompt of a fusion call depends on it; else None."""
     return broadcast.attackers if point.rewrites.changes.of_attackers else None
