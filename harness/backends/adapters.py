@@ -31,7 +31,11 @@ _MORE = (
 
 
 def read_config(folder: Path, shown: str) -> dict[str, Any]:
-    """Read what a folder says of its adapter. Raises UserError if it is none that is understood."""
+    """Return the configuration of a LoRA adapter's folder, as its `adapter_config.json` states it.
+
+    `shown` names the model in messages. Raises UserError if it cannot be read, or the adapter is
+    more than plain LoRA of linear layers.
+    """
     try:
         config: dict[str, Any] = json.loads(text_of(folder / CONFIG, "record"))
         rank, kind = int(config["r"]), config["peft_type"]
@@ -57,10 +61,9 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
 
 
 def find_adapter(card: Card) -> Path | None:
-    """Return the folder of a card's adapter, absolute or beside the cards;
-    None if the card names none.
+    """Return the folder of a card's LoRA adapter, absolute or beside the cards; else None.
 
-    Raises UserError if there is no such folder.
+    Raises UserError if the card names a folder that is no adapter.
     """
     if card.adapter is None:
         return None
@@ -81,7 +84,7 @@ def find_tensors(folder: Path, shown: str) -> Path:
 
 
 def foreign(shown: str, file: Path, reason: str) -> UserError:
-    """Return the refusal of an adapter that does not fit its model."""
+    """Return the error for an adapter in `file` that does not fit its model, for `reason`."""
     return UserError(
         f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that "
         "was trained on it"
@@ -89,9 +92,10 @@ def foreign(shown: str, file: Path, reason: str) -> UserError:
 
 
 def merge(card: Card, model: Any) -> None:
-    """Change a transformers model's weights by its card's adapter: W + alpha / r * B A, in float32.
+    """Add a card's LoRA adapter to a transformers model's weights: W + alpha / r * B A in float32.
 
-    Raises UserError if the adapter is of another model, or its file is not whole.
+    Nothing is done if the card names no adapter. Raises UserError if the adapter is of another
+    model, or its file is not whole.
     """
     if (folder := find_adapter(card)) is None:
         return

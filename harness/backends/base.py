@@ -38,7 +38,7 @@ AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 @dataclass(frozen=True)
 class Request:
-    """One question to a small language model."""
+    """Hold one question to a model: its chat messages, and how the answer is to be given."""
 
     id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
     role: Role  # which prompt of the version was rendered, and which schema the answer has
@@ -85,9 +85,7 @@ class Request:
 
     @property
     def shape(self) -> Shape:
-        """What the JSON of its answer is to be, even a helper's:
-        a bare distribution if it is `bare`.
-        """
+        """The form of JSON that its answer must have: a bare distribution if it is `bare`."""
         if self.bare:
             return Shape("ego", self.actions, "distribution")
         return Shape(self.role, self.actions, self.form, self.extension, self.placeholders)
@@ -98,13 +96,11 @@ class Request:
 
     @property
     def divides(self) -> bool:
-        """Whether the answer's probabilities are divided by their sum, however far it is off 1."""
+        """Whether the answer's probabilities are divided by their sum, whatever it is."""
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
-        """Return the request with other values in some fields,
-        in a third of the time of `replace`.
-        """
+        """Return a copy with other values in some fields; a third of the time of `replace`."""
         request = object.__new__(Request)
         vars(request).update(vars(self), **changes)
         return request
@@ -117,9 +113,7 @@ class Request:
 def by_scenario(
     requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]
 ) -> list[T]:
-    """Answer the requests of each scenario together;
-    return the answers in the order of the requests.
-    """
+    """Return the answers to requests, in order; `answer` gets all of one scenario at a time."""
     places: dict[int, list[int]] = {}
     for n, request in enumerate(requests):
         places.setdefault(id(request.scenario), []).append(n)
@@ -131,7 +125,7 @@ def by_scenario(
 
 @dataclass(frozen=True)
 class Completion:
-    """One answer to a request."""
+    """Hold a model's answer to one request as text, with its token counts and times."""
 
     request_id: str
     # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file
@@ -175,7 +169,7 @@ class Completion:
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
-    """Return the completion of a request that has no answer."""
+    """Return a completion that states an error in place of an answer."""
     return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)
 
 
@@ -193,24 +187,25 @@ def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None)
 
 
 class Backend(Protocol):
-    """Answers requests."""
+    """Describe what answers requests: a model in this process, a server, or a rule."""
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return one completion per request, in the same order; a failed request's has an error."""
+        """Return one completion a request, in the same order; `error` says why one failed."""
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers, as JSON for the manifest:
-        engine, versions, weights, settings.
+        """Return all that decides the answers, as JSON values, for a run's record.
 
-        Its `answers` is the answer version of the engine's registration.
+        Such as engine, versions, digests of weights and settings. `answers` is the version of the
+        engine's answers, by its registration.
         """
         ...
 
 
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether two identities are of one model;
-    what a server did not state then is not compared.
+    """Return whether two identities, as `Backend.identity` returns them, are of one model.
+
+    What servers state now and did not state in `stored` is not compared.
     """
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
@@ -234,28 +229,30 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
 
 
 class Rendering(Backend, Protocol):
-    """A backend of a language model that can show the prompts that its model is sent."""
+    """A backend of a language model that can show the prompts as its model reads them."""
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return each request's prompt as the model reads it,
-        or as sent to a server that renders it itself.
+        """Return each request's prompt as text after the chat template.
 
-        Raises UserError if the chat template refuses the messages.
+        For a server that renders prompts itself it is what is sent. Raises UserError if the chat
+        template refuses the messages.
         """
         ...
 
 
 def window(backend: Backend) -> int:
-    """Return the most requests that a backend works on at once;
-    0 if `complete` takes one call at a time.
+    """Return how many requests a backend can answer at once, in several calls of `complete`.
+
+    It is 0 if only one call may run at a time.
     """
     return getattr(backend, "window", 0)
 
 
 def forget(backend: Backend) -> None:
-    """Let a backend answer as if it was just opened; nothing for one that keeps nothing.
+    """Let a backend drop what its engine keeps of earlier prompts, as if it was just opened.
 
-    What an engine keeps of earlier prompts saves time, and moves probabilities by rounding.
+    What is kept saves time, but moves probabilities by rounding. Does nothing for backends that
+    keep nothing.
     """
     forgets: Callable[[], None] | None = getattr(backend, "forget", None)
     if forgets:
@@ -264,9 +261,7 @@ def forget(backend: Backend) -> None:
 
 @dataclass(frozen=True)
 class Served:
-    """Which server gave the answer of a request, and the model that it names;
-    None if it names none.
-    """
+    """Hold which server answered a request, and which model the server says it runs, or None."""
 
     id: str
     server: str
@@ -274,28 +269,25 @@ class Served:
 
 
 def served(backend: Backend) -> list[Served]:
-    """Return which server gave each answer since the last call;
-    empty for a backend without servers.
-    """
+    """Return which server gave each answer since the last call; none without servers."""
     taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
     return taken() if taken else []
 
 
 def doubt(backend: Backend) -> str | None:
-    """Return why cached answers may be of other weights, in a line;
-    None if a backend's identity can tell.
+    """Return a line on why cached answers may come from other weights; None if they cannot.
+
+    A server's identity may not tell which weights it has.
     """
     return getattr(backend, "doubt", None)
 
 
 def several(backend: Backend) -> Sequence[str]:
-    """Return the addresses of servers of which any may answer;
-    empty if the identity says who answers.
-    """
+    """Return the addresses of a backend's servers if any of them may answer; else empty."""
     return getattr(backend, "several", ())
 
 
 class Timed(Backend, Protocol):
-    """A backend whose answers were timed earlier, so that they are not timed again."""
+    """A backend of stored answers, whose times are known and are not measured again."""
 
     def latency(self) -> "Latency": ...

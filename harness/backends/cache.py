@@ -87,19 +87,18 @@ _HAS_CODE = "SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')"
 
 
 def default_file() -> Path:
-    """Return the file in which completions are kept if no other is named."""
+    """Return the SQLite file in which completions are cached by default."""
     return kept.folder() / "completions.sqlite"
 
 
 def key(
     identity: Mapping[str, Any], prompt: str, request: Request, batch_size: int | None = None
 ) -> str:
-    """Return the hex digest of all that decides an answer; it reveals no prompt and no secret.
+    """Return the hex digest under which a completion is cached; it reveals no prompt, no secret.
 
-    The identity states the version of the engine's answers.
-
-    With float32 weights other requests in a batch change no answer, and `batch_size` is None. With
-    quantised and 16-bit weights they move it by rounding: the batch size is part of the key.
+    It covers all that decides an answer: the backend's identity, the rendered prompt, the request,
+    and `batch_size` for quantised and 16-bit weights, where other requests in a batch move an
+    answer by rounding. For float32 weights that is None.
     """
     asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
     asked["image"] = request.image_sha256
@@ -108,19 +107,16 @@ def key(
 
 
 class CompletionFile:
-    """The SQLite file. It is opened for every call,
-    so a file that was deleted is simply empty again.
+    """A SQLite file of completions by key; opened for every call, so it may be deleted.
 
-    Its methods raise sqlite3.Error or OSError if it cannot be read or written.
+    Methods raise sqlite3.Error or OSError if it cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def find(self, keys: Sequence[str]) -> dict[str, Completion]:
-        """Return the stored completions by key.
-        They have no seconds, and their request's id is empty.
-        """
+        """Return the stored completions by key; they have no seconds, and an empty request id."""
         rows: list[tuple[str, str]] = []
         with self._open() as file:
             for start in range(0, len(keys), _AT_ONCE):
@@ -135,7 +131,7 @@ class CompletionFile:
             raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
 
     def add(self, completions: Mapping[str, Completion]) -> None:
-        """Store completions by key; a stored one is not replaced."""
+        """Store completions by key; one that is stored already stays."""
         rows = []
         for place, completion in completions.items():
             answer = {name: getattr(completion, name) for name in _KEPT}
@@ -206,8 +202,9 @@ def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
-    """Put a cache before a card's backend,
-    if there is a file and the backend can show its prompts.
+    """Return the backend with a completion cache in `file` before it.
+
+    The backend itself is returned if `file` is None, or its engine cannot show its prompts.
     """
     if file is None or not capabilities(card.engine).renders:
         return backend
@@ -215,7 +212,10 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
 
 
 class Cached:
-    """A backend with a cache of its answers, except errors. A cached answer has no seconds."""
+    """A backend that answers from a cache, and asks another backend for what is not in it.
+
+    Errors are not cached. A cached answer has no seconds.
+    """
 
     def __init__(self, backend: Rendering, file: Path) -> None:
         self.backend = backend

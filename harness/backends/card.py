@@ -63,7 +63,7 @@ _PER_ENGINE = (
 
 @dataclass(frozen=True)
 class Latency:
-    """Declared time of one answer."""
+    """Hold the time that a card declares for one answer of its model."""
 
     # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means
     # the paper's too, unless the card's is asked for: its makers' computer is not the car's
@@ -79,10 +79,10 @@ class Latency:
 
 @dataclass(frozen=True)
 class Failures:
-    """The shares of a proxy's answers that fail on purpose, drawn for each request;
-    the others are good.
+    """Hold the shares of a rule's answers that are spoilt on purpose, drawn for each request.
 
-    A text is spoilt in one way at most; any answer may be slow as well.
+    For the engine `proxy`, to test parsing and repair. A text is spoilt in one way at most; any
+    answer may be slow as well.
     """
 
     fence: Share = 0.0  # the answer is in a code fence. Recovered.
@@ -104,13 +104,13 @@ class Failures:
 
     @property
     def texts(self) -> dict[str, float]:
-        """The shares of the spoilt texts by name."""
+        """The shares of spoilt texts by field name, without those of slow answers."""
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
 @dataclass(frozen=True)
 class Card:
-    """One model on one engine."""
+    """Describe one model on one engine, as a file `models/<name>.toml` does."""
 
     # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
     name: str
@@ -156,7 +156,7 @@ class Card:
 
     @property
     def slow_s(self) -> float:
-        """Seconds that some of its answers take longer than its latency, by `failures`; or 0."""
+        """Seconds that some answers take longer than its latency, by `failures`; 0 without any."""
         return self.failures.slow_s if self.failures else 0.0
 
     @property
@@ -164,7 +164,7 @@ class Card:
         return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":
-        """Return the card of a served model with other servers; the card itself if `urls` is empty.
+        """Return the card with other server addresses; unchanged if it has none or `urls` is empty.
 
         Raises ValueError if one is not a base URL, or is named twice.
         """
@@ -175,7 +175,7 @@ class Card:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return the card as plain values, from which `convert` makes it again."""
+        """Return the card as plain values for a run's record; `convert` makes it again."""
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
         for name in ("adapter", "price"):
@@ -197,8 +197,9 @@ class _File(Card):
 
 
 def read_cards(path: Path) -> list[Card]:
-    """Read a file's card on each of its engines, the default one first.
-    Raises UserError on a mistake.
+    """Return the cards of a file, one for each engine that it lists, the default engine first.
+
+    Raises UserError for a mistake in the file.
     """
     where = f"model card {path}"
     table = _with_latency(toml(path, where))

@@ -52,20 +52,22 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
 def names() -> list[str]:
-    """Return the sorted names of all card files."""
+    """Return the sorted names of all card files of the project and of those that ship."""
     return resources.names("models")
 
 
 def each_engine(stem: str) -> list[Card]:
-    """Return a file's card on each of its engines, the default one first.
-    Raises UserError on a mistake.
+    """Return the cards of the file of this name, one for each engine, the default engine first.
+
+    Raises UserError for a mistake in the file.
     """
     return read_cards(resources.find("models", f"{stem}.toml"))
 
 
 def load(name: str) -> Card:
-    """Load a card by `<name>` or `<name>:<engine>`.
-    Raises UserError if there is none or it has a mistake.
+    """Return the card named `<name>` or `<name>:<engine>`.
+
+    Raises UserError if there is none, or its file has a mistake.
     """
     stem, _, engine = name.partition(":")
     if stem not in names():
@@ -77,15 +79,15 @@ def load(name: str) -> Card:
 
 
 def load_all() -> list[Card]:
-    """Load all cards, on each of their engines."""
+    """Return all cards of all files, one for each engine."""
     return [card for name in names() for card in each_engine(name)]
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
     """Return the card of a name, a URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
 
-    It runs on `engine`, if there is a choice. The server at a URL is asked what it serves. Raises
-    UserError if there is no such model or engine, or the model does not run on the engine;
+    `engine` chooses the engine if there is a choice. The server at a URL is asked what it serves.
+    Raises UserError if there is no such model or engine, or the model does not run on the engine;
     Unanswered if no server answers.
     """
     if engine is not None:
@@ -109,7 +111,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
 
 
 def argument(card: Card) -> str:
-    """Return a value of `--model` that resolves to this card; its name, if none does."""
+    """Return the text that `--model` takes for this card, or the card's name if there is none."""
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     if card.server:
@@ -120,12 +122,11 @@ def argument(card: Card) -> str:
 
 
 def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
-    """Return the user's own card of the model that a run names.
-    What the run says of it opens nothing.
+    """Return the user's own card of the model that a run states, so that the run opens nothing.
 
-    Only the name of the card that the run states is looked up; the rest is compared. Cards that the
-    user gave come before the card files. Raises UserError, with `where` and `hint`, if there is no
-    such card or it differs.
+    Only the stated name is looked up, first in `given`, then in the card files; all else is
+    compared. Raises UserError, with `where` and `hint` in the message, if there is no such card or
+    it differs in what decides answers.
     """
     name = printable(stated.name)
     card = next((card for card in given if card.name == stated.name), None)

@@ -27,7 +27,7 @@ _TURN = ({"role": "user", "content": "?"}, {"role": "assistant", "content": _ANS
 
 
 class Tokenizer(Protocol):
-    """A model's tokenizer, which comes with a chat template."""
+    """Describe a model's tokenizer that has a chat template."""
 
     template: str  # the template's Jinja text
     # texts of special tokens by their name in a template, such as `bos_token`
@@ -36,32 +36,24 @@ class Tokenizer(Protocol):
     vocabulary: int  # number of tokens
 
     def encode(self, text: str) -> list[int]:
-        """Return the token ids of a rendered prompt,
-        in which the template has already written any BOS.
-        """
+        """Return the token ids of a rendered prompt; no BOS is added to what the template wrote."""
         ...
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Return the text of an answer without special tokens.
-        Qwen3's `<think>` is not one, and stays.
-        """
+        """Return the text of token ids, without special tokens (of which `<think>` is none)."""
         ...
 
     def pieces(self, ids: Sequence[int]) -> list[str]:
-        """Return the text of each single token, with special tokens;
-        incomplete bytes become U+FFFD.
-        """
+        """Return each token's own text, of special ones too; incomplete bytes become U+FFFD."""
         ...
 
     def candidates(self, letters: str) -> Sequence[int]:
-        """Return the ids of all tokens whose text may be one of the letters,
-        and perhaps of others.
-        """
+        """Return ids of all tokens whose text may be one of these letters, and perhaps more."""
         ...
 
 
 class HubTokenizer:
-    """A `Tokenizer` of transformers (`hub`)."""
+    """Make a `Tokenizer` of a tokenizer of the package transformers."""
 
     def __init__(self, hub: Any) -> None:
         self.hub = hub
@@ -95,10 +87,10 @@ class HubTokenizer:
 
 
 class Chat:
-    """A tokenizer with its chat template; `encode`, `decode` and `pieces` are the tokenizer's.
+    """A tokenizer with its chat template, to render messages to prompts and encode these.
 
-    The template writes `image_token` for a picture; None if the model takes none. The system text
-    stands in the first user turn (`system` is `first-user`), or in a message of its own (None).
+    The template writes `image_token` for a picture; None if the model takes none. With `system`
+    `first-user`, the system text stands in the first user turn; with None in a message of its own.
     """
 
     def __init__(
@@ -128,9 +120,7 @@ class Chat:
 
     @property
     def thinking(self) -> Thinking:
-        """What the template can do: `switch`, `none`,
-        or `always` if its prompt always opens a thought.
-        """
+        """What its template can do: `switch` a thought on and off, `always` open one, or `none`."""
         if self._switch:
             return "switch"
         prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
@@ -138,9 +128,7 @@ class Chat:
 
     @cached_property
     def turn_end(self) -> int | None:
-        """Id of the token that the template writes after an answer;
-        None if it writes no such token.
-        """
+        """Id of the token that the template writes after an answer; None if there is none."""
         with suppress(UserError):
             text = self._apply(self._shown(_TURN), thinking=False, add_generation_prompt=False)
             _, answer, rest = text.rpartition(_ANSWER)
@@ -157,9 +145,10 @@ class Chat:
         return () if self.turn_end is None else (self.turn_end,)
 
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
-        """Render messages to the prompt that the model reads, with `image_token` for a picture.
+        """Return the prompt of chat messages, as the model reads it up to its answer.
 
-        Raises UserError if the template refuses the messages, or leaves out a text of them.
+        A picture stands as `image_token`. Raises UserError if the template refuses the messages, or
+        leaves out a text of them.
         """
         shown = self._shown(with_system(messages, self.system))
         try:
@@ -205,9 +194,7 @@ class Chat:
         return self._compiled.render(messages, **self.tokenizer.specials, **switch, **values)
 
     def spellings(self, letters: str) -> dict[str, list[int]]:
-        """Return the ids of all tokens that are each letter:
-        alone, with blanks around it, or as a byte.
-        """
+        """Return by letter the ids of all tokens that are it: alone, with blanks, or as a byte."""
         tokens: dict[str, list[int]] = {letter: [] for letter in letters}
         candidates = self.tokenizer.candidates(letters)
         for token, piece in zip(candidates, self.pieces(candidates), strict=True):
@@ -219,7 +206,7 @@ class Chat:
 def in_parts(
     messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Convert messages to contents that are lists of parts, as models with vision take them.
+    """Return messages whose contents are lists of parts, as models with vision take them.
 
     A message with the key `image` gets `picture`, the part that stands for it, before its text.
     """

@@ -23,14 +23,14 @@ _LONGEST_FORM = 100  # characters of a form of dates
 
 
 class Refused(UserError):
-    """A template raised an error about messages."""
+    """The error of a chat template that does not take some messages."""
 
 
 class ChatTemplate:
-    """A compiled chat template, rendered as transformers does."""
+    """A model's chat template, compiled in a sandbox and rendered as transformers does."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Compile the template of a model. Raises UserError if it is no Jinja, or too long."""
+        """Compile the template of model `name`. Raises UserError if it is no Jinja, or too long."""
         self._shown = f"model {printable(name)!r}: its chat template"
         try:
             self._compiled = _environment().from_string(text)
@@ -38,10 +38,10 @@ class ChatTemplate:
             raise UserError(f"{self._shown} is no Jinja ({printable(error)}); {_REMEDY}") from None
 
     def render(self, messages: Messages, **values: Any) -> str:
-        """Render messages, with the values of further names.
+        """Return the prompt of some messages; `values` are further names for the template.
 
-        Raises Refused, without advice yet, if the template refuses them,
-        and UserError if it takes too much.
+        Raises Refused if the template refuses the messages, and UserError if rendering takes too
+        much time or memory.
         """
         given = {"tools": None, "documents": None, "add_generation_prompt": True, **values}
         try:
@@ -55,8 +55,9 @@ class ChatTemplate:
 
 
 def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:
-    """Return messages in the way of a card's `system`:
-    `first-user`, or None to leave them as they are.
+    """Return messages with the system text where a card's `system` wants it.
+
+    That is at the beginning of the first user message (`first-user`), or where it is (None).
     """
     if way != FIRST_USER or len(messages) < 2 or messages[0]["role"] != "system":
         return tuple(messages)
@@ -65,8 +66,7 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
 
 
 def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
-    """Return the first message whose text does not stand in a prompt, after those before it;
-    None if all do.
+    """Return the first message whose text is not in the prompt in its turn; None if all are.
 
     White space around a text does not matter, and thoughts of earlier turns may be left out.
     """
@@ -84,9 +84,7 @@ def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
 
 
 def needs_first_user(text: str) -> bool:
-    """Return whether a template refuses a system message and takes its text in the first user
-    turn.
-    """
+    """Return whether a template refuses a system message, but takes its text in the user's."""
     asked = ({"role": "system", "content": "Be brief."}, {"role": "user", "content": "Where to?"})
     empty = {"bos_token": "", "eos_token": ""}
     try:

@@ -22,7 +22,7 @@ SAMPLED_S = 0.02  # time between two samples of a power
 
 @dataclass(frozen=True)
 class Counter:
-    """One energy or power meter."""
+    """Describe one energy meter (`joules`) or power meter (`watts`) of this machine."""
 
     name: str  # such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`
     joules: Callable[[], float] | None = None  # reads the joules counted so far, from any start
@@ -30,7 +30,8 @@ class Counter:
 
 
 def counters(sys: Path = SYS) -> list[Counter]:
-    """Return the meters that can be read here.
+    """Return the energy and power meters that can be read on this machine: NVML, RAPL, Jetson.
+
     `sys` is the folder in which the kernel shows its own.
     """
     return [*_nvml(), *_rapl(sys), *_jetson(sys)]
@@ -38,8 +39,9 @@ def counters(sys: Path = SYS) -> list[Counter]:
 
 @contextmanager
 def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
-    """Measure the energy of the block: the yielded dictionary of joules by meter is filled at its
-    end.
+    """Enter a context that measures energy; it yields a dict, filled at the end.
+
+    The dict has joules by the meter's name.
     """
     spent: dict[str, float] = {}
     sums = {meter.name: 0.0 for meter in meters if meter.watts}

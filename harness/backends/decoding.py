@@ -27,10 +27,10 @@ from harness.prompts.readout import letters, stated
 
 
 class Choice:
-    """Chooses the next tokens of some answers: the likeliest, or one drawn at a temperature.
+    """Choose the next tokens of a batch of answers: the likeliest, or drawn at a temperature.
 
-    Draws are keyed by the prompt and the answer's number, so other requests,
-    order and a resume change none.
+    Draws are keyed by the prompt and the answer's number, so other requests, their order and a
+    resume change none.
     """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
@@ -49,8 +49,10 @@ class Choice:
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
     ) -> list[int]:
-        """Choose the next token of the request at each place, in a session,
-        among some tokens (None: all).
+        """Return the chosen next token id of each sequence that is still written in a session.
+
+        `places` are their requests' places in the batch; `among` has for each the token ids to
+        choose from, None for all.
         """
         chosen = session.argmax(among)
         if self._drawn:
@@ -66,7 +68,7 @@ class Choice:
 
 
 class Decoding:
-    """Answers requests with one engine."""
+    """Answer requests in all answer modes with one engine, which only knows tokens."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -75,7 +77,7 @@ class Decoding:
         self._letters: dict[str, list[list[int]]] = {}
 
     def room(self, request: Request) -> int:
-        """Return the most tokens that the answer can take after the prompt.
+        """Return the most tokens that the answer to a request can take after its prompt.
 
         Raises UserError if the tokenizer or `max_tokens` leaves no room for this answer mode.
         """
@@ -89,12 +91,11 @@ class Decoding:
     def answer(
         self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]
     ) -> list[Completion]:
-        """Answer requests of one answer mode, for each of which there is `room`;
-        count no prompt tokens.
+        """Return the answers to a batch of requests of one answer mode; prompt tokens not counted.
 
-        `orders` has each request's rendered messages, in tokens; of a read-out over several orders
-        the messages with each, equally many. The first token of a read-out comes when it is
-        complete.
+        `orders` has the token ids of each request's prompt; for a read-out over several orders of
+        its list one prompt for each, equally many. A single request is timed. The first token of a
+        read-out comes when it is complete.
         """
         start_s = time.perf_counter()
         prompts = [prompt for prompt, *_ in orders]
@@ -295,10 +296,10 @@ def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[i
 
 
 def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
-    """Return the token of a draw from softmax(log_p / temperature) over the tokens of `among`
-    (None: all).
+    """Return a token id drawn from softmax(log_p / temperature) over the ids in `among`.
 
-    `u` is the uniform draw, in [0, 1). The temperature is above 0.
+    `log_p` is `(vocabulary,)`; `among` None takes all. `u` is the uniform draw, in [0, 1). The
+    temperature is above 0.
     """
     tokens = np.arange(len(log_p)) if among is None else np.unique(among)
     with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0

@@ -13,9 +13,9 @@ MOST = 8  # most tokens of a guess
 
 
 class Drafts:
-    """What came after which tokens so far; numbers count as equal.
+    """Remember what followed which tokens in a batch's answers, to guess how others go on.
 
-    A token is guessed only where all answers went on alike, so next to none is read in vain.
+    Tokens with digits count as equal. A token is guessed only where all answers went on alike.
     """
 
     def __init__(self, chat: Chat) -> None:
@@ -24,13 +24,13 @@ class Drafts:
         self._numeric: dict[int, bool] = {}
 
     def learn(self, kind: Hashable, tokens: Sequence[int]) -> None:
-        """Remember what the last token of an answer of some kind came after."""
+        """Remember an answer's last token as what follows those before it; `kind` is its form."""
         place = self._place(kind, tokens[:-1])
         if self._next.setdefault(place, tokens[-1]) != tokens[-1]:
             self._next[place] = None
 
     def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
-        """Return up to `most` tokens that may follow; none if nothing is known."""
+        """Return up to `most` guessed token ids after `tokens`; none if nothing is known."""
         guess: list[int] = []
         while len(guess) < min(most, MOST):
             token = self._next.get(self._place(kind, [*tokens, *guess]))

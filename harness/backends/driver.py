@@ -28,15 +28,16 @@ CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOO
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
-    """Open the driver that a card names. Raises UserError if there is none."""
+    """Return the backend of the rule-based driver that a card names. Raises UserError if none."""
     if card.name not in REFERENCES:
         raise unknown("driver", card.name, REFERENCES)
     return DriverBackend(card.name)
 
 
 class DriverBackend:
-    """Answers with all probability on the driver's action;
-    `uniform` with the same on every action.
+    """A backend of a rule-based driver: it gives all probability to the driver's action.
+
+    The driver `uniform` gives each action the same.
     """
 
     def __init__(self, driver: str) -> None:
@@ -78,9 +79,7 @@ class DriverBackend:
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """Return the driver and its answer version,
-        with what the choice of `constant` follows from.
-        """
+        """Return the driver's name, its answer version, and a digest of the table it chooses by."""
         chosen = {}
         if self.driver in CHOSEN:
             name, file = CHOSEN[self.driver]

@@ -15,79 +15,82 @@ from harness.core.image import Image
 
 
 class Session(Protocol):
-    """n sequences that advance together, each with a distribution over its next token."""
+    """Describe n token sequences in a model that advance together.
+
+    Each has the model's distribution over its next token.
+    """
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Return the most likely next token of each sequence among some (None: all);
-        the lowest of equals.
+        """Return each sequence's likeliest next token id, the lowest of equals.
+
+        `among` has for each sequence the ids to choose from, None for all.
         """
         ...
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        """Return log-probabilities over the vocabulary of some next tokens (None: all), (n,
-        tokens).
+        """Return log-probabilities of next tokens, `(n, tokens)`; of all tokens for None.
+
+        They are normalised over the whole vocabulary.
         """
         ...
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append tokens to each sequence.
-        An empty chunk leaves a sequence and its distribution unchanged.
-        """
+        """Append token ids to each sequence; an empty chunk leaves it and its distribution."""
         ...
 
     def follow(
         self, chunks: Sequence[Sequence[int]], guesses: Sequence[Sequence[int]]
     ) -> list[int]:
-        """Append a chunk to each sequence,
-        and as much of its guess as is its own likeliest next tokens.
+        """Append a chunk to each sequence, and as much of its guess as the model would write.
 
-        A chunk is not empty, a guess may be. Returns how many tokens of each guess were appended;
-        an engine that checks none appends none.
+        That is while the guess has the likeliest next tokens. A chunk is not empty, a guess may be.
+        Returns how many tokens of each guess were appended; an engine that checks none appends
+        none.
         """
         self.advance(chunks)
         return [0] * len(guesses)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        """Return the log-probabilities of some tokens after each of some chunks of each sequence.
+        """Return log-probabilities of `tokens` after each of several chunks of each sequence.
 
-        Each sequence has equally many chunks, none empty, and can only be closed then.
-        Shape (n, chunks, tokens).
+        The shape is `(n, chunks, tokens)`. Each sequence has equally many chunks, none empty. The
+        session can only be closed afterwards.
         """
         ...
 
     def keep(self, places: Sequence[int]) -> None:
-        """Keep these sequences only, in this order: n becomes len(places)."""
+        """Drop all sequences but those at `places`, in this order: n becomes len(places)."""
         ...
 
     def close(self) -> None: ...
 
 
 class Engine(Protocol):
-    """A loaded model."""
+    """Describe a loaded model that reads tokens and gives distributions of next ones."""
 
     chat: Chat  # its tokenizer and chat template
     context_tokens: int  # most tokens of one sequence
     stops: Sequence[int]  # token ids that end an answer, sorted
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture in a prompt.
-        Raises ValueError if the model takes none.
+        """Return the token ids that stand for a picture in a prompt.
 
-        Tokens that the vision encoder fills are negative, equal for equal pixels and different for
-        another picture; markers around them are tokens of the vocabulary.
+        Ids that the vision encoder fills are negative, equal for equal pixels and different for
+        another picture; markers around them are tokens of the vocabulary. Raises ValueError if the
+        model takes no pictures.
         """
         ...
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
-        """Read some prompts, none of them empty; their common beginning is computed once.
+        """Return a session that has read some prompts; their common beginning is computed once.
 
-        The logits of the tokens in `exact` are computed in float32,
+        No prompt may be empty. The logits of the token ids in `exact` are computed in float32,
         whatever the weights' number format.
         """
         ...
 
     def forget(self) -> None:
-        """Drop what is kept of earlier prompts; no session may be open."""
+        """Drop what is kept of earlier prompts, such as their KV cache; no session may be open."""
         ...
 
     def identity(self) -> dict[str, Any]: ...
@@ -97,9 +100,7 @@ LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of promp
 
 
 def check_logits(largest: Sequence[float]) -> None:
-    """Raise ArithmeticError if a sequence's largest logit is not finite:
-    its answer would mean nothing.
-    """
+    """Raise ArithmeticError if a sequence's largest logit is not finite, as of damaged weights."""
     if not all(map(math.isfinite, largest)):
         raise ArithmeticError(
             "the logits are no numbers; the weights are damaged, or too large for this dtype"
@@ -107,7 +108,7 @@ def check_logits(largest: Sequence[float]) -> None:
 
 
 def common_length(sequences: Sequence[list[int]]) -> int:
-    """Return the length of the common beginning of one or more sequences."""
+    """Return how many tokens one or more sequences have in common at their beginning."""
     first, last = min(sequences), max(sequences)  # all that sort between these two begin as both do
     return next(
         (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first)
@@ -115,13 +116,14 @@ def common_length(sequences: Sequence[list[int]]) -> int:
 
 
 def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
-    """Return the common beginning of one or more sequences."""
+    """Return the tokens that one or more sequences have in common at their beginning."""
     return sequences[0][: common_length(sequences)]
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Yield the places of sequences in groups with longer common beginnings,
-    where that saves tokens.
+    """Yield groups of indices of sequences that share long beginnings, each index once.
+
+    A group of its own is made only where that saves reading `LEAST_SAVED` tokens.
     """
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]

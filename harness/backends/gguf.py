@@ -31,7 +31,7 @@ _TEXT, _ARRAY = 8, 9
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """What a file states of its model; None where it does not."""
+    """Hold what a GGUF file states of its model; None where it states nothing."""
 
     name: str | None = None  # the model's name
     licence: str | None = None  # SPDX id of its licence, or its name, as the file writes it
@@ -42,8 +42,9 @@ class ModelFacts:
 
 
 def read_facts(file: Path) -> ModelFacts:
-    """Read what a file states of its model; nothing if it is no GGUF.
-    Raises OSError if it does not open.
+    """Return what a GGUF file states of its model; nothing if it is no GGUF.
+
+    Raises OSError if it cannot be opened.
     """
     try:
         values = read_metadata(file)
@@ -64,10 +65,10 @@ def read_facts(file: Path) -> ModelFacts:
 
 
 def read_metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
-    """Read the keys and values of a GGUF file; arrays are skipped unless they are asked for.
+    """Return the metadata keys and values of a GGUF file; arrays only with `arrays`.
 
-    Raises OSError if it cannot be opened,
-    and ValueError if it is no GGUF or they are longer than `LONGEST`.
+    Raises OSError if it cannot be opened, and ValueError if it is no GGUF or they are longer than
+    `LONGEST` bytes.
     """
     with opened(file, "weights") as data:
         head = data.read(LONGEST)

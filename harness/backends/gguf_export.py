@@ -48,13 +48,13 @@ _DEEPSTACK = {"norm": "norm", "linear_fc1": "fc1", "linear_fc2": "fc2"}
 
 
 def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
-    """Write a Qwen3 folder as a GGUF file, whole or not at all;
-    of a Qwen3-VL its projector beside it.
+    """Write a saved Qwen3 or Qwen3-VL checkpoint as a GGUF file, whole or not at all.
 
     The folder has config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json, a
-    chat template and, of a Qwen3-VL, preprocessor_config.json. The projector is `mmproj-` and the
-    name of `out`. `dtype` is that of matrices; vectors are always F32. Raises UserError for another
-    architecture or tokenizer, and for files that are not whole.
+    chat template and, of a Qwen3-VL, preprocessor_config.json. Its vision encoder becomes a file
+    beside `out`, named `mmproj-` and the name of `out`. `dtype` is that of matrices; vectors are
+    always F32. Raises UserError for another architecture or tokenizer, and for files that are not
+    whole.
     """
     shown = f"checkpoint {printable(checkpoint)}"
     try:
@@ -79,7 +79,7 @@ def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
 
 
 def projector_of(out: Path) -> Path:
-    """Return where the projector of an exported file goes."""
+    """Return the path of the vision encoder's GGUF file that goes with the file `out`."""
     return out.with_name(f"{PROJECTOR}{out.name}")
 
 

@@ -28,7 +28,7 @@ class _Prompt(NamedTuple):
 
 
 class LanguageModel:
-    """A backend that asks an engine in batches of at most `batch_size` requests."""
+    """A backend of a language model in this process, asked in batches of `batch_size` at most."""
 
     def __init__(self, engine: Engine, batch_size: int) -> None:
         self.engine = engine
@@ -82,7 +82,10 @@ class LanguageModel:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return the log-probabilities of the first tokens of the vocabulary, (n, vocabulary)."""
+        """Return log-probabilities of the first `vocabulary` token ids after each prompt.
+
+        The shape is `(n, vocabulary)`.
+        """
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))
 

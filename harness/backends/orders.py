@@ -18,7 +18,7 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 @dataclass(frozen=True)
 class AveragedReadOut:
-    """A read-out over all orders."""
+    """Hold a read-out of letters, averaged over cyclic orders of its list of actions."""
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders
@@ -29,10 +29,10 @@ class AveragedReadOut:
 
 
 def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> AveragedReadOut:
-    """Average a read-out.
+    """Return a read-out averaged over all cyclic orders of its list of actions.
 
-    `letters_p` has the letters' probabilities in each cyclic order of the actions
-    (`harness.prompts.readout.cyclic`), a row an order; the first is that of `actions`.
+    `letters_p`, `(orders, A)`, has the letters' probabilities, a row an order as
+    `harness.prompts.readout.cyclic` gives them, the first that of `actions`.
     """
     p: Floats = np.array(letters_p, dtype=float)
     mass = p.sum(axis=1)

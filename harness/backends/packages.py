@@ -30,17 +30,17 @@ _UNREACHED = ("connection broken", "Connection to", "NewConnectionError", "timed
 
 @dataclass(frozen=True)
 class Packaged:
-    """A file inside a wheel, by its path there; `model` is the model's name in messages."""
+    """Describe a weights file inside a wheel of a package registry."""
 
     package: str
     version: str
-    file: str
-    sha256: str
-    model: str
+    file: str  # its path inside the wheel
+    sha256: str  # hex digest that the file must have
+    model: str  # the model's name, for messages
 
     @property
     def place(self) -> Path:
-        """Where the file lies once it is fetched. Files of equal content and name share it."""
+        """Path of the file once it is fetched; files of equal content and name share it."""
         return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
 
     @property
@@ -49,7 +49,7 @@ class Packaged:
 
 
 def find_packaged(card: Card) -> Packaged | None:
-    """Return where in a wheel a card's weights lie; None if they lie elsewhere.
+    """Return the file in a wheel that a card has as its weights; None if they lie elsewhere.
 
     Raises UserError if the card names no package, file, version or digest that can be fetched.
     """
@@ -76,8 +76,9 @@ def find_packaged(card: Card) -> Packaged | None:
 
 
 def fetch(wanted: Packaged) -> Path:
-    """Download a wheel, take the file out of it, and return where it lies;
-    do nothing if it lies there.
+    """Return the path of a file in a wheel, which is downloaded unless it is there already.
+
+    Raises UserError if it cannot be downloaded or unpacked.
     """
     if not wanted.place.is_file():
         with tempfile.TemporaryDirectory() as folder:
@@ -86,8 +87,10 @@ def fetch(wanted: Packaged) -> Path:
 
 
 def unpack(wheel: Path, wanted: Packaged) -> None:
-    """Put one file of a wheel where it belongs.
-    Raises UserError if its digest is not the card's.
+    """Copy one file out of a wheel to its place.
+
+    Raises UserError if the wheel has no such file, it is too large, or its digest is not the
+    card's.
     """
     to = wanted.place
     try:

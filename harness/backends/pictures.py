@@ -19,18 +19,21 @@ _PLACE_BITS, _DIGITS = 16, 10
 
 
 def locate_picture(token: int) -> tuple[int, int]:
-    """Return the number of the picture that a token belongs to, and the token's place in it."""
+    """Return the number of the picture that a negative token id is of, and its place in it."""
     return divmod(-1 - token, 1 << _PLACE_BITS)
 
 
 def pictures_in(tokens: Iterable[int]) -> list[int]:
-    """Return the numbers of the pictures whose first token is among these, in order."""
+    """Return the numbers of the pictures whose first token id is among `tokens`, in order."""
     located = (locate_picture(token) for token in tokens if token < 0)
     return [number for number, place in located if place == 0]
 
 
 class Pictures(Generic[T]):
-    """Pictures by number, with what an engine's `encode` makes of each."""
+    """Keep pictures by number, and the encodings of those that were used last.
+
+    `encode` turns pictures into what an engine's model reads.
+    """
 
     def __init__(self, encode: Callable[[list[Image]], list[T]]) -> None:
         self._encode = encode
@@ -38,13 +41,13 @@ class Pictures(Generic[T]):
         self._encoded: OrderedDict[int, T] = OrderedDict()  # the least recently used come first
 
     def add(self, image: Image, count: int) -> list[int]:
-        """Return a picture's `count` tokens; the `Image` must stay alive until they are read."""
+        """Return the `count` negative token ids of a picture, which must stay alive until read."""
         number = int(image.sha256[:_DIGITS], 16)
         self._images[number] = image
         return [-1 - ((number << _PLACE_BITS) | place) for place in range(count)]
 
     def image(self, number: int) -> Image:
-        """Return a picture. Raises LookupError if it is not alive."""
+        """Return a picture by number. Raises LookupError if it is no longer alive."""
         if (image := self._images.get(number)) is None:
             raise LookupError(
                 "a picture is gone that a prompt's tokens stand for; look at it again"
@@ -52,7 +55,10 @@ class Pictures(Generic[T]):
         return image
 
     def encodings(self, numbers: Sequence[int]) -> list[T]:
-        """Return the encodings of some pictures; those that are not kept are encoded together."""
+        """Return the encodings of pictures by number; those not kept are computed in one batch.
+
+        Raises LookupError if such a picture is no longer alive.
+        """
         if new := [number for number in dict.fromkeys(numbers) if number not in self._encoded]:
             self._encoded |= zip(
                 new, self._encode([self.image(number) for number in new]), strict=True
@@ -65,6 +71,6 @@ class Pictures(Generic[T]):
         return encodings
 
     def forget(self, tokens: Iterable[int]) -> None:
-        """Drop the encodings of the pictures among some tokens, so that they are encoded again."""
+        """Drop the encodings of the pictures that `tokens` have parts of."""
         for number in {locate_picture(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(number, None)

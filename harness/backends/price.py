@@ -12,7 +12,7 @@ MILLION = 1e6
 
 @dataclass(frozen=True)
 class Price:
-    """What a million tokens cost, as its maker's price list says."""
+    """Hold what a million tokens of a served model cost, by its maker's price list."""
 
     input: _Amount  # of those that the model reads
     output: _Amount  # of those that it writes, thoughts included
@@ -21,5 +21,5 @@ class Price:
     ]
 
     def of(self, read: float, written: float) -> float:
-        """Return what so many tokens cost."""
+        """Return what `read` prompt tokens and `written` answer tokens cost, in `currency`."""
         return (read * self.input + written * self.output) / MILLION

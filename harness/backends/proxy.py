@@ -30,14 +30,14 @@ OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor th
 
 
 def open(card: Card, **_: Any) -> "Proxy":
-    """Open the proxy with the failures of its card."""
+    """Return the backend of the rule `proxy`, with the failures of its card."""
     return Proxy(card.failures)
 
 
 class Proxy:
-    """Answers in the form that its prompt asks for, like a well-behaved language model.
+    """A backend of a fixed rule that plans on a scene graph, in place of a language model.
 
-    With `failures`, it answers like a model that is less well-behaved.
+    It answers in the form that the prompt asks for. With `failures`, some answers are spoilt.
     """
 
     def __init__(self, failures: Failures | None = None) -> None:
@@ -67,7 +67,7 @@ class Proxy:
 
 
 def answers(requests: Sequence[Request]) -> list[str]:
-    """Return the texts of the answers to some requests."""
+    """Return the rule's answers to requests as texts, before any is spoilt."""
     return by_scenario(requests, _answers)
 
 
@@ -98,7 +98,10 @@ def _text(request: Request, view: SceneGraph, intent: dict[str, float]) -> str:
 
 
 def distribution(scenario: Scenario, view: SceneGraph) -> dict[str, float]:
-    """Return a viewer's intent: the planner's action on its graph, hedged by what it cannot see."""
+    """Return the rule's probability of each action, by name, for a viewer's scene graph.
+
+    The planner's action is likeliest, and less so the more of its sectors the viewer cannot see.
+    """
     return _hedged(scenario.actions, plan(scenario, view), view)
 
 
@@ -134,10 +137,10 @@ def _reason(view: SceneGraph) -> str:
 
 
 def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float]:
-    """Draw how a request's text fails (None if it does not),
-    and by how many seconds its answer is slow.
+    """Draw how a request's answer is spoilt (None if not), and its extra delay in seconds.
 
-    The draw depends on the id only, so batch, order, prompt and condition do not change it.
+    The first is a name of `Failures.texts`. The draw depends on the id only, so batch, order,
+    prompt and condition do not change it.
     """
     text, slow = noise.uniforms((2,), "proxy failure", request_id).tolist()
     slow_s = failures.slow_s if slow < failures.slow_tail else 0.0
@@ -149,7 +152,10 @@ def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float
 
 
 def spoil(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
-    """Spoil a good answer, which ends in compact JSON, in one of the ways of `Failures`."""
+    """Return a good answer's text spoilt as `how` says, and its finish reason.
+
+    `text` ends in compact JSON; `how` is a name of `Failures.texts`, or ValueError is raised.
+    """
     match how:
         case "fence":
             return f"```json\n{text}\n```", "stop"

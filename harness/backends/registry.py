@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What an engine can do. Other code tests these capabilities, never an engine's name."""
+    """Hold what an engine can do; other code tests these fields, never an engine's name."""
 
     # whose answers can be timed, and which can be asked to fuse messages
     language_model: bool = True
@@ -47,7 +47,7 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Registration:
-    """What an engine can do, needs and understands, and how the backend of a card is opened."""
+    """Describe an engine: what it can do, what its cards need, and how a backend is opened."""
 
     # `module:function`, called with a card and the options of `open_backend`; returns a backend
     opens: str
@@ -149,8 +149,9 @@ ENGINES = Engines("swarmdrive.backends", Registration, BUILT_IN)
 
 
 def registration(engine: str) -> Registration:
-    """Return the registration of an engine.
-    Raises UserError if there is none, or a plug-in fails.
+    """Return the registration of an engine by name.
+
+    Raises UserError if there is none, or a package's engine does not load.
     """
     entry = ENGINES.get(engine)
     if entry is None:
@@ -159,12 +160,12 @@ def registration(engine: str) -> Registration:
 
 
 def capabilities(engine: str) -> Capabilities:
-    """Return what an engine can do. Raises what `registration` raises."""
+    """Return what an engine can do, by its name; raises as `registration`."""
     return registration(engine).capabilities
 
 
 def reads_prompts(engine: str) -> bool:
-    """Return whether an engine's models read prompts; one that is unknown here may."""
+    """Return whether an engine's models read prompts; true for one that is not installed."""
     entry = ENGINES.get(engine)
     return entry is None or entry.capabilities.language_model
 
@@ -172,12 +173,12 @@ def reads_prompts(engine: str) -> bool:
 def open_backend(
     card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:
-    """Open the backend of a card and load its weights; engines without weights ignore the options.
+    """Return the backend of a card, with its weights loaded.
 
-    The device is `cpu`, `cuda` or `cuda:N`; None takes CUDA if there is any. `dtype` is a number
-    format instead of the card's; `batch_size` the most requests that go through the engine
-    together. Raises UserError if a package or the weights are missing, an option is wrong, or a
-    file does not load.
+    The options are for engines with weights. The device is `cpu`, `cuda` or `cuda:N`; None takes
+    CUDA if there is any. `dtype` is a number format instead of the card's; `batch_size` the most
+    requests that go through the engine together. Raises UserError if a package or the weights are
+    missing, an option is wrong, or a file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
@@ -197,7 +198,7 @@ def open_backend(
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
-    """Return this process's backend of a card, opened once (see `open_backend`)."""
+    """Return a card's backend as `open_backend` does, opened only once in each process."""
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
 
@@ -211,7 +212,7 @@ def _opened_in(
 
 
 def import_object(place: str) -> Any:
-    """Import the module of `module:name` and return the object."""
+    """Return the object that `module:name` names, after importing its module."""
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
@@ -223,7 +224,7 @@ def asked(card: "Card", place: str) -> Any:
 
 
 def missing_package(engine: str) -> str | None:
-    """Return the first package that an engine needs and that is not installed; None if all are."""
+    """Return the first package that an engine needs and that is not installed, or None."""
     packages = registration(engine).packages
     return next(
         (package for module, package in packages.items() if find_spec(module) is None), None
@@ -231,7 +232,7 @@ def missing_package(engine: str) -> str | None:
 
 
 def missing(card: "Card") -> str | None:
-    """Return what a card lacks to run here: the name of a package or `weights`; None if nothing."""
+    """Return what keeps a card from running here: a package's name, `weights`, or None."""
     if package := missing_package(card.engine):
         return package
     try:
@@ -243,9 +244,7 @@ def missing(card: "Card") -> str | None:
 
 
 def locate(card: "Card") -> Path:
-    """Return where the weights of a card lie for its engine.
-    Raises UserError if they are not found.
-    """
+    """Return the path of a card's weights, by its engine. Raises UserError if not found."""
     where = asked(card, registration(card.engine).finds)
     if not isinstance(where, Path):
         raise UserError(f"engine {printable(card.engine)} finds no path; repair its package")
@@ -253,8 +252,9 @@ def locate(card: "Card") -> Path:
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Return the tokens that a card's image processor makes of its picture;
-    None if it is not installed.
+    """Return how many tokens a card's own image processor makes of its picture.
+
+    None if its engine or weights are not installed, or take no pictures.
     """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None

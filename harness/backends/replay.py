@@ -26,7 +26,7 @@ _KEPT = [field.name for field in fields(Completion)[2:] if field.name != "server
 
 
 def open(card: Card, **_: Any) -> "Replay":
-    """Open the run folder that a card names.
+    """Return the backend that answers from the run folder that a card names.
 
     Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego
     only, or lacks answers that no run can do without.
@@ -46,11 +46,10 @@ def open(card: Card, **_: Any) -> "Replay":
 
 
 class Replay:
-    """Looks up answers by scene and viewer.
-    A prompt that was never asked is an error and not a guess.
+    """A backend that gives a run's stored answers, found by scene and viewer.
 
-    If other decisions lead to a decision point that the run did not reach,
-    the run's model is asked; its identity must be the same.
+    If other decisions lead to a scene that the run did not reach, the run's model is asked; its
+    identity must be the same. Raises UserError for a prompt other than the one that was answered.
     """
 
     def __init__(self, run: Run) -> None:
@@ -182,9 +181,10 @@ class Replay:
 
 
 class Kept(Replay):
-    """Has a run's answers and nobody else to ask, so that a stranger's run opens no model.
+    """A backend that gives a run's stored answers and never opens a model.
 
-    A delay that it states of an answer is not taken: only rules declare such, and they are asked.
+    So a stranger's run opens nothing: a missing answer raises UserError. A delay that it states of
+    an answer is not taken; only rules declare such, and they are asked.
     """
 
     def _completion(self, request: Request, answer: Answer) -> Completion:

@@ -37,7 +37,7 @@ _BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
 
 
 class Saved(NamedTuple):
-    """What its small files say."""
+    """Hold what the small files of a saved Qwen3 checkpoint say."""
 
     config: dict[str, Any]  # of the text part
     tokenizer: dict[str, Any]  # whole
@@ -48,8 +48,10 @@ class Saved(NamedTuple):
 
 
 def read(checkpoint: Path, shown: str) -> Saved:
-    """Read the small files of a checkpoint;
-    UserError if one is not there, or says what no GGUF can.
+    """Return what the small files of a Qwen3 or Qwen3-VL checkpoint say.
+
+    `shown` names it in messages. Raises UserError if a file is missing, or says what llama.cpp
+    would take otherwise.
     """
     texts = {
         name: text_of(checkpoint / name, "record")
@@ -118,7 +120,7 @@ def _check(config: Mapping[str, Any], only: Mapping[str, Any], shown: str) -> No
 
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the rope parameters, in a table of their own since transformers 5."""
+    """Return a config's parameters of rotary embeddings; newer files have them in a table."""
     parameters: Mapping[str, Any] = config.get("rope_parameters") or config
     return parameters
 
@@ -149,7 +151,7 @@ def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
 
 
 def numbers(tensor: Any) -> NDArray[np.float32]:
-    """Read a tensor of `gguf.utility.SafetensorsLocal` as float32."""
+    """Return a tensor of `gguf.utility.SafetensorsLocal` as a float32 array of its shape."""
     data = tensor.mmap_bytes()
     if tensor.dtype == "BF16":  # which numpy has not; its bits are float32's upper half
         values = (data.view("<u2").astype(np.uint32) << 16).view(np.float32)

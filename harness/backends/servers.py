@@ -66,10 +66,11 @@ _RESERVED = frozenset(
 
 @dataclass(frozen=True)
 class Fields:
-    """How a server is sent the fields of a request that servers refuse, or call by other names.
+    """Say how a server is sent request fields that servers refuse or call by other names.
 
     Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens
-    = "max_completion_tokens"`. No other field can be changed.
+    = "max_completion_tokens"`. No other field can be changed. Raises ValueError for a name that
+    another field has.
     """
 
     max_tokens: _Sent = True  # most tokens of the answer
@@ -94,7 +95,7 @@ class Fields:
         return {name: alias for name, alias in vars(self).items() if alias is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a request with the fields left out and renamed."""
+        """Return a request's JSON body with fields left out and renamed as stated here."""
         sent = {name: vars(self).get(name, True) for name in body}
         return {
             name if alias is True else alias: body[name]
@@ -140,7 +141,10 @@ _OF_MODELS = {
 
 @dataclass(frozen=True)
 class Server:
-    """A server that speaks OpenAI's chat completions."""
+    """Describe the servers of a model and how they are asked: a card's `[server]` table.
+
+    Raises ValueError for a URL or variable name that is not allowed, without showing the URL.
+    """
 
     # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
     # of servers, any of them may answer, and each must list the model.
@@ -182,7 +186,7 @@ class Server:
         """Return the server's key; None if its variable is not set.
 
         A card may come from others, so it may not have any variable sent to its server. Raises
-        UserError if the variable holds no key of models, by its name, and the user does not list
+        UserError if the variable's name is not that of a key of models, and the user does not list
         it.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
@@ -202,8 +206,9 @@ class Server:
 
     @property
     def any_may_answer(self) -> bool:
-        """Whether any of several servers may answer,
-        so that the model's identity is what they list.
+        """Whether `base_url` is a list of servers, any of which may answer a request.
+
+        The model's identity is then what they list, and has no address.
         """
         return not isinstance(self.base_url, str)
 
@@ -213,10 +218,10 @@ class Server:
 
 
 def readable(variable: str) -> bool:
-    """Return whether a card may have this environment variable sent to its server.
+    """Return whether a card may have this environment variable sent to its server as a key.
 
-    It ends in KEY or TOKEN and has the word of a service or a server of models,
-    or the user lists it.
+    It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists
+    it in `SWARMDRIVE_KEYS`.
     """
     *words, last = variable.split("_")
     listed = {name.strip() for name in os.environ.get(KEYS, "").split(",")}
@@ -224,9 +229,7 @@ def readable(variable: str) -> bool:
 
 
 def meant(address: str) -> str | None:
-    """Return the base URL that an address means which does not begin with http:// or https://, or
-    None.
-    """
+    """Return the base URL that is meant by an address without `http://`; None if it is none."""
     found = _ADDRESS.fullmatch(address)
     if found is None or address.startswith(("http://", "https://")):
         return None

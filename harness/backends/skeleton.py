@@ -28,7 +28,7 @@ UNIT = (0, 1)  # bounds of a number that is `0.` and two digits
 
 
 class Branch(NamedTuple):
-    """Fixed text that may follow a point, and the point behind it; None at the end."""
+    """Hold fixed text of an answer, and the point after it at which the model decides."""
 
     text: str
     then: "Point | None"
@@ -36,7 +36,7 @@ class Branch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place where the model decides, and then goes on in one of several branches."""
+    """A place in a constrained answer where the model decides, before one of some branches."""
 
     options: tuple[str, ...]  # texts to choose from; one empty text where only the branch is chosen
     most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
@@ -46,7 +46,7 @@ class Point:
 
 
 def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:
-    """Return the branches that write a value of a schema and go on in one of some branches.
+    """Return the branches that write a value of a JSON schema, and then go on in `branches`.
 
     Fixed texts begin and end only beside letters and digits, where tokenizers split as well.
     """
@@ -90,12 +90,12 @@ def _after(text: str, branches: Sequence[Branch]) -> list[Branch]:
 
 
 def start(shape: Shape) -> Point:
-    """Return the point at which an answer begins."""
+    """Return the point at which a constrained answer of a form begins."""
     return Point(("",), 0, tuple(expand(constrained_schema(shape), [Branch("", None)])))
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return the answer with the option and the branch at this place everywhere, and no text."""
+    """Return an example of an answer: each choice is the one at `place`, and texts are empty."""
     text, point = "", Branch("", start(shape)).then
     while point:
         branch = point.branches[place]
@@ -104,33 +104,31 @@ def filled(shape: Shape, place: int) -> str:
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
-    """Return the tokens of a text that follows another,
-    since some tokenizers mark the beginning of a text.
+    """Return the token ids of `text` where it follows `before`.
 
-    If a token would span both texts, the tokens are those of the text alone.
+    Some tokenizers mark the beginning of a text. If a token would span both texts, the ids are
+    those of `text` alone.
     """
     head, whole = chat.encode(before), chat.encode(before + text)
     return tuple(whole[len(head) :] if whole[: len(head)] == head else chat.encode(text))
 
 
 class Ask(NamedTuple):
-    """A decision of the model: `forced` tokens to append first,
-    then the sorted tokens to choose from.
-    """
+    """Hold a decision of the model: `forced` ids to append, then sorted ids to choose from."""
 
     forced: list[int]
     among: Sequence[int]
 
 
 class Filled(NamedTuple):
-    """A filled-in answer: its text, and how many tokens it has."""
+    """Hold a finished constrained answer: its text, and its number of tokens."""
 
     text: str
     tokens: int
 
 
 class Leg(NamedTuple):
-    """An option and the branch behind it: their text, its tokens, and the point that follows."""
+    """Hold an option and the branch after it: their text, its tokens, and that branch."""
 
     text: str
     tokens: tuple[int, ...]
@@ -138,7 +136,11 @@ class Leg(NamedTuple):
 
 
 class Skeleton:
-    """The answers of a shape in tokens, each after a line break, as in every template."""
+    """Hold the tokens of all answers of a form, for one tokenizer.
+
+    Answers follow a line break, as in every chat template. Raises UserError if the tokenizer cannot
+    tell choices apart.
+    """
 
     def __init__(self, chat: Chat, shape: Shape) -> None:
         self._chat = chat
@@ -191,7 +193,7 @@ class Skeleton:
         return longest[self._start]
 
     def walk(self) -> Generator[Ask, int, Filled]:
-        """Yield each decision, receive its token, and return the answer."""
+        """Yield each decision, receive the chosen token id, and return the finished answer."""
         text, count, before = "", 0, "\n"
         forced: list[int] = []
         point: Point | None = self._start

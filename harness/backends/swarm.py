@@ -10,7 +10,10 @@ from harness.backends.card import Card
 
 
 class Swarm:
-    """The backends of a run's agents, the ego's first; agents may share a backend."""
+    """A backend that sends each request to the backend of its agent (`Request.agent`).
+
+    `backends` are those of the agents, the ego's first; agents may share one.
+    """
 
     def __init__(self, backends: Sequence[Backend]) -> None:
         self._backends = backends
@@ -40,7 +43,7 @@ class Swarm:
 
 
 def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[Backend]:
-    """Open the backend of each card; equal cards share one."""
+    """Return the backend of each card, opened by `opens`; equal cards share one."""
     opened = {card: opens(card) for card in dict.fromkeys(cards)}
     return [opened[card] for card in cards]
 
@@ -48,8 +51,9 @@ def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[B
 def together(
     cards: Sequence[Card], backends: Sequence[Backend], cache: Path | None = None
 ) -> Backend:
-    """Combine the backends of a run's agents into one;
-    each has a cache before it if there is a file.
+    """Return one backend of a run's agents, which routes requests by agent.
+
+    With a `cache` file, a completion cache is put before each.
     """
     agents = [cached(backend, card, cache) for backend, card in zip(backends, cards, strict=True)]
     return agents[0] if len(agents) == 1 else Swarm(agents)

@@ -34,10 +34,10 @@ _CONTROL, _USER_DEFINED = 3, 4  # types of a GGUF file's tokens
 
 @lru_cache(maxsize=4)
 def tokenizer(source: Path) -> Any:
-    """Load a `tokenizers.Tokenizer` from a GGUF file, a tokenizer.json, or a folder with one.
+    """Return a `tokenizers.Tokenizer` from a GGUF file, a tokenizer.json, or a folder with one.
 
-    It neither cuts texts off nor pads them, whatever the file says.
-    Raises UserError if there is none.
+    It neither cuts texts off nor pads them, whatever the file says. Raises UserError if there is
+    none.
     """
     from tokenizers import Tokenizer
 
@@ -59,16 +59,14 @@ def tokenizer(source: Path) -> Any:
 
 
 def whole(loaded: Any) -> Any:
-    """Let a `tokenizers.Tokenizer` neither cut texts off nor pad them, and return it."""
+    """Return a `tokenizers.Tokenizer`, changed so that it neither cuts texts off nor pads."""
     loaded.no_truncation()
     loaded.no_padding()
     return loaded
 
 
 def token_ids(loaded: Any, text: str) -> list[int]:
-    """Return the token ids of a text in a chat,
-    without those that a tokenizer puts around a whole prompt.
-    """
+    """Return the token ids of a text in a chat, without tokens put around a whole prompt."""
     encoded: list[int] = loaded.encode(text, add_special_tokens=False).ids
     return encoded
 
@@ -120,8 +118,9 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
 
 
 def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
-    """Build a `tokenizers.Tokenizer` of a byte-level BPE model,
-    which splits text as Qwen2 or by `splits`.
+    """Return a `tokenizers.Tokenizer` of a byte-level BPE model.
+
+    It splits text by the patterns `splits`, one after another, by default as Qwen2 does.
     """
     from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
 
@@ -139,10 +138,10 @@ def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
 def counter(
     source: Path | None, card: Card | None = None
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
-    """Return a function that counts the tokens of chat messages,
-    without those of the chat template.
+    """Return a function that counts the tokens of messages, without the chat template's.
 
-    It uses the given tokenizer, or else the one with the model's weights; None if there is neither.
+    It uses the tokenizer at `source`, or else the one with the card's weights; None if there is
+    neither. Raises UserError if there is no tokenizer at `source`.
     """
     if source is None and card and card.weights:
         source = _of_weights(card)
@@ -163,6 +162,6 @@ def _of_weights(card: Card) -> Path | None:
 
 
 def summarize_counts(counts: Sequence[int]) -> dict[str, float]:
-    """Return `n`, `least`, `mean` and `most` of some token counts."""
+    """Return the number `n`, `least`, `mean` and `most` of one or more token counts."""
     mean = round(sum(counts) / len(counts), 1)
     return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

@@ -14,7 +14,7 @@ WIDE, HIGH = 16, 8  # tokens along the sides of a picture whose size the checkpo
 
 @dataclass(frozen=True)
 class Vision:
-    """Numbers of a model's image processor.
+    """Describe how a model takes pictures: their size, and how many tokens they become.
 
     A token stands for a square of `merge` x `merge` patches. A picture is scaled so that both sides
     hold whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one
@@ -52,9 +52,7 @@ class Vision:
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """Return the error text for a model that makes another number of tokens;
-        None if it agrees.
-        """
+        """Return the error for a processor that makes `tokens` of a picture; None if it agrees."""
         if tokens == self.tokens:
             return None
         return (
@@ -77,12 +75,11 @@ class Vision:
 
 
 def read_vision(config: Mapping[str, Any], processor: Mapping[str, Any]) -> Vision | None:
-    """Return what a checkpoint's config.json and preprocessor_config.json state;
-    None without vision.
+    """Return how a checkpoint takes pictures, by its two config files; None if it does not.
 
-    Its pictures have `WIDE` x `HIGH` tokens, unless it scales them to a size of its own. Raises
-    LookupError or TypeError if the model is neither Qwen's nor Idefics3's kind, or a file is
-    malformed.
+    `config` is its config.json and `processor` its preprocessor_config.json. Pictures have `WIDE` x
+    `HIGH` tokens, unless it scales them to a size of its own. Raises LookupError or TypeError if
+    the model is neither Qwen's nor Idefics3's kind, or a file is malformed.
     """
     vision = config.get("vision_config")
     if vision is None:

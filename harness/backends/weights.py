@@ -36,8 +36,9 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Find the directory of a card's checkpoint:
-    as given, beside the cards, or in the hub's cache.
+    """Return the directory of a card's checkpoint: as given, beside the cards, or the hub's cache.
+
+    Raises UserError if there is none, or it lacks a file.
     """
     find_adapter(card)
     local = find("models", card.weights or "")
@@ -72,8 +73,9 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Find the GGUF file of a card: as given, beside the cards, out of a package,
-    or in the hub's cache.
+    """Return a card's GGUF file: as given, beside the cards, of a package, or the hub's cache.
+
+    Raises UserError if there is none, or its projector is missing.
     """
     find_adapter(card)
     if wanted := packages.find_packaged(card):
@@ -100,22 +102,22 @@ def find_gguf(card: Card) -> Path:
 
 
 def is_gguf(card: Card) -> bool:
-    """Return whether a card's weights are a GGUF file, on whatever engine;
-    packages have no others.
-    """
+    """Return whether a card's weights are a GGUF file, on whatever engine."""
     weights = card.file or card.weights or ""
     return weights.endswith(".gguf") or weights.startswith(packages.PREFIX)
 
 
 def find_weights(card: Card) -> Path:
-    """Find the checkpoint's directory or the GGUF file of a card.
-    Raises UserError if it is not whole.
+    """Return the checkpoint's directory or the GGUF file of a card.
+
+    Raises UserError if there is none, or it is not complete.
     """
     return find_gguf(card) if is_gguf(card) else find_checkpoint(card)
 
 
 def check_digest(card: Card, file: Path) -> Path:
-    """Return the file if its digest is the card's, or the card has none.
+    """Return `file`, after comparing its SHA-256 with the card's, if that has one.
+
     Raises UserError if they differ.
     """
     if (
@@ -130,10 +132,10 @@ def check_digest(card: Card, file: Path) -> Path:
 
 
 def contradictions(card: Card) -> Iterator[str]:
-    """Yield a line for each thing that a card says otherwise than its weights. The card holds.
+    """Yield a line for each fact that a card states otherwise than its weights do.
 
-    A shorter context than that of the weights is a choice.
-    Raises UserError if the weights are not found.
+    They are the licence, and a context longer than the weights'; the card's is used. Raises
+    UserError if the weights are not found.
     """
     where = locate(card)
     stated = (
@@ -166,11 +168,10 @@ def _context_tokens(checkpoint: Path) -> int | None:
 
 
 def pull(card: Card) -> Path:
-    """Download what a card's engine needs and lacks into a cache;
-    return the checkpoint or the GGUF file.
+    """Download a card's weights into a cache, and return the checkpoint or the GGUF file.
 
-    Raises UserError if there is nothing to fetch,
-    the hub or the registry is not reached or refuses, or the digest is not the card's.
+    Raises UserError if there is nothing to fetch, the hub or the registry is not reached or
+    refuses, or the digest is not the card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"{card.shown} runs on {card.engine}: it has no weights to pull")
@@ -218,12 +219,12 @@ def _download(card: Card) -> None:
 
 
 def hub_commit(folder: Path) -> str | None:
-    """Return the commit in a folder of the hub's cache; None for any other folder."""
+    """Return the commit of a folder of the hub's cache; None for any other folder."""
     return folder.name if folder.parent.name == "snapshots" else None
 
 
 def fetching(card: Card) -> str:
-    """Return the advice for a checkpoint that is missing or incomplete."""
+    """Return the advice, for a message, on a checkpoint that is missing or incomplete."""
     if Path(card.weights or "").is_absolute():
         return "copy the checkpoint again, or give another directory"
     return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"

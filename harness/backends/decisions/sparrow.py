@@ -20,7 +20,7 @@ SUFFIX = ".sparrow"
 
 
 def find(card: Card) -> Path:
-    """Return the file of a card's weights: a path, or the name of a model that the package has.
+    """Return the file of a card's sparrow-decider weights: a path, or one that the package has.
 
     Raises UserError if there is none.
     """
@@ -45,7 +45,7 @@ def find(card: Card) -> Path:
 
 
 def open(card: Card, **_: Any) -> "Sparrow":
-    """Load a card's model. Raises UserError if it is not found or is no model."""
+    """Return the backend of a card's sparrow-decider model. Raises UserError if it has none."""
     from sparrow_decider import Decider
 
     file = find(card)
@@ -60,13 +60,13 @@ def open(card: Card, **_: Any) -> "Sparrow":
 
 
 class Sparrow:
-    """Answers the questions of decisions, one after the other."""
+    """A backend of a sparrow-decider model, which answers requests in mode `decision` in turn."""
 
     def __init__(self, model: Any, file: Path) -> None:
         self._model, self._file = model, file
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return one completion per request, as the package's own server would answer it."""
+        """Return one completion a request, in order, as the package's own server would answer."""
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:
@@ -82,7 +82,7 @@ class Sparrow:
         return replace(completion, seconds=seconds, first_token_s=seconds)
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return what each request asks, as JSON."""
+        """Return for each request the state and the question that the model gets, as JSON."""
         from harness.backends.decisions.wires import asked_of, questions
 
         return [
@@ -91,7 +91,7 @@ class Sparrow:
         ]
 
     def identity(self) -> dict[str, Any]:
-        """Return the package's version, and the model by its name and digest."""
+        """Return the package's version, and the model's name and SHA-256 digest."""
         ours = {"engine": "sparrow", "answers": BUILT_IN["sparrow"].answers}
         package = version("sparrow-decider")
         return {

@@ -25,14 +25,14 @@ Shares = Iterable[tuple[Any, Any]]  # each option with its probability, as state
 
 
 def asked_of(request: Request) -> Question:
-    """Return the question of a decision. Raises ValueError if a request has none."""
+    """Return the typed question of a request. Raises ValueError if it has none."""
     if request.question is None:
         raise ValueError(f"request {request.id} asks no question; only --answer decision does")
     return request.question
 
 
 def questions(request: Request) -> dict[str, Any]:
-    """Return the question as System One has it, its options in the order of the actions."""
+    """Return a request's question as System One's API takes it, options in order of the actions."""
     question = asked_of(request)
     meant: Any = {action: question.meanings[action] for action in request.actions}
     if question.kind == "score":
@@ -80,7 +80,10 @@ def _decisions(
 
 
 def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
-    """Read an answer to `POST /v1/systemone`, without its time; a malformed one is an error."""
+    """Return the completion in a reply of `POST /v1/systemone`; one with an error if malformed.
+
+    The completion has no time.
+    """
     try:
         shares = _shares(payload["answers"][NAME], "noul", lambda listed: listed.items())
     except (LookupError, TypeError, AttributeError):
@@ -89,7 +92,10 @@ def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Co
 
 
 def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
-    """Read an answer to `POST /v1/decisions`, without its time; a malformed one is an error."""
+    """Return the completion in a reply of `POST /v1/decisions`; one with an error if malformed.
+
+    The completion has no time.
+    """
     try:
         [answer] = payload["answers"]
         shares = _shares(
@@ -149,10 +155,10 @@ DECISIONS = Wire("decisions", "/decisions", _decisions, read_decisions, _remedy,
 
 
 def open_systemone(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
-    """Connect to servers that answer `POST /v1/systemone`, as `OpenAIBackend` does."""
+    """Return the backend of servers that answer `POST /v1/systemone`, as `OpenAIBackend` does."""
     return OpenAIBackend(card, batch_size, SYSTEMONE)
 
 
 def open_decisions(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
-    """Connect to servers that answer `POST /v1/decisions`, as `OpenAIBackend` does."""
+    """Return the backend of servers that answer `POST /v1/decisions`, as `OpenAIBackend` does."""
     return OpenAIBackend(card, batch_size, DECISIONS)

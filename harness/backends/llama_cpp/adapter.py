@@ -25,10 +25,10 @@ _PERMUTED: Mapping[str, Mapping[str, str]] = {
 
 
 def find_adapter_gguf(card: Card, base: Path) -> Path | None:
-    """Return the GGUF file of a card's adapter to the GGUF file `base`; None without an adapter.
+    """Return the GGUF file of a card's LoRA adapter, for the model file `base`; else None.
 
-    It is the one in the adapter's folder, or else made of the safetensors file there.
-    Raises UserError if it cannot be made.
+    It is the one in the adapter's folder, or made of the safetensors file there and kept in the
+    cache folder. Raises UserError if it cannot be made.
     """
     if (folder := find_adapter(card)) is None:
         return None

@@ -35,7 +35,10 @@ LOOK_S = 10.0  # time between two checks whether the process is stopped
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> "LlamaBackend":
-    """Find and load a card's weights."""
+    """Return the backend of a card's GGUF file, loaded by llama.cpp in a child process.
+
+    Raises UserError if the file is not found, does not load, or an option is not allowed.
+    """
     if dtype not in (None, "auto"):
         raise UserError(
             f"dtype {printable(dtype)!r}; a GGUF file has its own: leave it out, or give auto"
@@ -48,18 +51,19 @@ class _Died(Exception):
 
 
 class Child:
-    """The backend that an opener returns, opened and asked in a child process.
+    """A backend that runs in a child process, so that a crash of its engine ends no run.
 
-    The backend measures seconds inside the child. After a death, the same requests are asked again
+    Its seconds are measured in the child. After a death, the same requests are asked again
     together, since a different batch may move an answer by rounding. If that kills the engine, too,
-    they are asked one at a time, and a request that kills it again becomes a completion with an
-    error. A process that stays stopped is killed.
+    they are asked one at a time, and one that kills it again gets a completion with an error. A
+    process that stays stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
-        """Open a model's backend by `module:function`, called in the child with pickled arguments.
+        """Open a backend in a child process by `opener`, `module:function`, with pickled arguments.
 
-        Raises UserError if the opener raised it, or its process died `LOADS` times.
+        `name` is the model's in messages. Raises UserError if the opener raised it, or its process
+        died `LOADS` times.
         """
         self._name = name
         self._opener = opener, arguments, options
@@ -85,7 +89,7 @@ class Child:
         return prompts
 
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
-        """Return an attribute of the backend by its dotted name; call it if it is a method.
+        """Return an attribute of the child's backend by dotted name, or the result if a method.
 
         Raises UserError if the backend raised it, or died of the call.
         """
@@ -168,7 +172,7 @@ class Child:
 
 
 class LlamaBackend(Child):
-    """A GGUF file loaded in a child process; its chat template is rendered here."""
+    """A backend of a GGUF file that a child process has loaded; prompts are rendered here."""
 
     def __init__(self, card: Card, file: Path, device: str | None, batch_size: int) -> None:
         self.batch_size = batch_size

@@ -22,15 +22,14 @@ _FIELDS = c.llama_batch._fields_
 
 
 class LlamaContext:
-    """Sequences by number, 0 to n-1, each a list of `tokens` whose keys and values are computed.
+    """Hold numbered token sequences whose keys and values llama.cpp has computed.
 
-    Negative tokens are a picture's. A sequence may be cut before or after a picture,
-    but not inside.
-
-    All sequences have equal room. (llama.cpp can also share one memory, but then each sequence
-    would attend to all the others' tokens, if only to mask them.) The memory is allocated when it
-    is first needed. When a sequence has filled its room, the memory is replaced by one of twice the
-    size and filled again from the tokens. Keys and values are `F32` for F32 weights, or else `F16`.
+    Sequences have numbers from 0 to n-1; `tokens` has the token ids of each. Negative ids are a
+    picture's; a sequence may be cut before or after a picture, but not inside. All have equal room
+    in memory that is allocated at first need; when one has filled it, memory of twice the size is
+    allocated and all are computed again. (llama.cpp can also share one memory, but then each
+    sequence would attend to all the others' tokens, if only to mask them.) Keys and values are
+    `F32` for F32 weights, or else `F16`.
     """
 
     def __init__(
@@ -46,7 +45,7 @@ class LlamaContext:
         self._ends: dict[int, list[int]] = {}  # the position after each token
 
     def fork(self, source: int, copy: int, length: int) -> None:
-        """Start a new sequence with the computed first `length` tokens of another."""
+        """Make sequence `copy` of the first `length` computed tokens of sequence `source`."""
         if length:  # llama.cpp can only copy a whole sequence, so the copy is cut afterwards
             c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
             c.llama_memory_seq_rm(self._memory(), copy, self._ends[source][length - 1], -1)
@@ -58,7 +57,7 @@ class LlamaContext:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
     def cut(self, sequence: int, length: int) -> None:
-        """Cut a sequence to its first `length` tokens; a recurrent state is computed again."""
+        """Cut a sequence to its first `length` tokens; recurrent models compute it again."""
         tokens = self.tokens[sequence][:length]
         if self._model.whole_state:
             self.drop(sequence)
@@ -69,15 +68,15 @@ class LlamaContext:
             self.tokens[sequence], self._ends[sequence] = tokens, self._ends[sequence][:length]
 
     def reserve(self, room: int) -> None:
-        """Allocate memory for `room` tokens of each sequence, if there is none yet."""
+        """Allocate memory for `room` tokens of each sequence, if none is allocated yet."""
         if not self._context:
             self._make(room)
 
     def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
-        """Append a chunk, none empty, to each of some sequences;
-        return the logits after it, (n, vocabulary).
+        """Append tokens, none empty, to some sequences; return logits after, `(n, vocabulary)`.
 
-        Raises RuntimeError if llama.cpp fails; all sequences are lost then.
+        `chunks` has token ids by sequence number; logits are in that order. Raises RuntimeError if
+        llama.cpp fails; all sequences are lost then.
         """
         try:
             logits = self._decode(chunks)

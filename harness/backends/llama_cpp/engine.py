@@ -37,7 +37,10 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 
 
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
-    """Load a GGUF file in this process, which llama.cpp may abort."""
+    """Return the backend of a GGUF file loaded in this process, which llama.cpp may abort.
+
+    Raises UserError if it does not load, or the batch size is too large.
+    """
     # a backtrace would start a debugger if there is one
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")
     most = c.llama_max_parallel_sequences() - BEGINNINGS
@@ -61,7 +64,10 @@ class _Group(NamedTuple):
 
 
 class LlamaEngine:
-    """A loaded GGUF file with memory for `batch_size` sequences and some beginnings of prompts."""
+    """An engine of a loaded GGUF file, with memory for `batch_size` sequences.
+
+    It also keeps some beginnings of prompts, so that later prompts read only the rest.
+    """
 
     def __init__(
         self,
@@ -90,7 +96,7 @@ class LlamaEngine:
         return self._projector.tokens(image)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> "LlamaSession":
-        """Read some prompts; all logits are float32, `exact` or not.
+        """Return a session that has read these prompts; all logits are float32, `exact` or not.
 
         A beginning is kept for later calls, unless half of it is part of one that is kept already.
         """
@@ -161,8 +167,9 @@ class LlamaEngine:
         self._beginnings.append(beginning)
 
     def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
-        """Return the logits after some tokens more of sequences by place,
-        which stay as they are.
+        """Return the logits after further tokens of some sequences, which then drop these tokens.
+
+        `chunks` has the tokens by sequence number; the logits are `(n, vocabulary)`.
         """
         lengths = {place: len(self.context.tokens[place]) for place in chunks}
         logits = self.context.extend(chunks)
@@ -171,7 +178,7 @@ class LlamaEngine:
         return logits
 
     def forget(self) -> None:
-        """Free the memory, too: where its sequences lie moves numbers by rounding."""
+        """Drop kept beginnings and free the memory: where sequences lie moves numbers."""
         self.context.free()
         self._set_places()
 
@@ -187,8 +194,9 @@ class LlamaEngine:
         self._free += places
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers:
-        llama.cpp's build, and the file by hub commit or by content.
+        """Return what decides the answers: llama.cpp's build, the file, and settings.
+
+        The file is named by its commit on the hub, or else by its SHA-256 digest.
         """
         commit = hub_commit(self._file.parent)
         identity: dict[str, Any] = {
@@ -225,7 +233,7 @@ class LlamaEngine:
 
 
 class LlamaSession(Session):
-    """Sequences that advance together."""
+    """A session of sequences in a `LlamaEngine`."""
 
     def __init__(self, engine: LlamaEngine, places: list[int], logits: Logits) -> None:
         self._engine = engine

@@ -17,13 +17,13 @@ _errors: list[str] = []
 
 @c.llama_log_callback  # type: ignore[untyped-decorator]
 def keep_errors(level: int, text: bytes, _: Any) -> None:
-    """Keep errors for the user's one line, and drop all other log messages."""
+    """Keep llama.cpp's error messages for `last_error`, and drop its other log messages."""
     if level == _ERROR:
         _errors.append(text.decode(errors="replace").strip())
 
 
 def last_error() -> str:
-    """Return the first error that llama.cpp has logged since the last call, made safe to show."""
+    """Return the first error logged since the last call, as one line, and forget the others."""
     reason = (
         printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
     )
@@ -32,9 +32,7 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """A loaded model, perhaps with a LoRA adapter,
-    and the `harness.backends.chat.Tokenizer` in its file.
-    """
+    """A GGUF file loaded by llama.cpp, perhaps with a LoRA adapter; also its `Tokenizer`."""
 
     def __init__(
         self, name: str, file: Path, device: str | None, adapter: Path | None = None
@@ -91,7 +89,7 @@ class LlamaModel:
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
 
     def adapt(self, context: int) -> None:
-        """Have a new context of the model heed the adapter, if there is one."""
+        """Apply the LoRA adapter, if there is one, to a new llama.cpp context of this model."""
         if self._adapter:
             adapters = (c.llama_adapter_lora_p_ctypes * 1)(self._adapter)
             if c.llama_set_adapters_lora(context, adapters, 1, (ctypes.c_float * 1)(1.0)):

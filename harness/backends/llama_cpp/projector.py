@@ -25,41 +25,43 @@ MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
-    """Tokens that llama.cpp reads together."""
+    """Hold tokens of one text or picture, which llama.cpp reads in one call."""
 
     inputs: NDArray[Any]  # token ids, (n,) int32, or embeddings, (n, width) float32
     places: NDArray[np.int32]  # relative to the first, (1, n); with M-RoPE a picture's are (4, n)
     span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:
-        """Return the tokens' positions from `start`;
-        the fourth row is not a position and stays 0.
+        """Return the positions of the tokens from `start`, shaped as `places`.
+
+        The fourth row, with M-RoPE, is no position and stays 0.
         """
         shifted = self.places + np.int32(start)
         shifted[3:] = 0
         return shifted
 
     def ends(self, start: int) -> Sequence[int]:
-        """Return the position after each token;
-        for a picture, the position after the whole picture.
-        """
+        """Return the position after each token; for a picture's, that after the whole picture."""
         n = len(self.inputs)
         return range(start + 1, start + n + 1) if self.inputs.ndim == 1 else [start + self.span] * n
 
 
 def text_run(ids: Sequence[int]) -> Run:
-    """Return the run of a text."""
+    """Return the run of a text's token ids."""
     return Run(np.array(ids, dtype=np.int32), np.arange(len(ids), dtype=np.int32)[None], len(ids))
 
 
 class Projector:
-    """A loaded projector. It encodes a picture when its tokens are first read,
-    in an answer's time.
+    """The loaded GGUF file of a vision encoder, which turns pictures into embeddings.
+
+    A picture is encoded when its tokens are first read, in an answer's time.
     """
 
     def __init__(self, name: str, file: Path, model: LlamaModel, vision: Vision) -> None:
-        """Load a projector. Raises UserError if it is none, not of this model,
-        or not what the card says.
+        """Load a vision encoder's file for a model.
+
+        Raises UserError if it is none, not of this model, or makes another number of tokens than
+        the card says.
         """
         shown = f"model {name!r} with projector {printable(file)}"
         try:
@@ -108,8 +110,9 @@ class Projector:
             )
 
     def tokens(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture;
-        the `Image` must stay alive until they are read.
+        """Return the token ids that stand for a picture in a prompt.
+
+        Ids of the picture itself are negative. The `Image` must stay alive until they are read.
         """
         layout = self._layout(image.pixels.shape[:2])
         count = sum(part for part in layout if isinstance(part, int))
@@ -120,8 +123,9 @@ class Projector:
         return tokens
 
     def run(self, token: int) -> Run:
-        """Return the part of a picture that begins with a token.
-        Raises LookupError if it is gone.
+        """Return the encoded part of a picture that begins with a negative token id.
+
+        Raises LookupError if the picture is no longer alive.
         """
         number, place = locate_picture(token)
         [runs] = self._pictures.encodings([number])

@@ -35,23 +35,22 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
-    """Connect to a card's servers. Raises UserError if none answers or takes the key,
-    or models differ.
+    """Return the backend of a card's servers. Raises UserError if their models differ.
+
+    Raises Unanswered if none answers, or one refuses the key.
     """
     return OpenAIBackend(card, batch_size)
 
 
 class OpenAIBackend:
-    """A model behind one or several servers.
+    """A backend of a model behind one or several servers with OpenAI's API.
 
     Requests are sent concurrently, at most `window` at once and each by itself, so `complete` may
     be called during another call. Connections stay open between calls.
     """
 
     def __init__(self, card: Card, batch_size: int, wire: Wire = CHAT) -> None:
-        """Connect to a card's servers.
-        Raises what `open` raises, and ValueError without a server.
-        """
+        """Connect to a card's servers. Raises as `open`, and ValueError if the card has none."""
         if (server := card.server) is None:
             raise ValueError(f"card {card.name} has no server")
         self._card = card
@@ -81,22 +80,19 @@ class OpenAIBackend:
         with failed attempts and the waits between them; an answer that never came has its time,
         too. The first request opens a connection, which later ones reuse. Only `timed` requests are
         streamed: in a stream some servers count no tokens, or separate thoughts differently. Raises
-        UserError if no server is left, or one has come back with another model.
+        Unanswered if no server is left, and UserError if one has come back with another model.
         """
         return self._loop.run(self._all(requests))
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return the JSON that the server is sent for each request,
-        with its picture as a digest.
-        """
+        """Return the JSON that the server is sent for each request; a picture is a digest."""
         return [
             canonical_json(self._wire.body(self._card, self._server, r, digest_url))
             for r in requests
         ]
 
     def identity(self) -> dict[str, Any]:
-        """Return the model's identity as its servers state it;
-        what none of them states goes undetected.
+        """Return what decides answers, as far as the servers state it of their model.
 
         If any of several servers may answer, their URLs are not part of it: they are `several`.
         """
@@ -111,14 +107,12 @@ class OpenAIBackend:
 
     @property
     def several(self) -> Sequence[str]:
-        """The servers' addresses if any of them may answer;
-        empty if there is one, which the identity has.
-        """
+        """The servers' addresses if any of them may answer; empty if there is only one."""
         return self._server.urls if self._server.any_may_answer else ()
 
     @property
     def doubt(self) -> str | None:
-        """Why a cached answer may be one of other weights; None if the servers tell of these."""
+        """Why cached answers may be of other weights; None if servers state a digest or size."""
         if self._pool.model.tells_weights:
             return None
         return (

@@ -38,7 +38,10 @@ _SHOWN = 40  # characters of an answer that an error shows
 
 @lru_cache
 def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
-    """Return the fields that ask a kind of server for a constrained answer of a shape."""
+    """Return the request fields by which a kind of server constrains answers to a form.
+
+    Depending on the kind they hold a regular expression, a grammar or a JSON Schema.
+    """
     schema = constrained_schema(shape)
     match _BY_PATTERN.get(kind):
         case "regex":
@@ -50,10 +53,10 @@ def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
 
 
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
-    """Return where an answer breaks the constraint that was sent, in words; None if it keeps to it.
+    """Return where an answer breaks the constraint that was sent, in words; None if nowhere.
 
-    `text` is without a thought that the server took out.
-    If the model has not `ended` it, it need only be the beginning of what fits.
+    `text` is without a thought that the server took out. If the model has not `ended` it, it need
+    only be the beginning of what fits.
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:

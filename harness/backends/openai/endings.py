@@ -42,7 +42,9 @@ _ENDINGS = {word: ending for ending, words in _WORDS.items() for word in words}
 
 
 def ending(finish_reason: Any) -> Ending:
-    """Return what a server's reason to finish means:
-    `broken` is an answer that its server did not finish.
+    """Return what a server's `finish_reason` means, in one of five words.
+
+    They are `done`, `cut` (by a token limit), `filtered`, `refused`, and `broken` (not finished by
+    the server). An unknown reason counts as `done`.
     """
     return _ENDINGS.get(str(finish_reason).casefold().replace("-", "_"), "done")

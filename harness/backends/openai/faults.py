@@ -17,9 +17,7 @@ _REASON = ("metadata", "raw")  # where a router puts the words of the server beh
 
 
 class Fault(NamedTuple):
-    """An error in the server's words, of any length,
-    and the HTTP status that it would have had, if known.
-    """
+    """Hold an error in a server's own words, and the HTTP status it would have had, if known."""
 
     words: str
     code: int | None = None
@@ -27,18 +25,12 @@ class Fault(NamedTuple):
 
 
 def may_pass(status: int) -> bool:
-    """Return whether another attempt may succeed after an HTTP status:
-    a server is busy or broke down.
-
-    What it never learnt to do (501) it does not do the next time.
-    """
+    """Return whether another attempt may succeed after an HTTP status: 429, or 5xx but 501."""
     return status == 429 or (status >= 500 and status != 501)
 
 
 def error_words(payload: Any) -> str:
-    """Return an error's words, which servers put at `error`, `error.message`,
-    `message` or `detail`.
-    """
+    """Return the words in an error's JSON, at `error`, `error.message`, `message` or `detail`."""
     reason = None
     try:
         while isinstance(payload, dict):
@@ -52,10 +44,9 @@ def error_words(payload: Any) -> str:
 
 
 def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
-    """Return the error in a JSON value that came with HTTP 200, or in an event of a stream;
-    None without one.
+    """Return the error in JSON that came with HTTP 200, or in a stream's event; else None.
 
-    Where a chat completion is due (`of_chat`), a bare text, or words without any choice,
+    With `of_chat`, where a chat completion is expected, a bare text, or words without any choice,
     are an error as well.
     """
     if of_chat and isinstance(payload, str) and payload.strip():
@@ -82,8 +73,9 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
 
 
 def plain_text(data: bytes | bytearray) -> str | None:
-    """Return a body that is words of a server;
-    None if it is empty, markup, broken JSON or no text.
+    """Return a reply's bytes as one line of text, if they are words and not data.
+
+    None if they are empty, markup, broken JSON or no UTF-8.
     """
     with suppress(UnicodeDecodeError):
         text = " ".join(data.decode().split())

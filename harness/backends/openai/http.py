@@ -39,7 +39,7 @@ _UNREACHED = (
 
 
 class Reply(Struct, frozen=True):
-    """Result of one request."""
+    """Hold what came of one request to a server: a JSON value, or a fault in words."""
 
     payload: Any = None  # the JSON value; None on a fault
     fault: str | None = None  # why there is no payload; printable and of limited length
@@ -55,8 +55,9 @@ class Reply(Struct, frozen=True):
 
 
 class Client:
-    """Sends requests to servers with one key.
-    Redirects are not followed, since they would carry the key.
+    """An HTTP client for a model's servers, which sends them one key and never shows it.
+
+    Used as an asynchronous context. Redirects are not followed, since they would carry the key.
     """
 
     def __init__(self, server: Server) -> None:
@@ -80,7 +81,11 @@ class Client:
         await self._session.close()
 
     async def get(self, base: str, url: str, content: bytes | None = None) -> Reply:
-        """Request what a server states at a URL; with JSON as `content` it is sent that."""
+        """Return the reply to a GET of a URL, or to a POST of JSON if `content` is given.
+
+        For what a server states of itself, within `CONNECT_S` seconds. `base` is the server's base
+        URL.
+        """
         method = "GET" if content is None else "POST"
         return await self._once(method, base, url, content, min(CONNECT_S, self._server.timeout_s))
 

@@ -16,25 +16,28 @@ SWITCH = "enable_thinking"  # name of the thinking switch in chat templates
 
 
 class ServerKind:
-    """A kind of server that says nothing but its list of models."""
+    """Describe how a kind of server is recognised, and what it can tell of its model.
+
+    This base class is of a server that has nothing but a list of models.
+    """
 
     path = ""  # where it tells that it is one; empty if nowhere
 
     def is_one(self, said: Mapping[str, Any]) -> bool:
-        """Return whether what a server says at `path` tells that it is one."""
+        """Return whether the JSON that a server has at `path` shows that it is of this kind."""
         return False
 
     async def states(self, model: str, ask: Ask) -> Statement:
-        """Return what a server states of a model, by its name there."""
+        """Return the server's version, or None, and what it states of the model by that name."""
         return None, {}
 
     async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
-        """Return a model's chat template, empty if it is not told, and how the model thinks."""
+        """Return the model's chat template, empty if unknown, and how the model thinks."""
         return "", "none"
 
 
 class LlamaServer(ServerKind):
-    """llama.cpp's server."""
+    """The kind of llama.cpp's own server, llama-server."""
 
     path = "/props"
 
@@ -65,7 +68,7 @@ class LlamaServer(ServerKind):
 
 
 class LMStudio(ServerKind):
-    """LM Studio."""
+    """The kind of LM Studio's server."""
 
     path = "/api/v0/models"
 
@@ -77,7 +80,7 @@ class LMStudio(ServerKind):
 
 
 class Ollama(ServerKind):
-    """Ollama."""
+    """The kind of Ollama's server."""
 
     path = "/api/version"
 
@@ -103,7 +106,7 @@ class Ollama(ServerKind):
 
 
 class LlamaCppPython(ServerKind):
-    """The server of llama-cpp-python."""
+    """The kind of llama-cpp-python's server."""
 
     path = "/openapi.json"
 
@@ -112,14 +115,15 @@ class LlamaCppPython(ServerKind):
 
 
 class VLLM(ServerKind):
-    """vLLM, which says that it is one in its list of models."""
+    """The kind of vLLM's server, which is recognised by its list of models."""
 
     async def states(self, model: str, ask: Ask) -> Statement:
         return fields_of(await ask("/version", None)).get("version"), {}
 
     async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
-        """Ask whether a request can turn thinking off:
-        another prompt is made of the same messages then.
+        """Return no template, and `switch` if a request's switch changes the prompt's length.
+
+        The server's `/tokenize` counts the same messages with thinking on and off.
         """
         chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
         counts = []
@@ -141,7 +145,7 @@ SERVER_KINDS: Mapping[Kind, ServerKind] = {
 
 
 async def kind_of(ask: Ask) -> Kind:
-    """Return which kind of server answers as only one kind does; `generic` if none does."""
+    """Return the kind of a server, by what it answers at each kind's `path`; or `generic`."""
     known = {kind: server for kind, server in SERVER_KINDS.items() if server.path}
     replies = await asyncio.gather(*(ask(server.path, None) for server in known.values()))
     for (kind, server), reply in zip(known.items(), replies, strict=True):
@@ -151,12 +155,12 @@ async def kind_of(ask: Ask) -> Kind:
 
 
 def fields_of(reply: Reply) -> dict[str, Any]:
-    """Return the fields of a reply; none if it is no JSON object."""
+    """Return a reply's JSON object; an empty dict if its payload is none."""
     return reply.payload if isinstance(reply.payload, dict) else {}
 
 
 def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
-    """Return the entry of a model in a list of models, or the only one; None if there is none."""
+    """Return the entry of a model in a server's list at `key`, or its only entry; else None."""
     listed = payload.get(key) if isinstance(payload, dict) else None
     entries = (
         [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
@@ -169,7 +173,7 @@ def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
 
 
 def as_text(value: Any) -> str:
-    """Return a text as it is, and any other value as JSON."""
+    """Return a text as it is, and any other value as JSON text."""
     with suppress(RecursionError):
         return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return "nested too deeply"

@@ -59,14 +59,15 @@ class _Pending:
 
 
 def pause_s(times: int) -> float:
-    """Return the seconds to wait after `times` waits in a row."""
+    """Return the seconds to wait before the next attempt, after `times` waits in a row."""
     return float(min(FIRST_WAIT_S * 2 ** min(times, 32), LONGEST_WAIT_S))
 
 
 class ServerPool:
-    """The servers of a model, and what all of them state of it (`model`).
+    """Distribute requests over a model's servers, retry them, and avoid broken servers.
 
-    It runs in one event loop, inside `async with` of the client.
+    `model` is what all servers state of their model. It works in one event loop, inside `async
+    with` of the client.
     """
 
     def __init__(
@@ -74,8 +75,8 @@ class ServerPool:
     ) -> None:
         """Prepare a pool, which `open` connects.
 
-        One server gets `at_once` requests at most, from all workers together,
-        each at the `path` behind its base URL.
+        Each server gets at most `at_once` requests at a time, from all workers together, at `path`
+        behind its base URL. `name` is the model's in messages, `weights` its name at the servers.
         """
         self._client, self._settings = client, settings
         self._name, self._weights = printable(name), weights
@@ -90,10 +91,10 @@ class ServerPool:
         self.model = Model()
 
     async def open(self) -> None:
-        """Ask every server for its model. One that does not answer is set aside if another does.
+        """Ask every server for its model; one that does not answer is avoided if another does.
 
-        Raises UserError if two have different models,
-        Unanswered if none answers or one refuses the key.
+        Raises UserError if two have different models, Unanswered if none answers or one refuses the
+        key.
         """
         models = await asyncio.gather(*(self._look(server) for server in self._servers))
         answering = {
@@ -112,12 +113,13 @@ class ServerPool:
                 self._set_aside(server)
 
     async def post(self, key: str, build: Callable[[], Mapping[str, Any]]) -> Reply:
-        """Send a request; return the reply once there is an answer, or the retries are used up.
+        """Return a server's reply to a request, after retries if they are needed.
 
-        If a server is busy (429), breaks down (5xx), is not reached or takes too long, the request
-        is tried again: at once at another server, or at the same one after the wait that it asks
-        for, or else a doubling one. Raises UserError if one has come back with another model,
-        Unanswered if no server is left.
+        `key` ranks the servers, so that requests with one key share a prompt cache; `build` makes
+        the body when it is sent. If a server is busy (429), breaks down (5xx), is not reached or
+        takes too long, the request is tried again: at once at another server, or at the same one
+        after the wait that it asks for, or else a doubling one. Raises UserError if one has come
+        back with another model, Unanswered if no server is left.
         """
         if self._refused:
             raise self._refused

@@ -19,11 +19,11 @@ LONGER = 1.5  # times as many characters have more tokens
 
 
 class PromptCheck:
-    """Asks a model's servers, before the first answer of each role, what the model reads.
+    """Check that a served model reads every message, before the first answer of each role.
 
     llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without
     an answer. Of another server only the token counts of its answers are known: `fault` says if
-    they do not grow with the prompts. Prompts with pictures are not asked about.
+    they do not grow with the prompts. Prompts with pictures are not checked.
     """
 
     def __init__(self, client: Client, card: Card, server: Server) -> None:
@@ -34,7 +34,10 @@ class PromptCheck:
         self._alone = asyncio.Lock()
 
     async def check(self, requests: Sequence[Request]) -> None:
-        """Ask about the first request of each role. Raises UserError if a text is left out."""
+        """Ask the servers about the first request of each role.
+
+        Raises UserError if the chat template leaves out a message's text.
+        """
         if self._server.kind not in ("llama-server", "vllm"):
             return
         async with self._alone:
@@ -45,7 +48,7 @@ class PromptCheck:
                     self._asked.add(request.role)
 
     def fault(self, request: Request, tokens: int | None) -> str | None:
-        """Return what is wrong with a server's count of a prompt's tokens; None if nothing is.
+        """Return why a prompt may have been cut, by the server's count of its tokens; else None.
 
         Some servers cut long prompts to their context in silence, as Ollama does.
         """

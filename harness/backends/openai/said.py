@@ -21,14 +21,13 @@ _FIELDS = {
 
 
 class NoText(TypeError):
-    """A part of a content that is no text; the message says which, in a line."""
+    """The error of a message whose content has a part that is no text; it says which."""
 
 
 def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a message, or a piece of one,
-    whose content is a text even if it came as a list of parts.
+    """Return a server's message with its content as one text, also if it came in parts.
 
-    Thoughts and refusals among the parts go to their fields. Raises NoText for other parts.
+    Parts with thoughts and refusals go to their own fields. Raises NoText for other parts.
     """
     if not isinstance(message.get("content"), list):
         return message
@@ -57,7 +56,7 @@ def _text(part: Mapping[str, Any], kind: str) -> str:
 
 
 def thought(message: Mapping[str, Any]) -> str | None:
-    """Return the thought that a server took out of an answer, from the field that has one."""
+    """Return the thought that a server took out of an answer; None if it has no such field."""
     values = [message.get(name) for name in THOUGHTS]
     texts = [value for value in values if isinstance(value, str)]
     written = [text for text in texts if text]
@@ -65,6 +64,6 @@ def thought(message: Mapping[str, Any]) -> str | None:
 
 
 def refusal(message: Mapping[str, Any]) -> str | None:
-    """Return the words by which a model refuses; None if it does not."""
+    """Return the words in which a model refuses to answer; None if it does not."""
     words = message.get(REFUSAL)
     return words if isinstance(words, str) and words.strip() else None

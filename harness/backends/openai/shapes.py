@@ -41,22 +41,22 @@ _ALL: Mapping[Kind, Mapping[str, int]] = {
 
 
 def data_url(image: Image) -> str:
-    """Encode a picture as the URL that a server is sent."""
+    """Return a picture as a `data:` URL with its PNG bytes, as servers take it."""
     return f"data:image/png;base64,{b64encode(image.png()).decode()}"
 
 
 def digest_url(image: Image) -> str:
-    """Return the short URL that stands for a picture where a request is shown or stored."""
+    """Return a short URL with a picture's digest, for requests that are shown or stored."""
     return f"sha256:{image.sha256}"
 
 
 def body(
     card: Card, server: Server, request: Request, url: Callable[[Image], str] = data_url
 ) -> dict[str, Any]:
-    """Build the JSON request of one chat completion, not streamed;
-    `url` gives the URL of its picture.
+    """Return the JSON body of one chat completion request, not streamed.
 
-    Raises UserError if it has a temperature, which the card leaves out.
+    `url` makes the URL of its picture. Raises UserError if the request has a temperature and the
+    card sends none.
     """
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
     messages: list[Any] = []
@@ -98,9 +98,9 @@ def body(
 
 
 def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
-    """Read a chat completion, without its time.
+    """Return the completion in a server's reply to a chat completion request, without its time.
 
-    A malformed one, or one that breaks the constraint that this kind of server was sent, is an
+    A malformed reply, or one that breaks the constraint that this kind of server was sent, gives an
     error in one sentence. The text of a refusal is that of the model that refuses.
     """
     try:
@@ -197,15 +197,15 @@ def _read_out(
 
 
 def answering_model(payload: Any) -> str | None:
-    """Return the model that a server says has answered; None if it says none."""
+    """Return the model that a server names in its reply; None if it names none."""
     model = payload.get("model") if isinstance(payload, dict) else None
     return model if isinstance(model, str) else None
 
 
 def tokens_in(value: Any, characters: int = 0) -> int | None:
-    """Return a count of tokens as a server states it of so many characters; None if it is none.
+    """Return a token count that a server states of a text of so many characters, or None.
 
-    Latency and energy follow from counts, so one that the text cannot have is not taken.
+    None if it is no count, or too small or large for the text: latency and energy follow from it.
     """
     least = math.ceil(characters / MOST_CHARACTERS)
     return value if type(value) is int and least <= value <= MOST_TOKENS else None

@@ -49,7 +49,7 @@ _WEIGHTS = ("digest", "n_params", "size")
 
 
 class Model(NamedTuple):
-    """A server's statement about its model."""
+    """Hold what a server states of its model; part of the model's identity."""
 
     listed: dict[str, Any] | None = None  # name, owner, root and length in the server's list
     version: str | None = None  # version of the server; None if it does not tell
@@ -57,25 +57,21 @@ class Model(NamedTuple):
 
     @property
     def tells_weights(self) -> bool:
-        """Whether other weights under the same name would show, as a rule:
-        by a digest or their size.
-        """
+        """Whether it states a digest or size, which other weights of the same name would change."""
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Return whether it states all that an earlier one did;
-        a server that is loading states less.
-        """
+        """Return whether it states all that `earlier` did; a server still loading states less."""
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None
         return lists and tells_version and earlier.states.keys() <= self.states.keys()
 
 
 async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
-    """Return what a server states of a model,
-    by its answer to `/v1/models` and what else it is asked.
+    """Return what a server of a kind states of a model that it calls `weights`.
 
-    A server with one model accepts any name for it.
+    `models` is its reply at `/v1/models`, `ask` requests its other paths. A server with one model
+    accepts any name for it. Empty if the model is not in the list.
     """
     entry = entry_of(models, "data", weights)
     if entry is None:

@@ -20,7 +20,7 @@ _CUT_OFF = "the stream ends before the answer does"
 
 
 class Stream:
-    """The received part of one completion."""
+    """Assemble one streamed chat completion from received bytes."""
 
     def __init__(self) -> None:
         # Why it is no completion, with text of the server of any length; None once it is one.
@@ -39,7 +39,7 @@ class Stream:
         self._last_at_s: float | None = None
 
     def take(self, data: bytes, at_s: float) -> None:
-        """Add received bytes, which may be cut anywhere, and the time at which they came."""
+        """Add received bytes, cut anywhere, and the time they came at, by `time.perf_counter`."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             if not self._begun:
@@ -93,12 +93,13 @@ class Stream:
 
     @property
     def first_at_s(self) -> float | None:
-        """When the first text came; None if all text came at once,
-        so a buffer on the way hid the time.
+        """When the first text came, by `time.perf_counter`; None if it all came at once.
+
+        A buffer on the way then hid the time.
         """
         return None if self._first_at_s == self._last_at_s else self._first_at_s
 
     def payload(self) -> dict[str, Any]:
-        """Return the completion as a server would send it in one piece."""
+        """Return the completion as the JSON value that a server sends without streaming."""
         choice = {"message": {"content": "", **self._texts}, "finish_reason": self._finish}
         return {"choices": [choice], "usage": self._usage, "model": self._model}

@@ -9,16 +9,14 @@ _EITHER = zlib.MAX_WBITS | 32  # of gzip and of deflate, by the first bytes
 
 
 class Packed(Exception):
-    """An answer that cannot be unpacked; the message says why, in a line."""
+    """The error of a compressed reply that cannot be unpacked; its message says why."""
 
 
 class Unpacker:
-    """Unpacks the bytes of one answer as they come."""
+    """Unpack the bytes of one compressed HTTP reply as they come."""
 
     def __init__(self, coding: str) -> None:
-        """Unpack by a Content-Encoding, empty for none.
-        Raises Packed for one that is not known here.
-        """
+        """Prepare for a Content-Encoding, empty for none. Raises Packed for an unknown one."""
         self._coding = coding.strip().casefold()
         self._zlib = zlib.decompressobj(_EITHER) if self._coding in _ZLIB else None
         if self._zlib is None and self._coding not in ("", "identity"):
@@ -28,8 +26,9 @@ class Unpacker:
             )
 
     def take(self, data: bytes, most: int) -> bytes:
-        """Return what further bytes unpack to, `most` bytes at most.
-        Raises Packed if they are damaged.
+        """Return at most `most` bytes that further packed bytes hold.
+
+        Raises Packed if these are damaged.
         """
         if self._zlib is None:
             return data

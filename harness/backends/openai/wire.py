@@ -16,7 +16,7 @@ from harness.core.image import Image
 
 
 class Wire(NamedTuple):
-    """One shape of requests and answers."""
+    """Describe one API of servers: the path, how a request is written, how a reply is read."""
 
     engine: str  # the engine whose servers speak it
     path: str
@@ -27,8 +27,9 @@ class Wire(NamedTuple):
     decides: bool  # whether decision models are asked, which write nothing and render no chat
 
     def misfit(self, states: Mapping[str, Fact]) -> str | None:
-        """Return why a model is asked the wrong way, by what its server states of it;
-        None if it does not.
+        """Return why this API does not suit a model, by what its server states; None if it does.
+
+        A decision model writes no text, and other models answer no typed questions.
         """
         outputs = str(
             states.get("architecture.output_modalities", states.get("output_modalities", ""))

@@ -35,7 +35,10 @@ MOST_LAYERS = 10_000  # or experts; the largest models have some hundred
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> LanguageModel:
-    """Find and load a card's weights."""
+    """Return the backend of a card's checkpoint, loaded by the package transformers.
+
+    Raises UserError if the weights are not found, do not load, or an option is not allowed.
+    """
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
         raise UserError(f"dtype {printable(dtype)!r}; allowed: {', '.join(get_args(Dtype))}")
@@ -48,8 +51,9 @@ def open(
 
 
 def checkpoint(card: Card) -> Path:
-    """Return the directory of a card's checkpoint, held to the card's digest;
-    a GGUF file is unpacked.
+    """Return the directory of a card's checkpoint; a GGUF file is first unpacked into one.
+
+    Raises UserError if it is not found, not complete, or not of the card's digest.
     """
     if not is_gguf(card):
         where = find_checkpoint(card)
@@ -65,8 +69,9 @@ def checkpoint(card: Card) -> Path:
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
-    """Load the tokenizer and the model of a checkpoint.
-    Raises UserError if they do not go together.
+    """Return the tokenizer and the model of the checkpoint in `where`, on a device.
+
+    Raises UserError if it does not load, lacks weights, or the two do not go together.
     """
     import transformers
 
@@ -143,8 +148,9 @@ def _check_config(card: Card, where: Path) -> None:
 
 
 def choose_device(asked: str | None) -> str:
-    """Return the device that a user names; None means CUDA if there is any.
-    Raises UserError if missing.
+    """Return the torch device that a user names; for None CUDA if there is any, else CPU.
+
+    Raises UserError if this machine does not have it.
     """
     import torch
 
@@ -159,7 +165,7 @@ def choose_device(asked: str | None) -> str:
 
 
 def gpus() -> list[str]:
-    """Return the names of the GPUs that torch sees; empty if torch is not installed."""
+    """Return the names of the GPUs that torch sees; empty without torch."""
     try:
         import torch
     except ImportError:
@@ -168,9 +174,7 @@ def gpus() -> list[str]:
 
 
 class TransformersEngine:
-    """A transformers model with its tokenizer and, if it takes pictures,
-    its image processor (`eyes`).
-    """
+    """An engine of a loaded transformers model, its tokenizer and perhaps image processor."""
 
     def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
         from harness.backends.transformers.eyes import Eyes
@@ -207,8 +211,9 @@ class TransformersEngine:
         self._reader.forget()
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers;
-        a hub checkpoint is named by its commit, others by their files.
+        """Return what decides the answers: versions, weights, number format and device.
+
+        A hub checkpoint is named by its commit, others by a digest of their files.
         """
         commit = hub_commit(self.where)
         identity: dict[str, Any] = {

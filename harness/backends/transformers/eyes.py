@@ -23,10 +23,10 @@ from harness.core.image import Image
 
 
 class Processor:
-    """A checkpoint's image processor, which makes `tokens` of a picture of the card's size."""
+    """A checkpoint's image processor; `tokens` is how many a picture of the card's size has."""
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
-        """Load the processor. Raises UserError if the checkpoint has none."""
+        """Load the image processor in `where`. Raises UserError if the checkpoint has none."""
         # slow, and needed for pictures alone
         from transformers import AutoConfig, AutoImageProcessor
 
@@ -62,8 +62,9 @@ class Processor:
         return inputs
 
     def measured(self, pixels: Pixels) -> tuple[int, Any]:
-        """Return the number of tokens of a picture of this size,
-        and its grid of patches if it has one.
+        """Return the number of tokens of a picture of this shape, and its grid of patches.
+
+        The grid is `image_grid_thw`, `(1, 3)`, or None if the model has none.
         """
         if pixels.shape not in self._of_size:
             inputs, config = self([pixels]), self._config.vision_config
@@ -78,13 +79,15 @@ class Processor:
 
 
 class Eyes:
-    """A loaded model's image processor and vision encoder;
-    a picture is `image_token` in its template.
+    """The image processor and vision encoder of a loaded transformers model.
+
+    A picture is `image_token` in the chat template.
     """
 
     def __init__(self, name: str, where: Path, vision: Vision, tokenizer: Any, model: Any) -> None:
-        """Load the processor. Raises UserError if there is none,
-        or it makes more or fewer tokens.
+        """Load the image processor of a model, which is in memory already.
+
+        Raises UserError if there is none, or it makes another number of tokens than the card says.
         """
         self._processor = Processor(name, where, vision)
         if difference := vision.difference(self._processor.tokens):
@@ -97,16 +100,18 @@ class Eyes:
         self.forget = self._pictures.forget
 
     def look(self, image: Image) -> list[int]:
-        """Return the tokens that stand for a picture;
-        the `Image` must stay alive until they are read.
+        """Return the token ids that stand for a picture, with markers around it.
+
+        Ids of the picture itself are negative. The `Image` must stay alive until they are read.
         """
         tokens = self._pictures.add(image, self._processor.measured(image.pixels)[0])
         return [*self._before, *tokens, *self._after]
 
     def encode(self, tokens: Iterable[int]) -> None:
-        """Encode the pictures of a prompt, its negative tokens, in one batch, and keep the result.
+        """Encode all pictures of a prompt in one batch, and keep the results.
 
-        Nothing happens where they are more than are kept: each is encoded when it is read.
+        `tokens` are the prompt's. Nothing happens where they are more than are kept: each is
+        encoded when it is read.
         """
         numbers = list(dict.fromkeys(pictures_in(tokens)))
         if len(numbers) <= KEPT:
@@ -114,9 +119,7 @@ class Eyes:
                 self._pictures.encodings(numbers)
 
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
-        """Return the model's inputs for tokens (n, width):
-        their ids, and their pictures in order.
-        """
+        """Return the model's inputs for token ids `(n, width)`: ids and encoded pictures."""
         numbers = pictures_in(ids.flatten().tolist())
         token_ids = torch.where(ids < 0, self._filled, ids).to(self._model.device)
         inputs: dict[str, Any] = {"input_ids": token_ids}
@@ -127,8 +130,9 @@ class Eyes:
         return inputs
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
-        """Return positions in time, height and width, (3, tokens);
-        None if the model numbers tokens.
+        """Return positions of a prompt's tokens in time, height and width, `(3, tokens)`.
+
+        None if the model numbers tokens consecutively.
         """
         if not hasattr(self._model.model, "get_rope_index"):
             return None
@@ -168,7 +172,10 @@ def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
 
 
 def count_tokens(card: Card) -> int:
-    """Return the number of tokens that a card's processor makes of a picture of the card's size."""
+    """Return how many tokens a card's processor makes of a picture of the card's size.
+
+    Raises ValueError if the card takes no pictures, UserError if there is no processor.
+    """
     if card.vision is None:
         raise ValueError(f"card {card.name} takes no pictures")
     return Processor(card.name, find_checkpoint(card), card.vision).tokens

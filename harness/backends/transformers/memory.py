@@ -18,8 +18,9 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 
 
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
-    """Return one cache of the rows of several, which are emptied, in an order;
-    short rows end in zeros.
+    """Return one key-value cache with the rows of several, in `order`; these are emptied.
+
+    Short rows end in zeros.
     """
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
@@ -33,8 +34,9 @@ def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
 
 
 class Prefix(NamedTuple):
-    """A beginning that was read: its tokens, and each layer's keys and values,
-    (1, heads, tokens, dim).
+    """Hold the beginning of a prompt that was read: its token ids, and their keys and values.
+
+    `layers` has each layer's keys and values, `(1, heads, tokens, dim)`.
     """
 
     ids: list[int]
@@ -45,16 +47,16 @@ NOTHING = Prefix([], [])
 
 
 class Prefixes:
-    """Keep the keys and values of recently read beginnings of prompts, a few;
-    the least recently used is dropped first.
+    """Keep the keys and values of a few recently read beginnings of prompts.
+
+    At most `MOST_TOKENS` in total; the least recently used is dropped first.
     """
 
     def __init__(self) -> None:
         self._kept: list[Prefix] = []
 
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
-        """Return the longest known beginning of a sequence;
-        `NOTHING` if it is below `LEAST_TOKENS`.
+        """Return the longest kept beginning of `ids`; `NOTHING` if below `LEAST_TOKENS` tokens.
 
         `but` is a whole prompt that is ignored although it was read before.
         """
@@ -72,7 +74,7 @@ class Prefixes:
         return any(kept.ids == ids for kept in self._kept)
 
     def keep(self, prefix: Prefix) -> None:
-        """Keep a beginning, and drop old ones above the limit."""
+        """Keep a beginning, and drop the least recently used above the limit."""
         self._kept = [*(kept for kept in self._kept if kept.ids != prefix.ids), prefix]
         while sum(len(kept.ids) for kept in self._kept) > MOST_TOKENS:
             del self._kept[0]

@@ -38,8 +38,9 @@ CPU_TOKENS = 1024
 
 
 class Reader:
-    """A model that reads prompts; `together` if sequences can be padded,
-    and so be read in one batch.
+    """Read prompts with a transformers model, and keep beginnings for later prompts.
+
+    `together` says whether sequences can be padded, and so be read in one batch.
     """
 
     def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
@@ -55,8 +56,9 @@ class Reader:
         self.together = self._positions and all(type(layer) is DynamicLayer for layer in layers)
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
-        """Read some prompts, none of them empty;
-        until the next call, `exact` logits are float32's.
+        """Return a session that has read these prompts, none of them empty.
+
+        Until the next call, logits of the token ids in `exact` are computed in float32.
         """
         self._exact = list(exact)
         # perhaps because memory ran out; the failed call has released its own by now
@@ -149,8 +151,9 @@ class Reader:
         return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
-        """Return the positions of each prompt's tokens, (3, tokens);
-        None if they are consecutive.
+        """Return the positions of each prompt's tokens, `(3, tokens)`.
+
+        None if all are consecutive, as without pictures.
         """
         if self._eyes is None or not any(token < 0 for prompt in prompts for token in prompt):
             return None
@@ -158,11 +161,11 @@ class Reader:
         return None if places[0] is None else places
 
     def forward(self, cache: Cache, ids: Any, mask: Any, columns: Any, places: Any) -> Any:
-        """Read tokens and return the logits after some columns, (n, columns, vocabulary).
+        """Read tokens, and return the logits after some columns, `(n, columns, vocabulary)`.
 
         Args:
             cache: keys and values so far, to which the new ones are added.
-            ids: tokens, (n, width), on the CPU.
+            ids: token ids, (n, width), on the CPU.
             mask: 1 for a token and 0 for a pad, (n, cached + width),
                 or what each token sees, (n, 1, width, cached + width), on the CPU.
             columns: after how many of the last columns, or after which.
@@ -189,12 +192,12 @@ class Reader:
 
 
 class Rows:
-    """A `Session` of sequences in one batch."""
+    """A session whose sequences are rows of one padded batch."""
 
     def __init__(self, reader: Reader, cache: Cache, mask: Any, logits: Any, places: Any) -> None:
-        """Hold what was read, and the logits after each sequence.
+        """Hold a batch that was read, and the logits after each sequence, `(n, vocabulary)`.
 
-        The mask is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the
+        `mask` is 1 for a token and 0 for a pad, (n, columns), on the CPU. `places` has the
         positions of each prompt's tokens; None if they are consecutive.
         """
         self._reader, self._cache, self._mask, self._logits = reader, cache, mask, logits
@@ -204,7 +207,10 @@ class Rows:
     def read(
         cls, reader: Reader, prefix: Prefix, prompts: Sequence[Sequence[int]], places: Any
     ) -> "Rows":
-        """Read prompts that all begin with `prefix` and are longer."""
+        """Return a session that has read prompts, which all begin with `prefix` and are longer.
+
+        `places` has the positions of each prompt's tokens; None if they are consecutive.
+        """
         n, known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
             cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
@@ -214,7 +220,7 @@ class Rows:
 
     @classmethod
     def join(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
-        """Return the sequences of several sessions as one, each at its place."""
+        """Return the sequences of several sessions as one, each at its given index."""
         if len(parts) == 1:
             return parts[0][1]
         order = torch.tensor([place for piece, _ in parts for place in piece]).argsort()
@@ -230,9 +236,7 @@ class Rows:
         return Rows(self._reader, deepcopy(self._cache), self._mask, self._logits, self._places)
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Return each layer's keys and values, (n, heads, tokens, dim);
-        advancing never alters them.
-        """
+        """Return each layer's keys and values, `(n, heads, tokens, dim)`; they stay valid."""
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
@@ -351,8 +355,9 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
 
 
 class Apart(Session):
-    """Sequences that are each read on their own:
-    what a window or a recurrent state reads stays read.
+    """A session whose sequences are each read on their own.
+
+    For models with a sliding window or a recurrent state, which padding would change.
     """
 
     def __init__(self, sessions: Sequence[Rows]) -> None:

@@ -27,8 +27,9 @@ _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
 def unpack_checkpoint(card: Card, file: Path) -> Path:
-    """Return the checkpoint of a GGUF file, made if it is not kept.
-    Raises UserError if it cannot be.
+    """Return a float32 checkpoint of a GGUF file, made once and kept in the cache folder.
+
+    Raises UserError if it cannot be made or written.
     """
     from transformers import __version__
 
