@@ -36,7 +36,10 @@ HEADLINE = {  # metrics of a run's own table, by their heads
 
 
 class Run(Tables):
-    """A finished run. A notebook shows its headline and a row for each condition."""
+    """A finished run, with its tables as data frames.
+
+    A notebook shows its headline and a row for each condition.
+    """
 
     def decision(self, scene: str, viewer: str | None = None) -> "DecisionPoint":
         """Return a decision point of the run.
@@ -96,7 +99,10 @@ class Run(Tables):
 
 @dataclass(frozen=True)
 class DecisionPoint:
-    """A decision point of a run. A notebook shows its picture, the answers and the decisions."""
+    """One decision point of a run: its scene, and the answers and decisions there.
+
+    A notebook shows its picture, the answers and the decisions.
+    """
 
     run: Run  # the run
     scene: "Scene"  # who is where, and what each vehicle sees
@@ -104,17 +110,17 @@ class DecisionPoint:
 
     @property
     def answers(self) -> "pd.DataFrame":
-        """The answers that were given here, rows of `Run.answers`."""
+        """The models' answers at this decision point, as rows of `Run.answers`."""
         return self.run.answers[self.run.answers.scene == self.scene.id]
 
     @property
     def decisions(self) -> "pd.DataFrame":
-        """The decisions that were made here, rows of `Run.decisions`."""
+        """The decisions at this point, one a condition and seed, as rows of `Run.decisions`."""
         return self.run.decisions[self.run.decisions.scene == self.scene.id]
 
     @cached_property
     def svg(self) -> str:
-        """The scene from above."""
+        """An SVG picture of the scene from above, with what `viewer` sees."""
         from harness.report.drawing.scene import draw
 
         picture = BytesIO()
@@ -139,8 +145,9 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Run B against run A. A notebook shows how success changed, how many answers,
-    and the differences.
+    """The comparison of run B with run A, on what both have.
+
+    A notebook shows how success changed, how many answers, and the differences.
     """
 
     report: Mapping[str, Any] = field(repr=False)  # what `harness compare --json` prints
@@ -149,9 +156,7 @@ class Comparison:
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """One row for each answer to the same question that changed:
-        both texts and both verdicts.
-        """
+        """One row for each answer to the same question that changed, with texts and verdicts."""
         import pandas as pd
 
         from harness.report.compare.text import ANSWERS, changed_answers
@@ -188,7 +193,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Study:
-    """A finished study. A notebook shows its outcome and its figures."""
+    """A finished study: its outcome in sentences, and its data.
+
+    A notebook shows its outcome and its figures.
+    """
 
     path: Path  # its folder, with `index.html`
     headline: Sequence[str]  # the outcome in sentences
@@ -287,8 +295,9 @@ def load(run: str | PathLike[str]) -> Run:
 
 
 def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
-    """List the runs and studies in a folder, newest first:
-    a row each, as `harness run ls` prints them.
+    """Return the runs and studies in a folder as rows, newest first.
+
+    The columns are those of `harness run ls`.
 
     Raises:
         UserError: there is no such folder.
@@ -301,7 +310,9 @@ def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
 
 
 def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Comparison:
-    """Compare run B with run A on the episodes, conditions and seeds that both have.
+    """Return the comparison of run B with run A.
+
+    It is on the episodes, conditions and seeds that both have.
 
     Raises:
         UserError: one is no finished run, or they have nothing to be paired by.
