@@ -174,12 +174,11 @@ def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Co
 
 
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
-    """Return the time per output token (TPOT):
-    the seconds after the first token, for each later token.
+    """Return the time per output token (TPOT) in s: (seconds - first_token_s) / (tokens - 1).
 
-    It is (seconds - first_token_s) / (tokens - 1), as in `vllm bench serve`. Only tokens that the
-    model chose count: the fixed tokens of a constrained answer are read as input, and their time is
-    part of the next chosen token's.
+    As in `vllm bench serve`; None if a number is unknown or there are fewer than two tokens. Only
+    tokens that the model chose count: the fixed tokens of a constrained answer are read as input,
+    and their time is part of the next chosen token's.
     """
     if first_token_s is None or tokens is None or tokens < 2:
         return None

@@ -18,7 +18,7 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 @dataclass(frozen=True)
 class AveragedReadOut:
-    """Hold a read-out of letters, averaged over cyclic orders of its list of actions."""
+    """Hold an answer made of letters' probabilities, averaged over orders of the action list."""
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders
@@ -29,10 +29,10 @@ class AveragedReadOut:
 
 
 def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> AveragedReadOut:
-    """Return a read-out averaged over all cyclic orders of its list of actions.
+    """Return a read-out, the probabilities of one letter an action, averaged over cyclic orders.
 
-    `letters_p`, `(orders, A)`, has the letters' probabilities, a row an order as
-    `harness.prompts.readout.cyclic` gives them, the first that of `actions`.
+    `letters_p`, `(orders, A)`, has the letters' probabilities with the list of actions in each
+    order of `harness.prompts.readout.cyclic`; the first order is that of `actions`.
     """
     p: Floats = np.array(letters_p, dtype=float)
     mass = p.sum(axis=1)

@@ -229,7 +229,7 @@ def readable(variable: str) -> bool:
 
 
 def meant(address: str) -> str | None:
-    """Return the base URL that is meant by an address without `http://`; None if it is none."""
+    """Return the base URL that is meant by an address without `http://`; None if unclear."""
     found = _ADDRESS.fullmatch(address)
     if found is None or address.startswith(("http://", "https://")):
         return None

@@ -66,7 +66,7 @@ def whole(loaded: Any) -> Any:
 
 
 def token_ids(loaded: Any, text: str) -> list[int]:
-    """Return the token ids of a text in a chat, without tokens put around a whole prompt."""
+    """Return the token ids of a text in a chat, without special ones such as a BOS around it."""
     encoded: list[int] = loaded.encode(text, add_special_tokens=False).ids
     return encoded
 

@@ -46,7 +46,7 @@ class Vision:
 
     @property
     def tokens(self) -> int:
-        """Number of tokens of one picture, without markers around it."""
+        """Number of tokens that one picture becomes, without markers around it."""
         square = self.patch_px * self.merge
         width, height = self.scaled_to_px or self._whole_squares(square)
         return (width // square) * (height // square)

@@ -30,7 +30,7 @@ class Claims:
 
     @cached_property
     def off_road_m(self) -> Floats:
-        """Distance of each claimed place from the middle of the nearest lane, `(..., H)`."""
+        """Metres from each helper's claimed position to the nearest lane's middle, `(..., H)`."""
         return self.from_road_m(self.xy_m[..., 1:, :])
 
     def take(self, at: Any) -> "Claims":

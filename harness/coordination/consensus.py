@@ -62,10 +62,16 @@ class Rule(Protocol):
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the rule's memory before the first step of a batch of episodes, `(*batch, K)`."""
+        """Return the rule's memory before the first step of a batch of episodes, `(*batch, K)`.
+
+        There are `helpers` helpers and `actions` actions in each.
+        """
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Fuse one step of each episode."""
+        """Return the policies, weights and next memory of one step of a batch of episodes.
+
+        `state` is the memory of each episode before the step, `(..., K)`.
+        """
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,8 @@ class Call:
     ) -> Sequence["SceneGraph | None"]:
         """Return the scene graph to show the ego in each case, or None where its own graph stays.
 
-        Each case has what one ego sees and has heard; all are of the same vehicle of the scenario.
+        Each case has what one ego sees and has heard. All egos are of `scenario`: they come from
+        the same approach, with the same route.
         """
         return [None] * len(cases)
 
@@ -90,7 +91,10 @@ class Content:
         return not self.holds.isdisjoint(BY_MODELS)
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        """Return why this content cannot be used under `point` in `run`, and remedy, or None."""
+        """Return why this content cannot be used under `point` in `run`; None if it can.
+
+        The text also says what to do instead.
+        """
         return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:

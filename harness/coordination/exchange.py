@@ -236,7 +236,7 @@ def _ask_helpers(
 
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Return the point's schedule's value of asking each helper, in its own unit.
+    """Return the worth, by the point's schedule and in its unit, of asking each helper.
 
     The shape is `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. The
     schedule asks those above its threshold. Raises UserError if a package's schedule fails.

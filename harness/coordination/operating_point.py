@@ -480,9 +480,10 @@ class OperatingPoint:
         )
 
     def needs(self, what: str) -> bool:
-        """Return whether some part, schedule, rule or content needs an optional input named `what`.
+        """Return whether some part, schedule, rule or content needs an optional input `what`.
 
-        That is `in_time`, `outlook` or `lot` of a schedule, or `claims`, `objects` or `plans`.
+        That is `in_time` (the probability of a reply in the window), `outlook` (what the ego sees
+        of its regions), `lot` (a random draw), `claims`, `objects` or `plans`.
         """
         return what in self._needs
 

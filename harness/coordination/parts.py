@@ -118,7 +118,7 @@ class RunFacts(Protocol):
 
     @property
     def scenario(self) -> Any:
-        """The scenario, which has a name."""
+        """The scenario, which has a `name`."""
 
     @property
     def ego_alone(self) -> bool:
@@ -126,7 +126,7 @@ class RunFacts(Protocol):
 
     @property
     def several_decide(self) -> bool:
-        """Whether vehicles beside the ego decide, too."""
+        """Whether vehicles beside the ego decide for themselves, too, as agents."""
 
     @property
     def frozen(self) -> bool:
@@ -183,7 +183,10 @@ class Part(Struct, frozen=True, kw_only=True):
         """Raise ValueError if this part's settings contradict others of the operating point."""
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
-        """Return why this part cannot be used under `point` in `run`, and the remedy; else None."""
+        """Return why this part cannot be used under `point` in `run`; None if it can.
+
+        The text also says what to do instead.
+        """
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
         """Return what a run must store of what this part's settings name, by folder and by name."""
@@ -191,7 +194,11 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def needs(self) -> Collection[str]:
-        """Optional inputs that this part needs: of `claims`, `in_time`, `lot` and `outlook`."""
+        """Optional inputs that this part needs, by name; the run provides only what is needed.
+
+        `claims`: what helpers claim of themselves; `in_time`: the probability of a reply in the
+        window; `lot`: a random draw a decision; `outlook`: how much of its regions the ego sees.
+        """
         return ()
 
     @property

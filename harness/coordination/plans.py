@@ -32,7 +32,7 @@ class Plans:
     lost_s: Floats
 
     def take(self, at: Any) -> "Plans":
-        """Return the plans at these indices of the leading dimension."""
+        """Return the plans of the decisions at indices `at` of the leading dimension."""
         return Plans(self.row[at], self.vehicle[at], self.reaches_s[at], self.lost_s[at])
 
     def of_helpers(self, places: Ints) -> "Plans":

@@ -29,7 +29,7 @@ class Outlook:
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
-        """Return the outlooks at these indices of the leading dimension."""
+        """Return the outlooks of the decisions at indices `at` of the leading dimension."""
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
@@ -75,16 +75,16 @@ class Schedule(Protocol):
         """
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return what asking each helper is worth, `(..., H)`,
-        or `(..., 1)` if it is the same for all.
+        """Return what asking each helper is worth, in the schedule's own unit, `(..., H)`.
 
-        If helpers differ, it is NaN for one that may not be asked.
+        It is `(..., 1)` if it is the same for all. If helpers differ, it is NaN for one that may
+        not be asked.
         """
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A schedule that is one function of `ScheduleInputs`."""
+    """Make a schedule of a function of `ScheduleInputs` that returns `(..., H)` or `(..., 1)`."""
 
     formula: Callable[[ScheduleInputs], Floats]
     threshold: float | None = None

@@ -12,7 +12,10 @@ from harness.radio.channel import Draws
 
 @dataclass(frozen=True)
 class SentIntents:
-    """Hold what H voices send in n decisions; an attacker may have several voices."""
+    """Hold what H voices, senders as the ego hears them, send in n decisions.
+
+    An attacker may have several voices.
+    """
 
     intents: Intents  # the intents and claims of each voice
     draws: Draws  # the channel's draws for each voice

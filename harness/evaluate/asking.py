@@ -271,7 +271,7 @@ class Asker:
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
-        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        """Raise Unanswered if too many questions that were asked here got no answer."""
         if self.tally.missing:
             raise Unanswered(str(self.tally))
 

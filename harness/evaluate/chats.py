@@ -38,9 +38,10 @@ class Asking:
 
     @classmethod
     def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Return this for a prompt version by name, the scenario's own if None.
+        """Return an `Asking` with a prompt version by name, or the scenario's own if None.
 
-        Raises UserError if there is no such version, or it cannot be used.
+        `answer` is `json` or `readout`. Raises UserError if there is no such version, or it cannot
+        be used.
         """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 

@@ -31,7 +31,7 @@ FILE = "costs.jsonl"
 
 
 class Asked(msgspec.Struct, frozen=True):
-    """Hold how many tokens some completions took that a model was asked for together."""
+    """Hold the token counts of completions that one model was asked for in one call."""
 
     model: str
     asked: int  # number of completions

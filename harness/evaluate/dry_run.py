@@ -19,7 +19,7 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     """Return how many requests an evaluation would make, and how long and dear its prompts are.
 
     The dict has the settings, `requests`, `requests_by_role`, `scenes`, `prompt_tokens` by role
-    (None without a `tokenizer`) and, if a card has a price, `cost` by model, with the longest
+    (None if no tokenizer is found) and, if a card has a price, `cost` by model, with the longest
     answers. Who asks a helper depends on answers, so numbers of helpers' requests and fusion calls
     are the most possible unless all are asked. `cost` has no fusion calls and no repair turns.
     """

@@ -60,7 +60,7 @@ HOOKS: Plugins[Hook] = Plugins("swarmdrive.hooks", Hook, {})
 
 
 def chosen(names: Iterable[str]) -> dict[str, Hook]:
-    """Return hooks by name: those that are typed, else those in `SWARMDRIVE_TRACKERS`.
+    """Return hooks by name: `names`, or if empty those in the variable `SWARMDRIVE_TRACKERS`.
 
     Raises UserError if there is no such hook, or its package is not installed.
     """

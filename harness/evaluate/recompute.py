@@ -84,8 +84,8 @@ def computed(
 ) -> tuple[Run, int]:
     """Compute a run again from its stored answers into folder `out`.
 
-    Returns the new run, and the number of stored answers that differ from what the rule installed
-    here gives; 0 for models that are no rules. `progress` gets the number of answers.
+    Returns the new run, and how many stored answers differ from those of the rule-based model
+    installed here; 0 for other models. `progress` gets the number of answers.
     """
     kept, held = Kept(stated), list[Held]()
 

@@ -400,7 +400,7 @@ class Spec:
         return not self.ego.can.asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
-        """Return the vehicles of a scene for which a model answers, the ego first."""
+        """Return the ids of a scene's vehicles for which a model answers, the ego first."""
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def changed(self, **settings: Any) -> "Spec":

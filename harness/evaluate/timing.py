@@ -21,7 +21,7 @@ IDLE = 0.25  # highest load of an idle machine, in processes a core
 
 
 def refuse_busy() -> None:
-    """Raise UserError if the machine was busy in the last minute, or does not say so."""
+    """Raise UserError if the machine was busy in the last minute, or does not tell its load."""
     load = load_a_core()
     if load is None or load > IDLE:
         reason = (
