@@ -18,7 +18,7 @@ ANY = "any"  # the viewer is drawn among all
 
 
 def read_by(asking: Asking, role: str) -> dict[str, Any]:
-    """Return how answers in a role are read: arguments of `intent`, as plain values."""
+    """Return how answers of a role (`ego`, `helper`) are parsed: arguments of `intent`."""
     shape = asking.prompt.shape(role, asking.scenario.actions)
     return {
         "answer": asking.answer,
@@ -31,8 +31,9 @@ def read_by(asking: Asking, role: str) -> dict[str, Any]:
 
 
 def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
-    """Return who is asked: a viewer by id, the ego for None,
-    one of all by a uniform draw for `any`.
+    """Return the id of the vehicle that is asked in a scene.
+
+    `viewer` is an id, None for the ego, or `any`: then a uniform `draw` in [0, 1) chooses.
     """
     return scene.viewers[int(draw * len(scene.viewers))] if viewer == ANY else scene.viewer(viewer)
 
@@ -40,9 +41,11 @@ def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
 def rows(
     data: Dataset, values: Values, constant: int, asking: Asking, viewer: str | None, at: Ints
 ) -> Iterator[dict[str, Any]]:
-    """Yield a question a row, about decision points (n,), which may be there several times.
+    """Yield a dataset row, for a trainer of text models, for each decision point in `at`, (n,).
 
-    A row has `prompt` (chat messages), and all that `advantage` needs.
+    `at` has indices into the forest's decision points, repeats allowed. A row has `prompt` (chat
+    messages), and the columns that `advantage` needs: `values` (A,), `constant` (an action's
+    index), and how the answer is parsed.
     """
     forest = data.forest
     names = list(dict.fromkeys(forest.ids[n] for n in at.tolist()))
@@ -76,7 +79,10 @@ def intent(
     extension: str = "",
     reasons_first: bool = False,
 ) -> tuple[float, ...] | None:
-    """Return the distribution (A,) that an answer states; None if it cannot be read."""
+    """Return the distribution (A,) that an answer states; None if it cannot be parsed.
+
+    `answer` is the answer mode; the other arguments are as `read_by` returns them.
+    """
     if answer == "readout":
         letter = readout.spelt(text)[:1]
         letters = readout.letters(actions)
@@ -97,16 +103,18 @@ Worth = Callable[[Sequence[float], Sequence[float]], float]
 
 
 def driven(p: Sequence[float], values: Sequence[float]) -> float:
-    """Return the worth of the action that a distribution drives: the likeliest;
-    of equals each as often.
+    """Return the worth of a distribution's likeliest action; of equally likely ones, their mean.
+
+    `p` (A,) is the distribution, `values` (A,) each action's probability of success.
     """
     likeliest = np.array(p) == max(p)
     return float(np.mean(np.array(values)[likeliest]))
 
 
 def stated(p: Sequence[float], values: Sequence[float]) -> float:
-    """Return the mean worth of a distribution,
-    which tells apart those that drive the same action.
+    """Return the mean of `values` (A,), each action's probability of success, under `p` (A,).
+
+    Unlike `driven`, it tells apart distributions with the same likeliest action.
     """
     return float(np.dot(p, values))
 
@@ -114,10 +122,11 @@ def stated(p: Sequence[float], values: Sequence[float]) -> float:
 def earned(
     text: str, values: Sequence[float], constant: int, worth: Worth = driven, **how: Any
 ) -> float:
-    """Return what an answer is worth, less the action that is always taken.
+    """Return the advantage of an answer: its worth less that of the scenario's constant action.
 
-    An answer that cannot be read drives nobody: it is worth 0. `values` has the worth of each
-    action, (A,); `constant` is the index of the other.
+    `values` (A,) has each action's worth, `constant` is an action's index, and `worth` says what a
+    distribution is worth. An answer that cannot be parsed has worth 0. `how` are arguments of
+    `intent`.
     """
     p = intent(text, **how)
     return (0.0 if p is None else worth(p, values)) - float(values[constant])
@@ -134,15 +143,18 @@ def advantage(
     constant: Sequence[int],
     **columns: Any,
 ) -> list[float]:
-    """Return the advantage of each completion: a reward function of TRL's trainers.
+    """Return the advantage of each completion: a reward function for TRL's trainers.
+
+    The advantage is the worth of the action that the answer makes likeliest, less that of one
+    action that is always taken.
 
     Args:
         prompts: as the trainer has them; not read.
         completions: texts, or chats whose last message is the answer;
-            one without a text cannot be read.
-        values: like the further columns, those of the rows that the prompts are from.
-        constant: the action beside which each is judged.
-        columns: the further columns of `rows`; others are left alone.
+            one without a text cannot be parsed, and its worth is 0.
+        values: of each row, the worth of every action, (A,): a column of `rows`.
+        constant: of each row, the index of the action that is always taken: a column of `rows`.
+        columns: the further columns of `rows`; columns of other names are ignored.
     """
     return _rewards(driven, completions, values, constant, columns)
 
@@ -155,12 +167,11 @@ def expected_advantage(
     constant: Sequence[int],
     **columns: Any,
 ) -> list[float]:
-    """Return the advantage of the distribution that each completion states,
-    and not of what it drives.
+    """Return the advantage of the distribution that each completion states: a reward for TRL.
 
-    It differs between answers that drive the same, so a trainer that samples few answers to a
-    question learns from more of them; but who is unsure and right earns less than who is sure.
-    Arguments: as of `advantage`.
+    It is the mean worth under the distribution, less that of the constant action. It differs
+    between answers with the same likeliest action, so that few samples teach more; but an answer
+    that is unsure and right earns less than one that is sure. Arguments: as of `advantage`.
     """
     return _rewards(stated, completions, values, constant, columns)
 

@@ -32,11 +32,11 @@ CHARACTERS = frozenset(["\n", "\t"] + [chr(code) for code in range(0x20, 0x3000)
 
 
 class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
-    """Decides for the ego, a decision a step, on layouts that may be learnt from.
+    """Let an agent decide for the ego, a decision a step, as a Gymnasium environment.
 
-    An observation is a chat that asks the viewer (`text`), or the numbers of its scene graph
-    (`arrays`): `numbers`, named by `self.numbers`, 0 where `known` is 0. The last of an episode
-    repeats the one before.
+    Users get one from `harness.environment`. An observation is a chat that asks the viewer
+    (`text`), or the numbers of its scene graph (`arrays`): `numbers`, named by `self.numbers`,
+    which are 0 where `known` is 0. The last observation of an episode repeats the one before.
 
     `info` has what no driver knows: `values` and `optimal` of every action, (A,), `lost` if success
     is out of reach, `scene`, `layout_seed`, `danger` (its sector, "" without one) and `viewer`;
@@ -85,16 +85,17 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
 
     @property
     def values(self) -> Values:
-        """The worth of every action at every decision point, as arrays.
-        Raises UserError without trees.
+        """Return the probability of success after every action, at every decision point, as arrays.
+        Raises UserError if the episodes are driven and so have no trees.
         """
         return self._trees("values").values
 
     def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
-        """Return questions of all layouts, for trainers of text models: a row each (`asking.rows`).
+        """Return questions of all layouts for trainers of text models, a dict each (`asking.rows`).
 
-        They are of decisions that matter,
-        so many of each level of each layout (`values.drawn`). Raises UserError without trees.
+        They are of decision points at which the action matters, `per_level` for each step of each
+        layout (see `values.drawn`). Raises UserError if the episodes are driven and so have no
+        trees.
         """
         trees = self._trees("rows()")
         at = trees.drawn(per_level)
@@ -103,17 +104,22 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         ]
 
     def references(self, per_level: int = 6) -> dict[str, dict[str, float]]:
-        """Return what those earn who need no model: lines to draw beside a training curve.
+        """Return the scores of drivers that need no model, to draw beside a training curve.
 
-        Of each, `advantage` is the mean reward over the rows, 0 of `constant`, and `success` what
-        it drives on their layouts, balanced over those with and without a danger. `full-view` sees
-        everything. Raises UserError without trees, or if no decision of their layouts matters.
+        The keys are drivers, such as `constant`, `uniform` and `full-view`, which sees everything.
+        Each has `advantage`, the mean reward over `rows(per_level)` (0 for `constant`), and
+        `success`, the share of successful episodes on their layouts, balanced over those with and
+        without a danger. Raises UserError if the episodes are driven, or if no decision of the
+        layouts matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))
 
     def learnt(self) -> dict[str, Any]:
-        """Return what a model's card should state of what it learnt from here, as plain values."""
+        """Return what the card of a model trained here should state, as plain values.
+
+        It has scenario, seeds, reward and prompt.
+        """
         scenario, seeds = self.source.scenario, self.source.seeds
         prompt = self.ask.prompt
         return {
@@ -129,9 +135,10 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode on a layout that is drawn, or on that of `options={"layout_seed": ...}`.
+        """Begin an episode on a random layout, or on that of `options={"layout_seed": ...}`.
 
-        Raises UserError for a layout that may not be learnt from, or has no tree here.
+        Returns the observation and `info`. Raises UserError for a layout that may not be learnt
+        from, or has no tree here.
         """
         super().reset(seed=seed)
         seeds = self.source.seeds
@@ -142,7 +149,8 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take an action, given as an index or as a distribution (A,), which is normalised.
 
-        Raises UserError before `reset`, after the end, or for what is no action.
+        Returns observation, reward, whether the episode ended, False, and `info`, as Gymnasium
+        asks. Raises UserError before `reset`, after the end, or if it is not an action.
         """
         if self.trip is None or self.trip.success is not None:
             raise UserError("no episode is under way; call reset() first")

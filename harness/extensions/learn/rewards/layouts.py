@@ -23,9 +23,10 @@ CODE = ("world/**/*.py", "world/**/*.csv", "dataset/*.py")
 
 
 def seeds(which: str | int, layouts: int) -> range:
-    """Return the layout seeds of a purpose, or from a first one on.
+    """Return the range of `layouts` layout seeds for training.
 
-    Raises UserError for seeds that numbers are reported of, of two purposes, or none at all.
+    `which` is `train` or `tune`, or the first seed. Raises UserError for report seeds, on which
+    results are measured, for seeds of two purposes, or for seeds that do not exist.
     """
     if isinstance(which, str) and which not in FIRST:
         raise unknown(
@@ -42,7 +43,9 @@ def seeds(which: str | int, layouts: int) -> range:
 
 
 def whole(what: str, number: Any) -> int:
-    """Return a whole number as a plain one. Raises UserError if it is none."""
+    """Return a number as a Python int; `what` names it in the message.
+    Raises UserError if it is not a whole number.
+    """
     try:
         return operator.index(number)
     except TypeError:
@@ -50,7 +53,7 @@ def whole(what: str, number: Any) -> int:
 
 
 def refuse(kind: Purpose, what: str) -> None:
-    """Raise UserError if layouts are those that numbers are reported of."""
+    """Raise UserError if layouts are for reporting results; `what` names them in the message."""
     if kind == "report":
         raise UserError(
             f"{what}: numbers are reported of layout seeds from {FIRST['report']} on, and nothing "
@@ -61,10 +64,10 @@ def refuse(kind: Purpose, what: str) -> None:
 
 
 def stored(dataset: str) -> Dataset:
-    """Read a dataset, by its folder or name. Raises UserError for none, or one of report seeds.
+    """Read a dataset to learn from, by its folder or name.
 
-    The seeds count, and not what its manifest says that they are for;
-    some layouts are rebuilt from them.
+    Raises UserError if there is none, or if it has report seeds. Some layouts are rebuilt from
+    their seeds, so that a manifest with false seeds is refused.
     """
     data = load(find(dataset))
     refuse(purpose(data.manifest.seed, data.manifest.episodes), f"dataset {printable(dataset)}")
@@ -75,9 +78,11 @@ def stored(dataset: str) -> Dataset:
 def trees(
     scenario: Scenario, of: range, workers: Workers, progress: Callable[[int], None]
 ) -> Dataset:
-    """Return the trees of a scenario's layouts; what is not in the user's cache folder is built.
+    """Return a scenario's layouts of the seeds `of`, with their decision trees, as a dataset.
 
-    A build that was stopped goes on. Raises UserError if another process is building them.
+    Trees that are not in the user's cache folder are built; a stopped build resumes. `progress` is
+    called with the number of layouts just done. Raises UserError if another process is building
+    them.
     """
     key = digest([scenario.name, scenario.parameters.stated(), kept.code_sha256(*CODE)])[:12]
     name = re.sub(r"[^A-Za-z0-9]+", "-", scenario.name)[:60]

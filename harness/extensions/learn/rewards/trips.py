@@ -31,50 +31,50 @@ from harness.world.world import World
 
 
 class Trip(Protocol):
-    """An episode that is under way at a decision point, or over."""
+    """Describe an episode that `Source.begin` began: at a decision point, or over."""
 
     @property
     def scene(self) -> Scene:
-        """The present decision point; the last one once the episode is over."""
+        """Return the present decision point; the last one once the episode is over."""
         ...
 
     @property
     def values(self) -> Floats:
-        """What each action is worth there, (A,)."""
+        """Return the probability of success after each action at this point, (A,)."""
         ...
 
     @property
     def success(self) -> bool | None:
-        """Whether the episode succeeded; None while it is under way."""
+        """Return whether the episode succeeded; None while it is under way."""
         ...
 
     def take(self, action: int) -> None:
-        """Take an action, and go on to the next decision point or to the end."""
+        """Take an action by its index, and go on to the next decision point or to the end."""
         ...
 
 
 class Source(Protocol):
-    """Begins episodes on layouts that may be learnt from."""
+    """Describe where the environment's episodes come from: trees or the simulator."""
 
     @property
     def scenario(self) -> Scenario: ...
 
     @property
     def seeds(self) -> Sequence[int]:
-        """The layout seeds among which episodes are drawn."""
+        """Return the layout seeds among which an episode's is drawn."""
         ...
 
     def begin(self, seed: int) -> Trip:
-        """Begin an episode. Raises UserError for a layout that this source has not."""
+        """Begin an episode on a layout seed. Raises UserError if it has no such layout."""
         ...
 
 
 @dataclass(frozen=True)
 class Trees:
-    """Episodes that are walked through trees."""
+    """Take episodes from the decision trees of a dataset, without a simulator."""
 
     dataset: Dataset  # the trees, and the scenes of their decision points
-    then: str = BEST  # who decides after an action that is judged
+    then: str = BEST  # who decides after the action whose worth is asked: `best`, or a driver
 
     @property
     def scenario(self) -> Scenario:
@@ -90,8 +90,9 @@ class Trees:
 
     @cached_property
     def constant(self) -> int:
-        """The action beside which each is judged;
-        the best of these layouts where nobody has measured it.
+        """Return the index of the action that is always taken, beside which answers are judged.
+
+        It is the scenario's measured best constant, or else the best one of these layouts.
         """
         action = constant(self.scenario)
         if action is None:
@@ -99,8 +100,9 @@ class Trees:
         return self.scenario.actions.index(action)
 
     def drawn(self, per_level: int) -> Ints:
-        """Return decision points that matter,
-        so many of each level of each tree; see `values.drawn`.
+        """Return indices of decision points at which the action matters, (n,).
+
+        There are about `per_level` for each step of each tree; see `values.drawn`.
         """
         data = self.dataset
         return drawn(
@@ -108,8 +110,11 @@ class Trees:
         )
 
     def references(self, at: Ints) -> dict[str, dict[str, float]]:
-        """Return of who needs no model the mean `advantage` at points (n,),
-        and balanced `success`.
+        """Return `advantage` and `success` of drivers that need no model, by the driver's name.
+
+        `advantage` is the mean over decision points at indices `at` (n,) of the worth of what the
+        driver does, less that of the constant action; `success` is over all layouts, balanced.
+        Raises UserError if `at` is empty.
         """
         if not len(at):
             raise UserError("no decision of these layouts matters; give more layouts")
@@ -143,10 +148,10 @@ class Trees:
 
 @dataclass
 class TreeTrip:
-    """A walk through a tree."""
+    """Walk through the tree of one layout: an episode that `Trees` began."""
 
     of: Trees
-    at: int  # place of the decision point in the forest
+    at: int  # index of the present decision point in the forest
     success: bool | None = None
 
     @property
@@ -168,11 +173,12 @@ class TreeTrip:
 
 @dataclass(frozen=True)
 class Roads:
-    """Episodes that are driven in the simulator, so that no tree is built."""
+    """Drive episodes in the simulator, so that no tree is built."""
 
     scenario: Scenario
     seeds: Sequence[int]
-    then: str | None = None  # a reference driver; None where values are not asked for
+    # reference driver who decides after the action whose worth is asked; None: values are NaN
+    then: str | None = None
 
     def __post_init__(self) -> None:
         refuse_agents(self.scenario, "an environment to learn in")
@@ -189,7 +195,7 @@ class Roads:
 
 @dataclass
 class RoadTrip:
-    """An episode in the simulator."""
+    """Drive one layout in the simulator: an episode that `Roads` began."""
 
     of: Roads
     world: World
@@ -200,7 +206,7 @@ class RoadTrip:
 
     @cached_property
     def reference(self) -> Outcome:
-        """How the full-view driver ends on this layout, which says how late is too late."""
+        """Return how the full-view driver ends here: its time says when the ego is too late."""
         return drive(self.of.scenario, PRIVILEGED, self.world.seed)
 
     def _look(self) -> None:

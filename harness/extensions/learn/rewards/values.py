@@ -34,16 +34,20 @@ BEST = "best"
 
 @dataclass(frozen=True)
 class Values:
-    """The worth of A actions at N decision points."""
+    """Hold the worth of A actions at N decision points: the probability of success after each."""
 
     ids: tuple[str, ...]  # ids of the decision points
     actions: tuple[str, ...]  # the meta-actions
-    then: str  # who decides after the action
+    then: str  # who decides after the action: `best`, `uniform` or a reference driver
     table: Floats  # worth of each action, (N, A)
 
     @classmethod
     def of(cls, forest: Forest, then: str = BEST) -> "Values":
-        """Raises UserError if there is no such driver."""
+        """Compute the worth of every action at every decision point of a forest of decision trees.
+
+        `then` decides after the action: `best`, `uniform` or a reference driver. Raises UserError
+        if it is none of these.
+        """
         if then == BEST:
             table = forest.safe.astype(float)
         elif then == UNIFORM:
@@ -55,19 +59,18 @@ class Values:
         return cls(forest.ids, forest.actions, then, table)
 
     def __call__(self, points: Sequence[str] | Ints, p: Floats | None = None) -> Floats:
-        """Return the worth of each action at n decision points, (n, A);
-        given distributions p (n, A), theirs.
+        """Return the worth of each action at n decision points, (n, A).
 
-        The points are ids, or places among `ids`, which is faster.
-        Raises KeyError for an unknown id.
+        Given distributions `p` (n, A), return their mean worth, (n,). The points are ids, or
+        indices into `ids`, which is faster. Raises KeyError for an unknown id.
         """
         places = points if isinstance(points, np.ndarray) else self.at(points)
         values = self.table[places]
         return values if p is None else np.einsum("na,na->n", p, values)
 
     def at(self, ids: Sequence[str]) -> Ints:
-        """Return the places of decision points among `ids`, (n,).
-        Raises KeyError for an unknown one.
+        """Return the indices of decision points in `self.ids`, (n,).
+        Raises KeyError for an unknown id.
         """
         return np.fromiter(map(self.place.__getitem__, ids), np.intp, len(ids))
 
@@ -77,38 +80,39 @@ class Values:
 
     @cached_property
     def lost(self) -> Bools:
-        """Whether every action is worth nothing, (N,)."""
+        """Return at which decision points no action can lead to success, (N,)."""
         return np.asarray(~self.table.any(axis=-1))
 
     @cached_property
     def decides(self) -> Bools:
-        """Whether it matters which action is taken, (N,)."""
+        """Return at which decision points the actions differ in worth, (N,)."""
         return np.asarray(self.table.max(axis=-1) > self.table.min(axis=-1))
 
 
 def balanced(success: Floats | Bools, dangerous: Bools) -> float:
-    """Return the mean success (E,) of layouts with a danger and without,
-    as far as there are both.
+    """Return the mean success (E,) of layouts, where those with and without a danger weigh alike.
+
+    `dangerous` (E,) says which have one. If all are of one kind, it is their plain mean.
     """
     kinds = [success[kind].mean() for kind in (dangerous, ~dangerous) if kind.any()]
     return float(np.mean(kinds))
 
 
 def best_constant(forest: Forest, dangerous: Bools) -> int:
-    """Return the action that does best if it is always taken, by balanced success;
-    of equals the first.
+    """Return the index of the action that succeeds most if always taken, by balanced success.
+
+    `dangerous` (E,) says which layouts have a danger. Of equal actions it is the first.
     """
     success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
     return int(np.argmax(success))
 
 
 def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario: str) -> Ints:
-    """Return points among those that are asked for, (N,),
-    so many of each level of each tree, ascending.
+    """Draw about `per_level` decision points for each step of each tree: ascending indices, (n,).
 
-    They are drawn by scenario and layout seed. A level that has fewer has them several times, so
-    that levels weigh alike: an episode passes one point of each. Layouts with and without a danger
-    have as many in all, as balanced success weighs them, so of the rarer kind more are drawn.
+    Only points where `of` (N,) is true are drawn, keyed by scenario and layout seed; where a step
+    has too few, they repeat. `dangerous` (E,) says which trees' layouts have a danger; of the rarer
+    kind of layout more are drawn, so that both kinds have as many in all.
     """
     alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
     kinds = len(np.unique(dangerous))
@@ -131,8 +135,9 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
 
 
 def optimal(values: Floats) -> Bools:
-    """Return which actions are worth most, (..., A);
-    none where all are worth nothing, or it is not known.
+    """Return which actions have the greatest worth, a mask (..., A), for `values` (..., A).
+
+    It is false for all where every action is worth 0 or NaN (unknown).
     """
     most = values.max(axis=-1, keepdims=True)
     return np.asarray((values == most) & (most > 0))

@@ -25,10 +25,11 @@ STEP_M = 7.0  # from one class to the next; the last has no end
 
 
 def evidence(view: SceneGraph, named: bool = True) -> str:
-    """Report who brakes ahead of the ego, or comes closest to it, or what the viewer cannot see.
+    """Return one sentence of evidence from a viewer's scene graph, as a helper reports it.
 
-    The gap is by how many seconds that vehicle is later than the ego where their ways meet. A
-    vehicle that is not `named` in the prompt is no more than one.
+    It says who brakes ahead of the ego, else who comes closest to it in time, else what is hidden.
+    The gap is by how many seconds that vehicle reaches the conflict later than the ego. If `named`
+    is false, the prompt names no vehicle, and the sentence says "one".
     """
 
     def who(conflict: Conflict) -> str:
@@ -48,8 +49,9 @@ def evidence(view: SceneGraph, named: bool = True) -> str:
 
 
 def sights(view: SceneGraph) -> str:
-    """Report what a viewer's cameras show, the nearest first:
-    kinds, metres ahead and to the left, lamps.
+    """Return what a viewer's cameras show, as text: up to five vehicles, the nearest first.
+
+    Each has its type, metres ahead and to the left of the viewer, and a brake light or indicator.
     """
     seen = [node for node in view.nodes if "camera" in node.sensors]
     seen.sort(key=lambda node: float(np.hypot(node.forward_m, node.left_m)))
@@ -69,7 +71,12 @@ def _gap_s(conflict: Conflict) -> float | None:
 def message(
     view: SceneGraph, intent: Floats, actions: Sequence[str], named: bool = True
 ) -> dict[str, Any]:
-    """Return a helper's message that states an intent, with what any prompt may show of it."""
+    """Return a helper's message that states an intent (A,), with all fields that a prompt may show.
+
+    They are `evidence`, `risk`, `intent` (in steps of 1/20), `recommended_maneuver` and
+    `confidence`. `actions` has the names of the A actions, the most careful first; `named` is as in
+    `evidence`.
+    """
     stated = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
     braking = stated[0]  # the most careful action comes first
@@ -91,8 +98,9 @@ def answer(
     bare: bool = False,
     named: bool = True,
 ) -> str:
-    """Return the answer that states an intent;
-    `bare` without free text, as a constrained answer begins.
+    """Return the JSON answer that a viewer should give to `prompt` to state an intent (A,).
+
+    If `bare`, its free text is left empty, as in a constrained answer; `named` is as in `evidence`.
     """
     sent = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))
@@ -111,10 +119,10 @@ def answer(
 
 
 def cells(sight: Sight) -> Ints:
-    """Return the class of every token of a picture, (tokens,), row by row.
+    """Return the distance class of every image token of a camera picture, (tokens,), row by row.
 
-    A letter and a line of words are one answer a picture, too little for a vision encoder that
-    begins with random weights. This is an answer a token.
+    The class is that of the nearest vehicle which the token shows: 0 for none, else 1 to 9 in steps
+    of 7 m from the viewer. Learnt as a further target, it trains the vision encoder.
     """
     frame, viewer = sight.frame, sight.state.vehicle(sight.viewer_id)
     classes = np.zeros(len(frame.ids) + 1, dtype=np.int64)  # the last is of pixels that nobody owns

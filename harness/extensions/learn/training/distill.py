@@ -31,11 +31,11 @@ FACTS = "training.json"  # written last
 
 @dataclass(frozen=True)
 class Curriculum:
-    """What is learnt from."""
+    """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights."""
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
-    layouts: int  # how many of each scenario
-    seed: int  # layout seed of the first
+    layouts: int  # number of layouts of each scenario
+    seed: int  # layout seed of the first; the others follow
     # folder of a model of texts that was distilled here, which it begins as, or the card of a
     # published one; None begins with random weights
     base: Path | Card | None = None
@@ -54,7 +54,7 @@ class Curriculum:
         locate(self.base)  # now, and not after the layouts are drawn
 
     def settings(self) -> dict[str, Any]:
-        """Return, as plain values, what a resumed training must have in common with its start."""
+        """Return as plain values the settings that a resumed training must not change."""
         scenarios = {}
         for scenario in self.prompts:
             parameters = canonical_json(scenario.parameters.stated())
@@ -82,15 +82,13 @@ def distill(
     threads: int | None = None,
     workers: Workers = 1,
 ) -> dict[str, Any]:
-    """Train a model in some scenarios and write checkpoint, tokenizer,
-    GGUF file and model card to `out`.
+    """Train a model in some scenarios; write checkpoint, tokenizer, GGUF file and card to `out`.
 
-    Layouts and stages that a killed call finished are read, and a stage that it had begun resumes.
-    The name of `out`, a folder to make, becomes the model's. `drawing` is called with the number of
-    layouts just drawn, `progress` with the stage, the sequences seen in it and the loss. Without
-    `threads`, PyTorch chooses how many it takes on a CPU. Returns what the model card states: data,
-    plan, curves, and the KL of the read-out on held-out layouts. Raises UserError if the folder
-    holds a finished model or something else.
+    `out` is a folder to make; its name becomes the model's. A killed call resumes. `drawing` is
+    called with the number of layouts just drawn, `progress` with the stage, the sequences seen in
+    it and the loss. `threads` are PyTorch's CPU threads; None lets PyTorch choose. Returns what the
+    card states: data, plan, loss curves, and how the read-out fits held-out layouts. Raises
+    UserError if `out` holds a finished model or something else.
     """
     if threads:
         torch.set_num_threads(threads)
@@ -163,7 +161,10 @@ def _described(
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
-    """Write README.md of a model's folder from what `distill` returns: data, losses and limits."""
+    """Return the README.md of a model trained from random weights: data, losses and limits.
+
+    `facts` is what `distill` returns.
+    """
     plan, base = facts["plan"], facts["base_sha256"]
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"
     before = " The base may have learnt from these layouts, as its own card says." if base else ""

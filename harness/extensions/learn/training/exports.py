@@ -32,7 +32,7 @@ LEAST = Option(
 
 
 class Lessons:
-    """Chats with the answers that the decision trees show to be right."""
+    """Export a run's chats with the answers that the decision trees show to be right (`--sft`)."""
 
     help = (
         "Write chats to fine-tune on as JSON Lines; their answers are those that the decision "
@@ -51,7 +51,10 @@ class Lessons:
 
 
 class Preferences:
-    """The same chats with the model's own answers as the rejected ones."""
+    """Export pairs of answers to a run's chats (`--dpo`).
+
+    The tree's answer is the chosen one, and the model's own, where it is worse, the rejected one.
+    """
 
     help = (
         "Write the same chats with the model's own answers as the rejected ones, where these are "

@@ -47,15 +47,15 @@ PRIOR = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}
 
 
 class Point(msgspec.Struct, frozen=True):
-    """A decision point that is learnt from."""
+    """Hold one decision point to learn from: a scene, and the answer that it should have."""
 
-    record: Record
-    label: list[float]  # soft label, (A,)
+    record: Record  # the scene: its state, and every viewer's scene graph
+    label: list[float]  # soft label, (A,): probabilities of the scenario's A meta-actions
 
 
 @dataclass(frozen=True)
 class Lessons:
-    """What is learnt from one scenario."""
+    """Hold the decision points of one scenario that a model learns from, and their labels."""
 
     scenario: Scenario  # whose actions and words the prompts have
     prompts: tuple[Prompt, ...]  # versions that are learnt
@@ -66,13 +66,15 @@ class Lessons:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Return the numbers of the layouts."""
+        """Return the numbers of the layouts that the scenes are of, each once."""
         return tuple(dict.fromkeys(scene.record.episode for scene in self.scenes))
 
     @cached_property
     def weights(self) -> Mapping[str, float]:
-        """Return how often each scene is learnt from, by its id:
-        each level of a layout in all as often.
+        """Return the training weight of each scene, by scene id.
+
+        All scenes of one step of one layout share a weight of 1. If `balanced`, layouts with a
+        danger and those without have the same total.
         """
         levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
@@ -85,8 +87,9 @@ class Lessons:
         return dict(zip((scene.id for scene in self.scenes), weights.tolist(), strict=True))
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
-        """Split off a share of the layouts, the last ones, at least one:
-        those that are kept, and those.
+        """Return these lessons without the last layouts, and those of the last layouts.
+
+        `held_out` is the share of layouts that the second part gets, at least one layout.
         """
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
         kept = tuple(scene for scene in self.scenes if scene.record.episode not in last)
@@ -103,10 +106,11 @@ def draw(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> Lessons:
-    """Draw the layouts that the folder `place` lacks, a file each, and read all of them.
+    """Draw the decision points of `layouts` layouts, and return them as lessons.
 
-    A killed call resumes from that folder. Layout number n of `layouts` has layout seed `seed + n`;
-    `progress` is called with the number of layouts just done.
+    Each layout is a file in the folder `place`, and only missing ones are drawn, so that a killed
+    call resumes. Layout number n has layout seed `seed + n`; `progress` is called with the number
+    of layouts just done.
     """
     place.mkdir(parents=True, exist_ok=True)
     files = [place / f"{n:05d}.json" for n in range(layouts)]
@@ -130,8 +134,10 @@ def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
 
 
 def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
-    """Draw a layout's decision points that are learnt from:
-    the `record` and the soft `label` of each.
+    """Draw decision points of one layout to learn from, up to six for each step of its tree.
+
+    `seed` is the layout seed, and `number` the episode number that the records get. A point after
+    which no action leads to success is left out.
     """
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []
@@ -163,10 +169,11 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
 
 
 def label(ends_s: Mapping[str, float]) -> Floats:
-    """Return the soft label (A,) of a decision point from when the episode succeeds after each
-    action.
+    """Return the soft label (A,) of a decision point: probabilities of its A actions.
 
-    These are seconds, inf for never; at least one has to be finite.
+    `ends_s` has, by action, the time in seconds at which the episode succeeds after it, inf for
+    never; at least one has to be finite. A probability falls with the delay by exp(-delay / 0.25
+    s).
     """
     time_s = np.array(list(ends_s.values()))
     weight = np.array([PRIOR.get(a, 1.0) for a in ends_s]) * np.exp(

@@ -20,8 +20,9 @@ SCALE = 2.0  # alpha / r
 
 
 class LowRank(torch.nn.Module):  # type: ignore[misc]
-    """A linear layer (out, in) that stays,
-    plus two matrices (rank, in) and (out, rank) that learn.
+    """Add a trainable low-rank update to a linear layer with weights (out, in), which are kept.
+
+    The update is the product of matrices (out, rank) and (rank, in), scaled by alpha / r = 2.
     """
 
     def __init__(self, kept: Any, rank: int, generator: Any) -> None:
@@ -39,7 +40,10 @@ class LowRank(torch.nn.Module):  # type: ignore[misc]
 
 
 def widen(model: Any, rank: int, seed: int) -> None:
-    """Put a `LowRank` around every linear layer of a model's blocks; nothing else of it learns."""
+    """Replace every linear layer of a model's blocks by a `LowRank` around it, and freeze all else.
+
+    `seed` draws the initial matrices.
+    """
     model.requires_grad_(False)
     generator = torch.Generator().manual_seed(seed)
     layers = [(n, m) for n, m in model.base_model.named_modules() if isinstance(m, torch.nn.Linear)]
@@ -53,9 +57,10 @@ def _layers(model: Any) -> Iterator[tuple[str, LowRank]]:
 
 
 def write(model: Any, out: Path, base: str) -> None:
-    """Write a widened model's adapter to a folder, in F16: peft's two files.
+    """Write the LoRA adapter of a widened model to a folder, in F16, as peft's two files.
 
-    `base` is how the model is opened that it was trained on.
+    The model is one that `widen` changed; `base` is the path or id of the model that it was trained
+    on.
     """
     tensors, rank = {}, 0
     for name, layer in _layers(model):

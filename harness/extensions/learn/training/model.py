@@ -54,11 +54,12 @@ EYES = {  # its vision encoder: a quarter of the weights
 
 
 def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
-    """Make a `Qwen3ForCausalLM` of half a million random weights,
-    or a `Qwen3VLForConditionalGeneration`.
+    """Make a `Qwen3ForCausalLM` with about half a million random weights.
 
-    Matrices are normal with a deviation of 1/sqrt(fan-in), less on what adds to the residual
-    stream. One that `sees` takes pictures; `tokenizer` is a `tokenizers.Tokenizer`.
+    With `sees`, make a `Qwen3VLForConditionalGeneration`, which also takes pictures. `tokenizer` is
+    a `tokenizers.Tokenizer` that has the special tokens of `train_tokenizer`. Matrices are drawn
+    from `seed`, normal with a deviation of 1/sqrt(fan-in), and less where they write to the
+    residual stream.
     """
     import torch
     import transformers
@@ -121,9 +122,11 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
 
 
 def take_over(model: Any, base: Path) -> None:
-    """Give a model the weights of a model of texts whose vocabulary begins its own.
+    """Copy the weights of a text model into `model`, a larger one from `new_model`.
 
-    Raises UserError if the folder has no such weights, or those of another size.
+    `base` is the folder of a text model that `harness model distill` made; its vocabulary is the
+    beginning of the model's. Raises UserError if the folder has no such weights, or those of
+    another size.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -146,7 +149,7 @@ def take_over(model: Any, base: Path) -> None:
 
 @lru_cache(maxsize=1)
 def image_processor() -> Any:
-    """Return what turns pictures into the model's patches."""
+    """Return the transformers image processor that cuts pictures into the patches of the model."""
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     pixels = {"shortest_edge": 1 << 12, "longest_edge": 1 << 20}
@@ -156,8 +159,9 @@ def image_processor() -> Any:
 
 
 def read_tokenizer(base: Path, sees: bool) -> Any:
-    """Read a model's tokenizer; for one that `sees`,
-    add the tokens around pictures behind its own.
+    """Read the `tokenizers.Tokenizer` of the model in the folder `base`.
+
+    With `sees`, the special tokens that mark a picture are added behind its vocabulary.
     """
     from tokenizers import Tokenizer
 
@@ -169,8 +173,10 @@ def read_tokenizer(base: Path, sees: bool) -> Any:
 
 
 def train_tokenizer(texts: Iterable[str], sees: bool = False) -> Any:
-    """Train a byte-level BPE `tokenizers.Tokenizer` with Qwen2's pre-tokeniser:
-    every digit stands alone.
+    """Train a byte-level BPE `tokenizers.Tokenizer` of 768 entries on texts.
+
+    It splits text as Qwen2's does, so that every digit is a token of its own. With `sees`, it also
+    has the special tokens that mark a picture.
     """
     from tokenizers import models, pre_tokenizers, trainers
 
@@ -193,9 +199,9 @@ def _special(texts: Sequence[str]) -> list[Any]:
 
 
 def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
-    """Return a prompt as the model reads it: its system message, and the rest up to the answer.
+    """Return a chat in ChatML as two texts: the system message, and the rest up to the answer.
 
-    A picture's mark stands there once for each of its tokens.
+    A message with the key `image` begins with its picture: one mark for each token of the picture.
     """
     picture = f"{BEGINS}{PICTURE * VISION.tokens}{ENDS}"
     parts = [
@@ -205,8 +211,9 @@ def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
 
 
 def save_tokenizer(tokenizer: Any, folder: Path) -> None:
-    """Write it as transformers reads it, chat template included,
-    and what makes patches of pictures.
+    """Write a `tokenizers.Tokenizer` and its chat template to a folder, as transformers reads them.
+
+    If it has the tokens of pictures, the settings of the image processor are written, too.
     """
     from transformers import PreTrainedTokenizerFast
 

@@ -17,7 +17,10 @@ STEPS = 5
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]
-    """Nesterov momentum 0.95, orthogonalised; matrices of one shape together."""
+    """Optimise matrices with Muon: Nesterov momentum of 0.95, orthogonalised.
+
+    Matrices of one shape are orthogonalised as one batch.
+    """
 
     def __init__(self, matrices: Iterable[Any], lr: float, weight_decay: float) -> None:
         super().__init__(matrices, {"lr": lr, "weight_decay": weight_decay, "momentum": 0.95})
@@ -43,8 +46,9 @@ def _shape(p: Any) -> tuple[int, int]:
 
 
 def orthogonal(m: Any) -> Any:
-    """Matrices (n, rows, columns) with their singular values near 1,
-    by Newton and Schulz's iteration.
+    """Return matrices (n, rows, columns) with their singular values moved near 1.
+
+    This is Newton and Schulz's iteration, five steps of a quintic polynomial.
     """
     if m.shape[1] > m.shape[2]:
         return orthogonal(m.mT).mT

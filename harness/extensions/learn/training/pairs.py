@@ -41,11 +41,12 @@ def write(
     dataset: Path | None = None,
     margin: float | None = None,
 ) -> Path:
-    """Write a run's pairs to a file, with a `margin` its preferences, and return its path.
+    """Write a run's chats for fine-tuning to a file as JSON Lines, and return its path.
 
-    Raises UserError if the run was driven, its dataset or prompt is not here as it was, an answer
-    is not what its text says, or, where `report_seeds_too` is false, its layouts are not those of
-    their seeds or numbers are reported of them.
+    Without `margin` they are those of `pairs`, with it those of `preferences`. Raises UserError if
+    the run was driven, its dataset or prompt is not here as it was, or an answer does not match its
+    text; and, unless `report_seeds_too`, if it has report seeds or layouts that are not those of
+    their seeds.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
@@ -78,24 +79,24 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
 
 
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield what each viewer was asked, fusion calls included,
-    and the answer that the tree asks for.
+    """Yield each question of a run as a chat, with the answer that the decision tree asks for.
 
-    A decision point after which no action succeeds teaches nothing and is left out. The dataset is
-    the one that the run states, or lies in `folder`. Raises UserError if it or the prompt is not
-    here as it was.
+    A dict has `prompt` and `completion` (chat messages), and the scene, viewer, seed, actions,
+    their label (`probabilities`) and `values`. Fusion calls are included; a decision point at which
+    no action succeeds is left out. `folder` has the dataset; None finds the one that the run
+    states. Raises UserError if the dataset or the prompt is not here as it was.
     """
     for asked, completion, _ in _answered(run, folder):
         yield {"prompt": asked.pop("prompt"), "completion": _said(completion), **asked}
 
 
 def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the same with the model's own answer as the rejected one,
-    where it is worth less by `margin`.
+    """Yield each question of a run whose answer is worth less than the tree's by `margin` or more.
 
-    An answer is worth the probability with which its distribution leaves success possible; one that
-    cannot be read is worth nothing, and of a read-out the likeliest letter counts. What got no
-    answer is left out.
+    A dict is as of `pairs`, with `chosen` (the tree's answer), `rejected` (the model's) and
+    `value_rejected`. An answer is worth the probability that it gives to actions after which
+    success is possible; one that cannot be parsed is worth 0, and of a read-out the likeliest
+    letter counts. A question without an answer is left out.
     """
     for asked, completion, stored in _answered(run, folder):
         values, p, raw = asked["values"], stored.intent, stored.raw

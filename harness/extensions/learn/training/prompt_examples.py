@@ -25,15 +25,13 @@ Candidate = tuple[SceneGraph, Floats, int]
 def examples(
     prompt: Prompt, scenario: Scenario, count: int, first_seed: int, progress: Callable[[int], None]
 ) -> Examples:
-    """Draw `count` examples for each role, 1 or more,
-    each from a layout of its own from `first_seed` on.
+    """Draw `count` examples for a prompt, 1 or more for each role, each from a layout of its own.
 
-    Of a layout's decision points, one is taken whose best action the role's examples have shown
-    least so far, the most careful of such actions first, and whose viewer sees a conflict, so that
-    there is a reason to be seen; a keyed draw decides between equals. A layout in which nothing is
-    safe is passed over, and so are a few whose best actions have all been shown oftener than
-    others. `progress` is called with 1 for each layout that gave examples. Raises UserError if the
-    train seeds end before there are enough.
+    Layouts have the seeds from `first_seed` on. An example is a decision point of its layout whose
+    best action the role's examples show least so far, and whose viewer sees a conflict where one
+    does. A layout with no safe action is passed over, and so are a few that repeat frequent
+    actions. `progress` is called with 1 for each layout used. Raises UserError if the train seeds
+    end too early.
     """
     chosen: dict[str, list[Example]] = {role: [] for role in ROLES}
     times = {role: [0] * len(scenario.actions) for role in ROLES}

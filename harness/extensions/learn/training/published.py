@@ -32,18 +32,18 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 
 @dataclass(frozen=True)
 class Adapt:
-    """How a published model is changed."""
+    """Describe how a published model is fine-tuned."""
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
     # in which its layers compute; weights are float32
     dtype: Literal["float32", "bfloat16"] = "float32"
-    # weight of the words behind a letter, which it learns soon, beside the letter's KL
+    # weight of the loss of the words that follow an answer's letter, beside the letter's KL
     report: float = 0.3
 
 
 class Published:
-    """A published model of texts that learns, and how it reads a chat."""
+    """Hold a published text model while it is fine-tuned, with its tokenizer and chat template."""
 
     def __init__(self, card: Card, adapt: Adapt, seed: int, device: str) -> None:
         """Open a card's weights on transformers.
@@ -70,8 +70,10 @@ class Published:
             trunk.forward = torch.autocast(torch.device(device).type, torch.bfloat16)(trunk.forward)
 
     def read(self, messages: Sequence[Mapping[str, str]]) -> tuple[NDArray[np.int32], int, str]:
-        """Return a prompt's tokens, how many of them all of its kind share,
-        and a name for that kind.
+        """Return a chat's token ids, how many of them it shares with similar chats, and a key.
+
+        Chats with equal keys share their first tokens, all messages but the last, which are
+        computed once.
         """
         ids = self.encode(self.chat.render(messages, thinking=False))
         kind = "\n".join(message["content"] for message in messages[:-1])
@@ -83,7 +85,9 @@ class Published:
         return np.array(ids, dtype=np.int32), shared, f"{shared} {kind}"
 
     def letters(self, texts: str) -> list[int]:
-        """Return the token of each letter. Raises UserError if one is none."""
+        """Return the token id of each letter of `texts`.
+        Raises UserError if a letter is not one token.
+        """
         tokens = [self.encode(text) for text in texts]
         if any(len(each) != 1 for each in tokens):
             raise UserError(
@@ -92,7 +96,7 @@ class Published:
         return [token for (token,) in tokens]
 
     def write(self, out: Path, weights: Mapping[str, Any]) -> None:
-        """Write the adapter, or the whole checkpoint with these weights, to a folder."""
+        """Write the LoRA adapter, or the whole checkpoint with these weights, to a folder."""
         if any(isinstance(module, low_rank.LowRank) for module in self.model.modules()):
             low_rank.write(self.model, out, base_name(self.card))
             return
@@ -116,9 +120,7 @@ class Published:
 
 
 def base_name(card: Card) -> str:
-    """Return what `--model` opens a base by, on any engine:
-    the name of its card file, a path or an id.
-    """
+    """Return how `--model` names a card's model: its card file, a path or a hub id."""
     named = argument(card)
     return named.partition(":")[0] if named == card.name else named
 
@@ -132,8 +134,9 @@ def _digest(card: Card, where: Path) -> str:
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
-    """Write README.md of a taught model's folder from what `distill` returns:
-    base, data and losses.
+    """Return the README.md of a fine-tuned published model as Markdown: base, data and losses.
+
+    `facts` is what `distill` returns.
     """
     plan, adapt = facts["plan"], facts["plan"]["adapt"]
     loss_rows = []
@@ -200,8 +203,9 @@ out. The losses are of different sums and compare within a stage only; curves ar
 
 
 def references_table(facts: Mapping[str, Any]) -> str:
-    """Return a Markdown table of the value of those who need no model,
-    beside the model's, by scenario.
+    """Return a Markdown table of values by scenario: the model's, and those of rule drivers.
+
+    `facts` is what `distill` returns.
     """
     names = dict.fromkeys(name for row in facts["held_out"] for name in row["references"])
     lines = [f"| scenario | the model | {' | '.join(f'`{name}`' for name in names)} |"]

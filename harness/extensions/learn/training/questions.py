@@ -25,22 +25,25 @@ ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 
 @dataclass(frozen=True)
 class Question:
-    """One prompt."""
+    """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get."""
 
     key: str  # scenario, scene, viewer and prompt version, and `+m` where messages are in it
     scenario: Scenario  # what is decided in
     prompt: Prompt  # which version
-    graph: SceneGraph  # the viewer's scene graph
+    graph: SceneGraph  # what the viewer knows of the scene
     messages: tuple[Mapping[str, str], ...]  # chat messages
-    label: Floats  # soft label, (A,)
-    weight: float  # how often it is learnt, beside others
+    label: Floats  # soft label, (A,): probabilities of the scenario's A meta-actions
+    weight: float  # training weight, relative to that of other questions
     image: Sight | None = None  # what the viewer's cameras see, if the prompt shows it
     heard: Sequence[Mapping[str, Any]] = ()  # helpers' messages in the prompt
     excerpt: SceneGraph | None = None  # what of the graph the prompt shows, if not all
 
     @property
     def named(self) -> bool:
-        """Whether the prompt names those of whom the answer may speak; a picture names nobody."""
+        """Return whether the prompt names a vehicle whose path conflicts with the ego's.
+
+        It is false for a picture, which shows no names.
+        """
         return any(f"{c.vehicle} " in self.messages[-1]["content"] for c in self.graph.conflicts)
 
     @property
@@ -49,14 +52,14 @@ class Question:
 
     @property
     def read_out(self) -> tuple[Mapping[str, str], ...]:
-        """Return the chat messages that ask for a letter."""
+        """Return the prompt's chat messages, asking for one letter (read-out)."""
         shown, words = self.excerpt or self.graph, self.scenario.prompt_words
         messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
         return in_mode("readout", self.prompt, messages, self.graph, self.actions, words)
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:
-    """Ask every viewer on its own."""
+    """Yield a question without helpers' messages for every scene, viewer and prompt version."""
     for scene in lessons.scenes:
         for viewer in scene.viewers:
             for prompt in lessons.prompts:
@@ -64,8 +67,9 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 
 
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
-    """Repeat the questions that have conflicts or a picture,
-    with no text in them but the conflicts.
+    """Yield shorter copies of questions, in whose scene graph only the conflicts are left.
+
+    Questions with neither conflicts nor a picture are left out.
     """
     for q in questions:
         if q.graph.conflicts or q.image:
@@ -77,8 +81,10 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
 def with_messages(
     lessons: Lessons, scenes: Sequence[Scene], intents: Mapping[str, Floats]
 ) -> Iterator[Question]:
-    """Ask the ego with what some of its helpers sent;
-    `intents` are the helpers' read-outs, by key.
+    """Yield questions to the ego that show helpers' messages, by scene and prompt version.
+
+    `intents` has each helper's intent (A,), by the `key` of its question. Each message arrives with
+    probability 0.85, by draws keyed by layout and scene; a scene in which none arrives is left out.
     """
     for scene in scenes:
         ego, *helpers = scene.viewers
@@ -101,7 +107,10 @@ def question(
     prompt: Prompt,
     heard: Sequence[Mapping[str, Any]] = (),
 ) -> Question:
-    """Return what a viewer is asked in a scene, with the messages that it heard."""
+    """Return the question to one viewer of a scene, for a prompt version.
+
+    `heard` has the helpers' messages that the prompt shows, each as a dict with its `sender`.
+    """
     graph, scenario = scene.graphs[viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
@@ -111,15 +120,15 @@ def question(
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
-    """Return the name of a viewer's question."""
+    """Return the key of a question: `scenario/scene/viewer/prompt version`."""
     return f"{lessons.scenario.name}/{scene.id}/{viewer}/{prompt.version}"
 
 
 def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
-    """Return the mean probability that answers (n, A) give to actions after which the episode
-    succeeds.
+    """Return the weighted mean probability of success of answers to n questions.
 
-    Those are the actions that the soft labels (n, A) give any.
+    `p` (n, A) has the stated distributions, and `labels` (n, A) the soft labels, which are above 0
+    for the actions after which the episode succeeds; `weights` has n.
     """
     return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
 
@@ -127,7 +136,11 @@ def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
 def references(
     questions: Sequence[Question], labels: Floats, weights: Sequence[float]
 ) -> dict[str, float]:
-    """Return the value of those who need no model: lines beside a model's, by the driver's name."""
+    """Return the value of drivers that need no model at n questions, by the driver's name.
+
+    They are `uniform`, `local-view` and, where the scenario has one, `constant`; `labels` (n, A)
+    are soft labels, and the value is that of the function `value`.
+    """
     scenario = questions[0].scenario
     each = np.eye(len(scenario.actions))
     policies = {UNIFORM: np.full(labels.shape, 1 / len(each))}
@@ -139,7 +152,7 @@ def references(
 
 
 def kl_nats(labels: Floats, p: Floats) -> float:
-    """Return the mean KL divergence of answers (n, A) from soft labels (n, A)."""
+    """Return the mean KL divergence in nats of answers `p` (n, A) from soft labels (n, A)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(labels > 0, labels * np.log(labels / np.maximum(p, 1e-12)), 0.0)
     return float(terms.sum(axis=1).mean())

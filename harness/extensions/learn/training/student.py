@@ -59,7 +59,7 @@ T = TypeVar("T")
 
 
 class Student:
-    """The lessons as questions, the tokenizer, and the model as it grows."""
+    """Hold a model in training, with its questions and tokenizer, and train it stage by stage."""
 
     def __init__(
         self,
@@ -96,13 +96,12 @@ class Student:
             self.taught = {_place(q): intent for q, intent in zip(texts, read, strict=True)}
 
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
-        """Make samples that ask for one letter;
-        drawn by the target, it is followed by a report in words.
+        """Return samples of questions whose answer is one letter, followed by a report in words.
 
-        The target is the label. A picture's is what the base reads out of the same viewer's scene
-        graph in words, if it learns both: a label depends on what nobody sees as well, which is
-        noise to an eye that has yet to open. The report is of the nearest conflict, or of whom the
-        picture shows, where there is one and `seen` is true.
+        The letter is drawn from the target: the soft label. If a base model with text prompts is
+        there, a picture's target is that model's read-out of the same scene in words, which has
+        less noise. The report tells the nearest conflict; of a picture, if `seen`, the vehicles
+        that it shows.
         """
         rng = np.random.default_rng(self.plan.seed)
         samples = []
@@ -114,7 +113,7 @@ class Student:
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
-        """Make samples whose answer states a distribution."""
+        """Return samples of questions, answered by JSON that states these intents, (A,) each."""
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         samples = []
         for q, intent, is_bare in zip(questions, intents, bare.tolist(), strict=True):
@@ -124,14 +123,14 @@ class Student:
 
     @cached_property
     def asked(self) -> list[Sample]:
-        """Return the questions, each asking for one letter."""
+        """Return a sample with a one-letter answer for each question without helpers' messages."""
         return self.reading(self.questions)
 
     @cached_property
     def heard(self) -> list[Question]:
-        """Return the ego's questions with messages in some scenes;
-        the first stages' model states them.
+        """Return questions to the ego with helpers' messages, whose intents the model states.
 
+        The intents are the model's after the stage `alone`, kept in a file for a resumed training.
         Raises UserError if no message reaches the ego in the scenes that are taken.
         """
         prompts = sum(len(lessons.prompts) for lessons in self.lessons)
@@ -164,7 +163,10 @@ class Student:
         return heard
 
     def samples(self, stage: str) -> list[Sample]:
-        """Make what a stage learns from; the last two rehearse the read-outs of earlier ones."""
+        """Return the samples of a stage: `excerpts`, `alone`, `messages` or `answers`.
+
+        The last two stages repeat one-letter samples of the earlier ones.
+        """
         if stage == "excerpts":
             return self.reading(list(excerpts(self.questions)), seen=True)
         if stage == "alone":
@@ -188,13 +190,14 @@ class Student:
         return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
-        """Draw at most so many items by the plan's seed, in their order."""
+        """Return at most `most` random items, in their order; the plan's seed draws them."""
         places = np.random.default_rng(self.plan.seed).permutation(len(items))[:most]
         return [items[i] for i in sorted(places)]
 
     def stage(self, name: str, progress: Progress) -> Curve:
-        """Train one stage, or read it if it is done already;
-        return its curve, empty without sequences.
+        """Train a stage, or load its weights if it is done, and return its loss curve.
+
+        The curve is empty for a stage of no sequences.
         """
         done = self.work / f"{name}.pt"
         if done.is_file():
@@ -235,8 +238,9 @@ class Student:
         return kl_nats(labels, read), value(labels, read, [sample.weight for sample in samples])
 
     def rounded(self) -> dict[str, Any]:
-        """Round what learnt to F16, so that every engine reads the same numbers,
-        and return all weights.
+        """Round the trainable weights to F16 in place, and return all weights by name.
+
+        So every engine computes with the same numbers.
         """
         halves: dict[int, Any] = {}  # by address, since some have two names
         with torch.no_grad():
@@ -246,11 +250,11 @@ class Student:
         return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
 
     def held_out_facts(self) -> list[dict[str, Any]]:
-        """Return how each scenario's read-out fits the soft labels on held-out layouts.
+        """Return for each scenario, as a dict, how the read-out fits labels of held-out layouts.
 
-        That is its KL (nats), and its value, balanced over layouts with and without a danger.
-        Beside them stand those of always answering the mean label, the value of its likeliest
-        action, and that of who needs no model.
+        It has the KL in nats and the `value` (see `questions.value`), balanced over layouts with
+        and without a danger; the same of always answering the mean label; and the values of drivers
+        that need no model.
         """
         facts = []
         for each in self.held_out:

@@ -49,16 +49,16 @@ KEEP_S = 60.0  # a killed run loses at most so much
 
 @dataclass(frozen=True)
 class Sample:
-    """One sequence."""
+    """Hold one training sequence: the tokens of a prompt and its answer, and its target."""
 
     ids: NDArray[np.int32]  # token ids, the shared beginning included
-    shared: int  # how many of them are the system message, equal in all samples of a `kind`
-    kind: str  # names that system message
-    answer_at: int  # where the answer starts
+    shared: int  # number of tokens of the shared beginning, equal in all samples of a `kind`
+    kind: str  # key of that beginning
+    answer_at: int  # index in `ids` at which the answer starts
     # what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
     # text from its first token
     target: Floats | None
-    weight: float = 1.0  # how often it is drawn, beside others
+    weight: float = 1.0  # sampling weight, relative to that of other samples
     # the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
     # or none has
     image: Sight | None = None
@@ -66,18 +66,18 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """How long and how fast."""
+    """Describe a training: its length, batch size, learning rates, seed and objective."""
 
     samples: dict[str, int]  # sequences per stage, by name
     batch: int = 16  # sequences a step
     muon_lr: float = 3e-3  # learning rate of the matrices (Muon)
     adam_lr: float = 3e-3  # learning rate of embeddings and norms (AdamW)
-    seed: int = 0  # of the weights and of the order
+    seed: int = 0  # of the initial weights and of the order of samples
     adapt: Adapt | None = None  # how a published model is changed; None for one of ours
     objective: Objective = "imitation"  # what a letter's probability is fitted to
 
     def settings(self) -> dict[str, Any]:
-        """Return, as plain values, what a resumed training must have in common with its start."""
+        """Return as plain values the settings that a resumed training must not change."""
         settings = asdict(self)
         # trainings that were begun before there was another say nothing
         if self.objective == "imitation":
@@ -100,12 +100,12 @@ def run_stage(
     going: Path,
     watch: Callable[[], Sequence[float]] = tuple,
 ) -> Curve:
-    """Train on `count` sequences drawn from `samples`,
-    resuming from the checkpoint `going` if there is one.
+    """Train on `count` sequences drawn from `samples`, and return the loss curve.
 
-    `letters` and `digits` are the ids of the tokens that a read-out and a picture's tokens are
-    fitted to. Returns, along the way, the sequences seen, the mean loss since the last, and what
-    `watch` returns then.
+    `letters` and `digits` are the ids of the tokens that state an action and an image token's
+    class. `going` is the checkpoint file of this stage, from which a killed call resumes. Every 50
+    steps the curve gets the sequences seen, the mean loss since then, and what `watch` returns;
+    `progress` is called with them.
     """
     device = next(model.parameters()).device
     opts, rates = _optimizers(model, plan)
@@ -176,7 +176,7 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
 
 
 def learnt(model: Any) -> dict[str, Any]:
-    """Return a model's state without the weights that do not learn."""
+    """Return the trainable part of a model's state dict."""
     # an output embedding may be the input's as well
     every = model.named_parameters(remove_duplicate=False)
     frozen = {name for name, p in every if not p.requires_grad}
@@ -184,7 +184,7 @@ def learnt(model: Any) -> dict[str, Any]:
 
 
 def restore(model: Any, state: Mapping[str, Any]) -> None:
-    """Give a model the state that `learnt` returned."""
+    """Load a trainable state, as `learnt` returns it, into a model."""
     model.load_state_dict({**model.state_dict(), **state})
 
 
@@ -213,7 +213,10 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
 
 
 def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
-    """Return states after the shared beginning, (n, longest rest, hidden); padding is not seen."""
+    """Return the last hidden states behind a batch's shared tokens: (n, longest rest, hidden).
+
+    The samples are of one `kind`. States at padding mean nothing.
+    """
     from transformers import DynamicCache
 
     device = next(model.parameters()).device
@@ -245,8 +248,11 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan: Plan) -> Any:
-    """Return how ill the read-out fits its target,
-    plus mean cross-entropies of text and pictures.
+    """Return the training loss of a batch, a scalar tensor.
+
+    It is the loss of the read-out beside its target (`fitting`), plus mean cross-entropies of
+    prompt text, answer text and image tokens. `letters` and `digits` are tensors of token ids, as
+    in `run_stage`.
     """
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
@@ -292,11 +298,11 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
 
 
 def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
-    """Return the mean loss of letters' logits (n, A) beside soft labels (n, A), by the objective.
+    """Return the mean loss of letter logits (n, A) beside soft labels (n, A).
 
-    `imitation` is the KL to the label, in nats. `values` is what the stated distribution p loses of
-    the value that it can have, 1 - sum_a p(a) v(a), where v(a) is 1 if the episode succeeds after
-    the action: its gradient is the policy gradient, exact since the tree knows v of every action.
+    `imitation` is the KL divergence from the label, in nats. `values` is 1 - sum_a p(a) v(a), where
+    p is the softmax of the logits and v(a) is 1 if the episode succeeds after action a: its
+    gradient is the exact policy gradient.
     """
     if objective == "imitation":
         return F.kl_div(F.log_softmax(logits, -1), labels, reduction="batchmean")
@@ -331,7 +337,10 @@ def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
 def read_out(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64
 ) -> list[Floats]:
-    """Return the distribution over the letters after each prompt, (A,) each."""
+    """Return the model's distribution over the action letters at each sample's answer, (A,) each.
+
+    `letters` has the letters' token ids; `batch` is the number of samples computed at once.
+    """
     model.eval()
     device = next(model.parameters()).device
     of_letters = model.get_output_embeddings().weight[torch.tensor(letters, device=device)]
@@ -361,6 +370,6 @@ def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
 
 
 def save(state: Mapping[str, Any], path: Path) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a training checkpoint to a file, whole or not at all."""
     with replacing(path) as part:
         torch.save(state, part)
