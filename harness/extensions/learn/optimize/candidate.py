@@ -24,22 +24,22 @@ SYSTEM = re.compile(r"(\{%-?\s*block\s+system\s*-?%\})(.*?)(\{%-?\s*endblock\b)"
 
 @dataclass(frozen=True)
 class Candidate:
-    """A prompt that is tried."""
+    """Hold one wording of a prompt that a search tries."""
 
-    prompt: Prompt  # of the base's name
+    prompt: Prompt  # the wording as a prompt version, under the name of the one searched
     what: str  # how it differs from the base, in a line
     rewritten: Mapping[str, str] = field(default_factory=dict)  # texts of blocks `system`, by role
 
     @property
     def key(self) -> str:
-        """The digest of its files."""
+        """Return the sha256 of the prompt's files, by which candidates are told apart."""
         return self.prompt.sha256
 
 
 def space(prompt: Prompt) -> dict[str, int]:
-    """Return the number of alternatives of each choice that the author of a prompt marked, by name.
+    """Return how many alternatives a prompt's author marked for each choice, by the choice's name.
 
-    Raises UserError if a mark cannot be chosen from.
+    Raises UserError if a mark is malformed.
     """
     try:
         marks = counts(prompt.texts.values())
@@ -49,8 +49,10 @@ def space(prompt: Prompt) -> dict[str, int]:
 
 
 def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
-    """Return a prompt with alternatives chosen by number, from 0.
-    Raises UserError if its files are wrong.
+    """Return a prompt with one alternative of each choice, as a candidate.
+
+    `choice` has the number of the alternative, from 0, by the choice's name; others take the first.
+    Raises UserError if the prompt's files are wrong.
     """
     sizes = space(base)
     changes = ", ".join(f"{name} {n + 1} of {sizes[name]}" for name, n in choice.items() if n)
@@ -66,7 +68,7 @@ def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
 
 
 def systems(base: Prompt) -> dict[str, str]:
-    """Return the text of each role's block `system`, with its first alternatives."""
+    """Return the text of the template block `system` of each role, with its first alternatives."""
     texts = {}
     for role in ROLES:
         match = SYSTEM.search(resolved(base.texts[role]))
@@ -76,8 +78,9 @@ def systems(base: Prompt) -> dict[str, str]:
 
 
 def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
-    """Return a prompt with some roles' blocks `system` rewritten.
-    Raises UserError if its files are wrong.
+    """Return a prompt whose template block `system` is replaced by `texts`, by role.
+
+    Raises UserError if the prompt's files are wrong.
     """
     first, own = chosen(base), systems(base)
     files = dict(first.prompt.files)
@@ -114,7 +117,10 @@ def _toml(value: Any) -> str:
 
 
 def write(candidate: Candidate, folder: Path, more: Mapping[str, str]) -> None:
-    """Write a version's files, and beside them others that are not part of its digest."""
+    """Write a candidate's prompt files to a folder, and `more` files, by name, beside them.
+
+    The further files are not part of the prompt's digest.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     ordered: Sequence[str] = [
         *more,

@@ -41,11 +41,11 @@ form of the answer alone, which is asked for elsewhere. Write only the template,
 
 
 def alternatives(tuning: Tuning) -> None:
-    """Search the marked alternatives by coordinate descent.
+    """Search the alternatives that a prompt's author marked, by coordinate descent.
 
     Each alternative of each choice is played with the best of the others, first on half of the
-    layouts, and on the rest if it is not worse there. The best stays; it ends when a round over all
-    choices changes nothing.
+    layouts, and on the rest if it is not worse there. The search ends when a round over all choices
+    changes nothing, or raises Spent when the budget of questions is spent.
     """
     base = tuning.base
     sizes = space(base)
@@ -67,11 +67,11 @@ def _better(tuning: Tuning, new: Candidate, old: Candidate) -> bool:
 
 
 class Reflecting:
-    """The engine of GEPA, with a model that reads what went wrong and writes system messages anew.
+    """Search with GEPA: a model reads what went wrong, and rewrites the system messages.
 
     Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs the loop. All that it
-    draws is seeded, and what the model wrote is kept, so that a stopped search goes on by beginning
-    again.
+    draws is seeded, and what the model wrote is kept, so that a stopped search resumes by
+    repeating.
     """
 
     def __init__(
@@ -81,8 +81,10 @@ class Reflecting:
         settings: Mapping[str, Any],
         roles: Sequence[str],
     ):
-        """`asked` is the model; `kept` the file of what it wrote so far in a search of these
-        settings.
+        """Set up the search; `asked` sends a text to the rewriting model and returns its reply.
+
+        `kept` is the file of the replies so far to a search of these `settings`; `roles` are those
+        whose messages are rewritten.
         """
         self._asked, self._roles = asked, roles
         self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()))
@@ -122,8 +124,9 @@ class Reflecting:
 
 
 def asked_of(backend: Backend) -> Callable[[str], str]:
-    """Return a model as a function from a question to its answer.
-    It raises Unanswered if there is none.
+    """Return a function that sends one text to a model and returns its reply.
+
+    The function raises Unanswered if the model gives none.
     """
 
     def asked(prompt: str) -> str:

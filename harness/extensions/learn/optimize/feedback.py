@@ -12,8 +12,9 @@ from harness.world.scene_graph import Conflict
 
 
 def of_course(played: Played) -> tuple[Decision, str]:
-    """Return the decision of a course that lost most,
-    and what is to be said of it and of the outcome.
+    """Return the decision of an episode that lost most, and feedback in words about it.
+
+    The feedback is that of `of_decision`, and whether the episode succeeded.
     """
     lost = [_lost(decision) for decision in played.course]
     worst = played.course[int(np.argmax(lost))]
@@ -24,11 +25,12 @@ def of_course(played: Played) -> tuple[Decision, str]:
 
 
 def of_decision(decision: Decision) -> str:
-    """Return what was stated and done, what each action was worth,
-    and who was out of sight and unreported.
+    """Return feedback in words on one decision, for a model that rewrites the prompt.
 
-    An action's worth is the probability that the episode succeeds after it if all later actions are
-    drawn evenly (`Forest.worth`). What an action lost is the best action's worth less its own.
+    It says what was stated and done, what each action was worth, and which vehicles in the ego's
+    way were out of its sight and in no message. The worth is the probability that the episode
+    succeeds after the action if all later actions are drawn evenly (`Forest.worth`); what an action
+    lost is the best action's worth less its own.
     """
     actions = decision.dataset.actions
     stated = ", ".join(

@@ -22,8 +22,9 @@ from harness.world.scenario import Scenario
 
 
 def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
-    """Raise UserError unless all layout seeds of a dataset, `count` from `first` on,
-    are for this purpose.
+    """Raise UserError unless `count` layout seeds from `first` on are all for the purpose `wanted`.
+
+    `option` and `name` name the dataset in the message.
     """
     if purposes(first, count) != [wanted]:
         raise UserError(
@@ -34,10 +35,10 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
 
 
 def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSource]:
-    """Return datasets of tune layouts for those that are reported.
+    """Return the user's datasets of tune layouts, one for each dataset of report layouts.
 
-    Raises UserError unless there is one of each scenario, in order,
-    whose layouts are those of its seeds.
+    Raises UserError unless they are of the same scenarios in the same order, share no layout with
+    them, and hold the layouts of their own seeds.
     """
     if len(names) != len(reported):
         raise UserError(
@@ -70,7 +71,10 @@ def built(
     workers: Workers,
     progress: Progress,
 ) -> list[FrozenSource]:
-    """Return tune layouts of each scenario, which are frozen if they are not there."""
+    """Return a dataset of tune layouts for each scenario, built in the folder `place` if missing.
+
+    Each has `layouts` layouts, with seeds from `first_seed` on.
+    """
     from harness.dataset.build import build
 
     sources = []
@@ -91,8 +95,12 @@ def counted(
     episodes: Sequence[int],
     tokenizer: Path | None,
 ) -> dict[str, Any]:
-    """Return how many requests are to be expected, and the tokens of their prompts,
-    from tune layouts.
+    """Return what a search is expected to ask, as the dict that `--dry-run` prints.
+
+    It has the marked choices, requests for one wording and for the certificate on report layouts,
+    and prompt tokens. `sizes` has the alternatives of each choice, `layouts` and `episodes` the
+    layouts of each tune and report dataset; `specs` are evaluations on a few tune layouts, from
+    which it counts.
     """
     of_family = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
     here = [len(list(spec.source.layout_seeds)) for spec in specs]

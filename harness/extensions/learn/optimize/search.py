@@ -41,12 +41,12 @@ OLD, NEW = "base", "winner"  # the folders of the two runs on report layouts
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, and where it is written."""
+    """Describe a search for a better wording of a prompt: its layouts, its budget, its output."""
 
-    base: Prompt
+    base: Prompt  # the prompt version whose wording is searched
     # evaluations of the base on tune layouts, one a family, each of one condition
     tune: Sequence[Spec]
-    # the same on report layouts: they are opened when a winner stands, and not before
+    # return the same on report layouts; called after the search, if it has a winner
     report: Callable[[], Sequence[Spec]]
     budget: int  # most questions on tune layouts
     version: str  # name of the version that is made
@@ -56,7 +56,7 @@ class Search:
 
 
 def choices(prompt: Prompt) -> dict[str, int]:
-    """Return the number of alternatives of each choice of a prompt.
+    """Return how many alternatives each marked choice of a prompt has, by the choice's name.
     Raises UserError if there are none.
     """
     sizes = space(prompt)
@@ -69,7 +69,7 @@ def choices(prompt: Prompt) -> dict[str, int]:
 
 
 def render_all(spec: Spec) -> None:
-    """Render each alternative once. Raises UserError if one does not render."""
+    """Render each alternative of a prompt once, on one scene. Raises UserError if one fails."""
     sizes = space(spec.ego.prompt)
     [scene] = spec.source.trial(1, ego_alone=False)
     graphs = {graph.role: graph for graph in scene.graphs.values()}
@@ -94,11 +94,12 @@ def search(
     progress: Progress,
     cache_file: Path | None,
 ) -> Study:
-    """Search, certify, write the version, and return what was tried and what it gained.
+    """Search a better wording, measure the winner on report layouts, and write it as a version.
 
-    `place` is the folder of what is kept until the end. The two runs on report layouts stay in
-    `out`. If no candidate is better than the base on tune layouts, no report layout is read and no
-    version written.
+    Returns a study of what was tried and gained. `place` is the folder of what is kept until the
+    end; the two runs on report layouts stay in `out`. If no candidate beats the base on tune
+    layouts, no report layout is read and no version written. Raises UserError if the budget does
+    not suffice for the base.
     """
     for spec in plan.tune:
         render_all(spec)
@@ -140,9 +141,10 @@ def search(
 
 
 def looks(base: Prompt, where: Path) -> int:
-    """Return how often report layouts were read for the versions that a prompt comes from.
+    """Return how often report layouts were read for the versions from which `base` was made.
 
-    It is 0 where no history of this program says so.
+    `where` is the folder of prompt versions. It is 0 if the version has no history file of a
+    search.
     """
     with suppress(*BROKEN):
         return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))

@@ -36,26 +36,28 @@ TIE = 1e-3  # weight of worth in a score
 
 
 class Spent(Exception):
-    """The budget does not suffice for what would be asked next."""
+    """Signal that the budget of questions does not suffice for what would be asked next."""
 
 
 class Decision(NamedTuple):
-    """One decision on a course, for feedback."""
+    """Hold one decision of an episode, from which feedback is written."""
 
-    dataset: Dataset  # of the layout alone
+    dataset: Dataset  # the layouts that were played, with their trees
     scene: Scene
-    policy: Floats  # what was stated, (A,)
-    action: int  # what was done
+    policy: Floats  # the distribution after fusion, (A,)
+    action: int  # index of the action taken
     heard: tuple[Answer, ...]  # the answers of the helpers whose messages came in time
     raw: str  # the ego's own answer
 
 
 class Played(NamedTuple):
-    """What a candidate did on one layout."""
+    """Hold the result of a candidate on one layout."""
 
-    success: float  # over the channel seeds
-    worth: float  # of what it stated, over the decisions in which success was still possible
-    course: tuple[Decision, ...]  # under the first channel seed
+    success: float  # share of successful episodes over the channel seeds
+    # mean probability of success under the stated distributions if later actions are drawn evenly,
+    # over the decisions at which success was still possible; 0 without one
+    worth: float
+    course: tuple[Decision, ...]  # the episode's decisions under the first channel seed
 
     @property
     def score(self) -> float:
@@ -64,22 +66,22 @@ class Played(NamedTuple):
 
 @dataclass
 class Record:
-    """What is known of a candidate."""
+    """Hold all results of one candidate so far."""
 
     candidate: Candidate
     length: int  # characters of the ego's prompt, in the first decision point of each family
     played: dict[int, Played] = field(default_factory=dict)  # by the layout's number
-    asked: set[Hashable] = field(default_factory=set)  # the questions so far
+    asked: set[Hashable] = field(default_factory=set)  # the questions charged to it so far
 
 
 class Tuning:
-    """Scores candidates, each question once, until the budget is spent.
+    """Score candidates on tune layouts, and stop when the budget of questions is spent.
 
     Attributes:
-        specs: the evaluations of the base on tune layouts, one a family; each has one condition.
-        base: the prompt that is searched.
-        budget: most questions.
-        records: every candidate that was played, by digest, in order.
+        specs: the evaluations of the base on tune layouts, one a scenario; each has one condition.
+        base: the prompt version whose wording is searched.
+        budget: most questions that may be asked.
+        records: the results of every candidate that was played, by its digest, in order.
         spent: questions so far, those of an earlier, stopped search included.
     """
 
@@ -92,7 +94,10 @@ class Tuning:
         place: Path,
         progress: Progress,
     ) -> None:
-        """`place` is the folder of the answers so far; `progress` gets the number of questions."""
+        """Set up; `place` is the folder of the answers so far.
+
+        `progress` gets the number of questions asked.
+        """
         self.specs, self.base, self.budget = specs, specs[0].ego.prompt, budget
         self.records: dict[str, Record] = {}
         self.spent = 0
@@ -101,8 +106,9 @@ class Tuning:
 
     @cached_property
     def layouts(self) -> list[tuple[int, int]]:
-        """The family and the number of each layout's episode;
-        layouts are named by their place here.
+        """Return the scenario's index and the episode number of each layout.
+
+        Other methods number layouts by their index in this list.
         """
         return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
 
@@ -112,15 +118,16 @@ class Tuning:
 
     @cached_property
     def first_half(self) -> Ints:
-        """Every second layout of each family with a danger, and of those without."""
+        """Return indices (n,) of every second layout with a danger, and without, by scenario."""
         kinds: dict[tuple[int, bool], list[int]] = {}
         for n, (family, _) in enumerate(self.layouts):
             kinds.setdefault((family, bool(self._dangerous[n])), []).append(n)
         return np.array(sorted(n for of_kind in kinds.values() for n in of_kind[::2]))
 
     def weights(self, layouts: Ints) -> Floats:
-        """Return what each of some layouts counts, 1 in all:
-        families alike, and both halves of each.
+        """Return the weights of layouts in a mean score, given their indices (n,); they sum to 1.
+
+        Scenarios weigh alike, and in each so do layouts with and without a danger.
         """
         family = np.array([self.layouts[n][0] for n in layouts])
         weights = np.zeros(len(layouts))
@@ -131,8 +138,9 @@ class Tuning:
         return np.asarray(weights / weights.sum())
 
     def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
-        """Return what a candidate does on some layouts.
-        Raises Spent before the budget is exceeded.
+        """Return a candidate's results on the layouts of these indices; only new ones are played.
+
+        Raises Spent before the budget would be exceeded.
         """
         wanted = list(layouts)
         record = self.records.get(candidate.key)
@@ -150,26 +158,28 @@ class Tuning:
         return [record.played[n] for n in wanted]
 
     def score(self, candidate: Candidate, layouts: Ints) -> float:
-        """Return a candidate's score over some layouts.
-        Raises Spent before the budget is exceeded.
+        """Return a candidate's mean score on the layouts of these indices (n,).
+
+        Raises Spent before the budget would be exceeded.
         """
         scores = [played.score for played in self.play(candidate, layouts.tolist())]
         return float(self.weights(layouts) @ scores)
 
     def rank(self, candidate: Candidate) -> tuple[float, int]:
-        """Return what grows with how good a candidate is on all layouts."""
+        """Return a candidate's sort key, greater for a better one: its score, and minus its length.
+
+        The score is over all layouts. Raises Spent before the budget would be exceeded.
+        """
         score = self.score(candidate, np.arange(len(self.layouts)))
         return round(score, 9), -self.records[candidate.key].length
 
     @property
     def tokens(self) -> int:
-        """The `tokens` of all answers so far."""
+        """Return the prompt and completion tokens of all answers so far."""
         return sum(tokens(read_kept(file).values()) for file in self._place.glob("answers-*.jsonl"))
 
     def best(self) -> Candidate:
-        """Return the best candidate of those that were played on all layouts;
-        of equals the first.
-        """
+        """Return the best candidate of those played on all layouts; of equal ones the first."""
         whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
         return max(whole, key=self.rank)
 
@@ -220,7 +230,10 @@ class Tuning:
         return played
 
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
-        """Take new questions from the budget. Raises Spent, and takes none, if too few are left."""
+        """Charge the new ones of these questions to the budget.
+
+        Raises Spent, and charges none, if the budget has too few left.
+        """
         new = set(questions) - record.asked
         if self.spent + len(new) > self.budget:
             raise Spent
@@ -262,12 +275,12 @@ class _Asker(Asker):
 
 
 def tokens(answers: Iterable[Answer]) -> int:
-    """Return the tokens of questions and answers together, as far as their engine counts them."""
+    """Return the sum of prompt and completion tokens of answers; uncounted ones count 0."""
     return sum((each.prompt_tokens or 0) + (each.completion_tokens or 0) for each in answers)
 
 
 def changed(spec: Spec, prompt: Prompt) -> Spec:
-    """Return an evaluation with another prompt, of all agents that have the ego's."""
+    """Return an evaluation with another prompt for all agents that have the ego's."""
     version = spec.ego.prompt.version
     helpers = [
         replace(each, prompt=prompt) if each.prompt.version == version else each
