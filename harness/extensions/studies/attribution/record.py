@@ -15,9 +15,7 @@ FILE = "attribution.json"
 
 
 class LeftOut(Struct, frozen=True, kw_only=True):
-    """One object or message that was left out of a prompt or of the fusion,
-    and what that changed.
-    """
+    """Hold what changed when one object or message was left out of a prompt or of the fusion."""
 
     scene: str  # id of the decision point
     episode: int  # the episode's number
@@ -35,7 +33,7 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 
 
 class Attribution(Struct, frozen=True, kw_only=True):
-    """A run's attribution: every item that was left out, one at a time."""
+    """Hold the result of leaving out objects and messages of a run, one at a time."""
 
     condition: str  # name of the condition whose decision points were drawn
     decision_points: int  # how many were drawn
@@ -45,7 +43,10 @@ class Attribution(Struct, frozen=True, kw_only=True):
 
 
 def of_run(run: Run) -> Attribution | None:
-    """Return a run's attribution; None if there is none. Raises UserError if the file is broken."""
+    """Read the attribution that lies in a run's folder; None if there is none.
+
+    Raises UserError if the file is broken.
+    """
     return run.read_file(FILE, _load) if (run.path / FILE).is_file() else None
 
 

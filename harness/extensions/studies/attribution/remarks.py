@@ -17,10 +17,13 @@ MOVED = 5  # decision points whose answers moved most
 
 
 class Remarks:
-    """The remarks of attributions; see `harness.report.remarks.Remarks`."""
+    """Tell a run's page what an attribution found; see `harness.report.remarks.Remarks`."""
 
     def sentences(self, runs: Runs) -> Iterator[Markup]:
-        """Of each run whose decision points were drawn: how many, and where most moved."""
+        """Yield a sentence, as HTML, for each run that has an attribution.
+
+        It says how many decision points were drawn, and at which of them answers moved most.
+        """
         template = environment(Path(__file__).parent).get_template("remark.html.j2")
         for n, run in enumerate(runs.runs):
             if a := of_run(run):
@@ -35,7 +38,11 @@ class Remarks:
                 yield Markup(template.render(text=drawn, runs=runs))
 
     def left_out(self, run: Run) -> LeftOut:
-        """What was left out of each decision point that was drawn, what moved most first."""
+        """Return, by decision point, the objects and messages left out, what moved most first.
+
+        Each is a dict with the fields of `record.LeftOut` and the `condition`; empty without
+        attribution.
+        """
         of: dict[str, list[dict[str, Any]]] = {}
         if a := of_run(run):
             for each in sorted(a.left_out, key=lambda each: -(each.shift or 0.0)):

@@ -49,20 +49,20 @@ KINDS = (
 
 @dataclass(frozen=True)
 class Row:
-    """How much one kind of thing moves."""
+    """Hold how much one kind of object or message moves answers, over all that were left out."""
 
-    role: str  # out of whose prompt it was left, or `fusion`
-    kind: str  # what it is
-    shift: Estimate  # mean total variation
-    flips: Estimate  # share whose likeliest action changed
-    failed: Estimate  # share whose answer without it failed, which the other two leave out
+    role: str  # whose prompt it was left out of, `ego` or `helper`; or `fusion`, for messages
+    kind: str  # kind of object or message, such as `hidden conflict vehicle`
+    shift: Estimate  # mean total variation distance of the answers with and without it
+    flips: Estimate  # share of answers whose likeliest action changed
+    failed: Estimate  # share of answers that failed without it; the other two leave these out
 
 
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
-    """Leave out every listed object and every message heard at some decision points of a run, in
-    turn.
+    """Measure what each listed object and each message heard changes, by leaving it out.
 
-    At most `sample` of the condition's decision points are drawn.
+    At most `sample` of the condition's decision points are drawn, by `seed`. Questions that the run
+    has no answer for are put to its model.
 
     Raises:
         UserError: the run has no such condition,
@@ -102,11 +102,10 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
 
 
 def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
-    """Draw decision points, each with the channel seed of one of its decisions;
-    return also of how many.
+    """Draw at most `sample` decision points of a condition, and for each a channel seed.
 
-    Each that the condition came to is as likely as any other, and so is each seed.
-    A larger sample has the smaller one in it.
+    Returns the seed by decision point, and how many decision points the condition has. All points
+    are equally likely, and so are the seeds of each; a larger sample contains a smaller one.
     """
     run = stored.run
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
@@ -125,7 +124,10 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
 
 
 def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
-    """Yield every listed object left out of every prompt about these decision points in turn."""
+    """Yield what each listed object changes when it is left out of one viewer's prompt.
+
+    This is done for every viewer of these scenes whose prompt lists the object.
+    """
     asked = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
     answers = stored.answered([*whole, *(request for *_, request in asked)])
@@ -181,8 +183,9 @@ def _kind(scene: Scene, viewer: str, item: str) -> str:
 def messages(
     stored: ReplayedRun, point: OperatingPoint, drawn: Mapping[str, int]
 ) -> Iterator[LeftOut]:
-    """Every message that was in time left out in turn;
-    `drawn` has a channel seed of each decision point.
+    """Yield what each message that came in time changes when it is left out of the fusion.
+
+    `drawn` has, by decision point, the channel seed of the decision that is taken.
     """
     memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
     for [part] in walk(world, [point], stored, stored.spec.ties):
@@ -255,7 +258,10 @@ def _left_out(
 
 
 def rows(result: Attribution) -> list[Row]:
-    """Return a row for each kind of thing that was left out; intervals are over episodes."""
+    """Return a row for each kind of object or message that was left out, with 95 % intervals.
+
+    The intervals are over episodes.
+    """
     by_kind: dict[tuple[str, str], list[LeftOut]] = {}
     for each in result.left_out:
         by_kind.setdefault((each.role, each.kind), []).append(each)
@@ -285,7 +291,7 @@ def _what(row: Row) -> str:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """Say which kind of thing moved answers most, or that none clearly did."""
+    """Return a sentence on which kind of object or message moved answers most, if that is clear."""
     known = [row for row in table if row.shift.n]
     if not known:
         return (
@@ -308,7 +314,7 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
-    """Declare the study of what was left out, of which `harness report` shows every decision."""
+    """Return the study of an attribution, for the terminal and `--json`."""
     table, cells, plain_rows = rows(result), list[Sequence[str]](), list[dict[str, Any]]()
     for row in table:
         shift, flips = figure(row.shift, SHIFT), figure(row.flips)
@@ -353,6 +359,6 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
 
 
 def write(result: Attribution, run: Path) -> Path:
-    """Write the file beside a run's tables."""
+    """Write an attribution to its file in a run's folder, and return the file's path."""
     write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(result), indent=1) + b"\n")
     return run / FILE

@@ -19,8 +19,8 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
 
     Args:
-        table: of `Fidelity`.
-        models: who drove, of each row.
+        table: `Fidelity.table`, a row a point.
+        models: names of the models, in the order of the rows.
     """
     figure = Figure(figsize=(4.4, 4.2), layout="constrained")
     axes = figure.subplots()

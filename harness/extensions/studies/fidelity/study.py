@@ -37,7 +37,7 @@ SHOWN = 20  # ways to disagree that the page lists
 
 @dataclass(frozen=True)
 class Fidelity:
-    """What the comparison says."""
+    """Hold the comparison of success on frozen scenes with success in closed loop."""
 
     # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
     # minus closed, paired by episode) and `agreement` (share of episodes and seeds with the same
@@ -53,10 +53,11 @@ class Fidelity:
 
 
 def fidelity(runs: Sequence[Path]) -> Fidelity:
-    """Compare runs on frozen scenes with live runs.
+    """Compare runs of `harness eval` (frozen scenes) with runs of `harness drive` (closed loop).
 
     Raises:
-        UserError: a folder is no run, or no frozen run has anything in common with a live one.
+        UserError: a folder is no run, a kind of run is missing, two runs have the same episodes,
+            or no episode is in runs of both kinds.
     """
     import pandas as pd
 
@@ -132,8 +133,11 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
 
 
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
-    """Return how episodes ended that ended otherwise:
-    a row a model, condition and two ends, with a count.
+    """Count the episodes that succeeded in only one of the worlds, by how they ended in both.
+
+    `both` is `Fidelity.episodes`. The table has a row for each model, prompt, answer mode,
+    condition, `frozen_end` and `closed_end` (`success` or a failure), with `count`, the most
+    frequent first.
     """
     ends = both.assign(
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
@@ -146,7 +150,7 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
-    """Declare the study of a comparison."""
+    """Return the study of a comparison; `runs` are the folders that it names as sources."""
     from harness.studies.study import Study, percent
 
     rows, ends_rows = list[Sequence[str]](), list[Sequence[str]]()
@@ -190,7 +194,7 @@ def _scatter(result: Fidelity) -> "Figure":
 
 
 def headline(result: Fidelity) -> list[str]:
-    """Say the rank correlation, or why there is none, and the largest difference."""
+    """Return sentences on the largest difference, and the rank correlation or why there is none."""
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)

@@ -48,33 +48,39 @@ HALVES = ("ego", "helper")
 
 @dataclass(frozen=True)
 class Factor:
-    """What one half of a swarm chooses."""
+    """Describe one thing that the grid varies: model, prompt or answer mode, of ego or helpers."""
 
-    half: str  # whose it is, `ego` or `helper`
+    half: str  # whose it is: `ego` or `helper`
     field: str  # `model`, `prompt` or `answer`
-    levels: tuple[str, ...]  # what it may be, the base first
+    levels: tuple[str, ...]  # its values in the grid; effects are measured from the first
 
     @property
     def name(self) -> str:
-        """For tables: `helper prompt`."""
+        """Return the name for tables, such as `helper prompt`."""
         return f"{self.half} {self.field}"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A combination: the ego's agent, the helpers', and their run."""
+    """Hold one combination of an ego agent and a helper agent, and their run."""
 
     ego: Agent
     helper: Agent
     run: Run
 
     def level(self, half: str, field: str) -> str:
-        """Return the level of a factor."""
+        """Return the cell's level of a factor, such as the model's name.
+
+        `half` is `ego` or `helper`, and `field` is `model`, `prompt` or `answer`.
+        """
         return level(self.ego if half == "ego" else self.helper, field)
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
-        """Success, latency and tokens of a decision, each (C, S, E); NaN where unknown."""
+        """Return success, latency (ms) and tokens of a decision, by metric, each (C, S, E).
+
+        The axes are conditions, channel seeds and episodes; unknown values are NaN.
+        """
         run = self.run
         metrics = [METRICS[SUCCESS], METRICS[LATENCY]]
         values = by_episode(metrics, run.grid, run.decisions, run.episodes)
@@ -83,52 +89,57 @@ class Cell:
         return {**values, "tokens": of_episodes.reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
-        """Return a metric under a condition, over episodes."""
+        """Return a metric's mean under a condition, with its interval over episodes."""
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of level is worth in the headline metric, averaged over all other factors."""
+    """Describe how the headline metric changes with a factor, averaged over all other factors."""
 
     condition: str  # the operating point
-    what: str  # the factor and its two levels; two of them for an interaction
-    # b - a of a main effect; of an interaction half the difference of two such differences
+    what: str  # the factor and its two levels, in words; for an interaction, two factors
+    # second level minus first; for an interaction, half the difference of two such differences
     estimate: Estimate
-    # of no effect, by Holm's method corrected for all effects of the grid; None without an interval
+    # p-value of no effect, corrected by Holm's method for all effects of the grid; None without an
+    # interval
     p: float | None
 
     @property
     def clear(self) -> bool:
-        """Whether it is more than chance explains."""
+        """Return whether the corrected p-value is at most 0.05."""
         return self.p is not None and self.p <= LEVEL
 
 
 @dataclass(frozen=True)
 class Halves:
-    """Shares of the variance of the headline metric between the cells that each half explains.
+    """Hold which shares of the variance between cells the choices of ego and helpers explain.
 
-    What episodes by chance add is taken off, as a bootstrap over episodes says;
-    so are intervals made.
+    The variance is that of the headline metric over the grid's cells. What the random choice of
+    episodes adds is taken off, as estimated by a bootstrap over episodes, which also makes the
+    intervals.
     """
 
     condition: str  # the operating point
-    ego: Estimate  # which agent the ego has
-    helpers: Estimate  # which the helpers have
-    together: Estimate  # their interaction, the rest
+    ego: Estimate  # share explained by the ego's agent
+    helpers: Estimate  # share explained by the helpers' agent
+    together: Estimate  # share of their interaction, which is the rest
     apart: Estimate  # `ego` - `helpers`
 
 
 def level(agent: Agent, field: str) -> str:
-    """Return a factor's level that an agent has."""
+    """Return an agent's model name, prompt version or answer mode: its level of a factor.
+
+    `field` is `model`, `prompt` or `answer`.
+    """
     return {"model": agent.card.name, "prompt": agent.prompt.version, "answer": agent.answer}[field]
 
 
 def tokens(run: Run) -> Floats:
-    """Return tokens in and out that a decision took,
-    of the ego and of each helper that was to reply, (n,).
+    """Return prompt and completion tokens of each decision of a run, (n,).
 
-    NaN throughout where a model of the run counts none.
+    They are those of the ego and of each helper that was asked; NaN for all if one answer of the
+    run has no count.
     """
     by_scene: dict[str | None, dict[str, list[float]]] = {}
     for answer in run.answers:
@@ -152,9 +163,10 @@ def run_cells(
     progress: Progress,
     cache_file: Path | None,
 ) -> "Grid":
-    """Evaluate every combination in a folder of its own under `out`; those that are there stay.
+    """Run every combination of ego and helper agents, each in a folder of its own under `out`.
 
-    Completions are kept between runs in the cache file, if there is one.
+    Finished runs there are read. All combinations share answers, and completions are kept between
+    calls in the cache file, if there is one.
 
     Raises:
         UserError: the folder holds another grid, or a model is not available.
@@ -184,14 +196,12 @@ def run_cells(
 
 @dataclass(frozen=True)
 class Grid:
-    """All cells of a full factorial design, row by row:
-    `rows` ego agents, `columns` helper agents.
-    """
+    """Hold all runs of a full factorial design: every ego agent with every helper agent."""
 
-    cells: tuple[Cell, ...]
-    rows: int
-    columns: int
-    success_rule: Success  # of all cells
+    cells: tuple[Cell, ...]  # row by row
+    rows: int  # number of ego agents
+    columns: int  # number of helper agents
+    success_rule: Success  # how success of every cell is averaged, such as balanced by danger
 
     def __post_init__(self) -> None:
         if len({(cell.run.conditions, cell.run.grid) for cell in self.cells}) > 1:
@@ -201,12 +211,12 @@ class Grid:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the operating points."""
+        """Return the names of the operating points that all runs have."""
         return self.cells[0].run.conditions
 
     @cached_property
     def factors(self) -> tuple[Factor, ...]:
-        """The fields of either half that have more than one level."""
+        """Return the factors that vary: model, prompt or answer mode, of ego or helpers."""
         factors = []
         for half, field in product(HALVES, FIELDS):
             levels = tuple(dict.fromkeys(cell.level(half, field) for cell in self.cells))
@@ -215,17 +225,20 @@ class Grid:
         return tuple(factors)
 
     def success(self, cell: Cell, condition: str) -> Estimate:
-        """Return the headline metric of a cell under a condition."""
+        """Return a cell's mean success (the headline metric) under a condition."""
         return self.success_rule.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
 
     def name(self, agent: Agent, half: str) -> str:
-        """Return an agent by what is varied of its half; by its model where nothing is."""
+        """Return a short name of an agent: its levels of the factors that vary, else its model.
+
+        `half` is `ego` or `helper`.
+        """
         varied = [factor.field for factor in self.factors if factor.half == half]
         return " ".join(level(agent, field) for field in varied or ("model",))
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """Main effects and interactions of two factors on success, under every condition."""
+        """Return main effects and two-factor interactions on success, under every condition."""
         effects, p_values = list[Effect](), list[float | None]()
         for condition in self.conditions:
             for name, low, high in (*self._main(condition), *self._interactions(condition)):
@@ -264,8 +277,10 @@ class Grid:
                 yield name, (high_low + low_high) / 2, (low_low + high_high) / 2
 
     def halves(self, condition: str) -> Halves | None:
-        """Return what each half explains;
-        None without a channel, if one varies, or if all may be alike.
+        """Return the shares of variance that ego and helpers explain under a condition.
+
+        None if the condition has no channel, if only one of them varies, or if the cells may all be
+        equal.
         """
         at = self.conditions.index(condition)
         if (
@@ -310,7 +325,7 @@ MOST_EFFECTS = 8  # that a terminal shows
 
 
 def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
-    """Declare the study of a grid in its folder."""
+    """Return the study of a grid whose runs lie under `out`; all share the evaluation `spec`."""
     data, episodes = tables(grid), grid.cells[0].run.grid.episodes
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
     last = grid.conditions[-1]
@@ -376,7 +391,7 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
 
 
 def headline(grid: Grid) -> list[str]:
-    """Say under each condition which half matters, or that none can be told to."""
+    """Return a sentence a condition: whether the choice of ego or of helpers matters more."""
     sentences = []
     for condition in grid.conditions:
         halves = grid.halves(condition)
@@ -410,7 +425,10 @@ def _halves(grid: Grid, h: Halves) -> str:
 
 
 def front(grid: Grid, condition: str) -> list[Cell]:
-    """Return the cells that none beats in success without taking longer, fastest first."""
+    """Return the Pareto front under a condition: cells that no other beats in success and latency.
+
+    They are sorted by latency, the fastest first.
+    """
 
     def success(cell: Cell) -> float:
         return grid.success(cell, condition).value
@@ -426,7 +444,7 @@ def front(grid: Grid, condition: str) -> list[Cell]:
 
 
 def pair(grid: Grid, cell: Cell) -> str:
-    """Return ego and helpers of a cell, by what is varied."""
+    """Return a cell's name: its ego's and its helpers' agent, by the factors that vary."""
     return f"{grid.name(cell.ego, 'ego')} + {grid.name(cell.helper, 'helper')}"
 
 
@@ -474,7 +492,7 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
 
 
 def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
-    """Return `cells` and `effects` as data frames: an estimate with its interval a row."""
+    """Return the tables `cells` and `effects`, with an estimate and its interval in each row."""
     import pandas as pd
 
     def row(cell: Cell, condition: str, metric: str, estimate: Estimate) -> dict[str, Any]:

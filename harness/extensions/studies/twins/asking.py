@@ -35,11 +35,11 @@ Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twi
 
 @dataclass(frozen=True)
 class Questions:
-    """What is asked."""
+    """Describe what is asked in a study of twins: a model, decision points, and their twins."""
 
-    spec: Spec  # who is asked, and how; its source has the drawn episodes
-    twins: tuple[str, ...]  # their names
-    seed: int  # of the draw of decision points
+    spec: Spec  # the evaluation: model, prompt, answer mode and episodes
+    twins: tuple[str, ...]  # names of the twins
+    seed: int  # seed of the draw of decision points
 
     def __post_init__(self) -> None:
         ego = self.spec.ego
@@ -56,18 +56,21 @@ class Questions:
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
 
     def lacks(self, names: Sequence[str]) -> str:
-        """Return what these twins need and nothing here has."""
+        """Return in words what each of these twins needs to apply, such as a language model."""
         needs = ((name, lack(self.spec, TWINS[name]) or TWINS[name].needs) for name in names)
         return "; ".join(f"{name} needs {what}" for name, what in needs)
 
     @property
     def dataset(self) -> Dataset:
-        """The drawn episodes."""
+        """Return the dataset of the drawn episodes."""
         assert isinstance(self.spec.source, FrozenSource)
         return self.spec.source.dataset
 
     def points(self) -> dict[int, list[str]]:
-        """Return decision points by episode: of each step one of those on the drivers' courses."""
+        """Draw a decision point for each step of each episode; return their ids by episode number.
+
+        Only points that a reference driver visits are drawn.
+        """
         forest = self.dataset.forest
         drawn: dict[int, dict[int, str]] = {}  # by episode and step
 
@@ -84,11 +87,14 @@ class Questions:
         return points
 
     def count(self) -> int:
-        """Return how many decision points were drawn."""
+        """Return how many decision points are drawn in all."""
         return sum(map(len, self.points().values()))
 
     def begin(self, identity: str) -> work.WorkStart:
-        """Return what the work begins with; `identity` is the digest of the model's."""
+        """Return the record with which the study's folder begins; a resumed one must have the same.
+
+        `identity` is the digest of the model's identity.
+        """
         settings = {
             **self.spec.record(),
             "twins": self.twins,
@@ -98,7 +104,7 @@ class Questions:
         return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
-        """Return whether this was begun in a folder, stopped there, and nobody is at it."""
+        """Return whether the folder `out` has this study, stopped, with no process on it."""
         try:
             left = work.begun(out, work.WorkStart)
             if work.idle(out):
@@ -112,9 +118,7 @@ class Questions:
 
 
 def lack(spec: Spec, twin: Twin) -> str | None:
-    """Return what a twin needs that this evaluation never has;
-    None where some question may have it.
-    """
+    """Return in words what a twin needs and this evaluation lacks; None if it may apply."""
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
@@ -130,22 +134,20 @@ def ask(
     cache: Path | None,
     workers: Workers,
 ) -> tuple[list[Pair], str]:
-    """Ask about decision points and their twins; the same for any workers.
+    """Ask a model about decision points and their twins; any number of workers gives the same.
 
-    What was stopped in the folder before goes on. The working folder stays until `work.tidy`, which
-    whoever writes the result calls. `progress` is called with 1 for each episode that is done.
-    Completions are kept between runs in the cache file, if there is one. Each worker has a backend
-    of its own.
+    A stopped study in the folder `out` goes on; its working folder stays until `work.tidy` is
+    called. `progress` is called with 1 for each finished episode. Completions are kept in the file
+    `cache`, if there is one. Each worker has a backend of its own.
 
     Returns:
-        The pairs of answers; and how many questions of helpers got none, in words,
-            empty if all did. Their
-        pairs are left out.
+        The pairs of answers, and a text on how many questions to helpers got no answer, empty if
+        none; such pairs are left out.
 
     Raises:
         UserError: the folder holds something else, the model is not available,
             or no question has a twin.
-        Unanswered: a question of the ego, or too many of the helpers', got no answer;
+        Unanswered: a question to the ego, or too many to the helpers, got no answer;
             the folder keeps all others.
     """
     if (out / RESULT).exists():

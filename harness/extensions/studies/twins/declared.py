@@ -42,10 +42,10 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 
 @dataclasses.dataclass(frozen=True)
 class Twin:
-    """One way to put a question otherwise."""
+    """Describe one change of a question, and how the answers to both versions must agree."""
 
     name: str  # how commands call it
-    says: str  # what is other
+    says: str  # what is changed, in words
     needs: str = "a graph or a text that it changes"  # what a question must have for it to apply
     # greatest total-variation distance that it allows; None where the action must be the same
     within: float | None = None
@@ -53,11 +53,11 @@ class Twin:
     graph: Callable[[Spec, Scene, SceneGraph], SceneGraph] | None = None
     # the twin's request, `(spec, request)`, of a language model
     text: Callable[[Spec, Request], Request] | None = None
-    # the same for who reads the graph and no text
+    # the twin's scene graph for a driver that reads the graph and no text
     view: Callable[[SceneGraph], SceneGraph] | None = None
     # the twin's picture, where the graph is another; None where it is the same
     image: Callable[[Image], Image] | None = None
-    # whose messages a fusion call has, `(senders)`, in the place of these
+    # the senders of the messages in the twin's fusion call, given those of the question's
     senders: Callable[[Sequence[str]], Sequence[str]] | None = None
     # the question's name for an action of the twin, where it is another
     actions: Mapping[str, str] | None = None
@@ -68,20 +68,21 @@ class Twin:
 
     @property
     def text_only(self) -> bool:
-        """Whether it says nothing to who reads the graph and no text."""
+        """Return whether it changes only text, which a driver that reads the graph never sees."""
         return bool(self.text or self.senders) and not self.view
 
     @property
     def holds(self) -> str:
-        """What must hold, in a word or two."""
+        """Return what must hold of both answers, in a word or two: `same` or `TV <= 0.1`."""
         if self.within is not None:
             return f"TV <= {self.within:g}"
         return "mirrored" if self.actions else "same"
 
 
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
-    """Return a copy of a record with `leaf(key, value)` for leaves;
-    those of a tuple have the tuple's key.
+    """Return a copy of a record in which each leaf value is replaced by `leaf(key, value)`.
+
+    The key is the name of the field; values in a tuple have the key of the tuple.
     """
     if isinstance(value, Struct):
         values = {name: getattr(value, name) for name in value.__struct_fields__}
@@ -92,7 +93,10 @@ def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
 
 
 def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Swap left and right; the same graph if the scenario is one-sided, or has no such path."""
+    """Return a scene graph with left and right swapped.
+
+    It is unchanged if the scenario may not be mirrored, or its road lacks a mirrored path.
+    """
     if spec.scenario.one_sided is not None:
         return graph
     twin = swapped(graph)
@@ -101,7 +105,10 @@ def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def swapped(graph: SceneGraph) -> SceneGraph:
-    """Swap left and right in positions, headings and words; sectors in the order that they had."""
+    """Return a scene graph with left and right swapped in positions, headings and words.
+
+    Sectors stay in the order that they had.
+    """
 
     def leaf(key: str, value: Any) -> Any:
         if key in ("left_m", "heading_deg") and value is not None:
@@ -120,14 +127,15 @@ def swapped(graph: SceneGraph) -> SceneGraph:
 
 
 def flipped(image: Image) -> Image:
-    """Return what the cameras would see in a mirror,
-    which is what those of the mirrored scene see.
-    """
+    """Return a camera picture mirrored left to right, as the mirrored scene would look."""
     return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
 def permuted_ids(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Every vehicle has the name of another, in all graphs of the scene alike."""
+    """Return a scene graph in which every vehicle has the id of another.
+
+    All scene graphs of the scene are renamed alike.
+    """
     ids = [vehicle.id for vehicle in scene.state.vehicles]
     order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
     # one cycle
@@ -142,8 +150,9 @@ NAMES = ("id", "vehicle", "viewer", "by")
 
 
 def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Round metres and m/s to none, shares to one decimal. Times stay:
-    half a second decides conflicts.
+    """Return a scene graph with distances (m) and speeds (m/s) in whole numbers.
+
+    The visible share of a sector has one decimal. Times stay: half a second decides conflicts.
     """
 
     def leaf(key: str, value: Any) -> Any:
@@ -156,7 +165,10 @@ def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Add a vehicle: it stands beside the road, away from viewer, ego and conflict zone."""
+    """Return a scene graph with one more vehicle, parked off the road.
+
+    It is at least 100 m from the viewer, and 65 m from the conflict zone.
+    """
     away = max(FAR_M, CLEAR_M + graph.itself.zone_m)
     ahead = graph.ego.forward_m < 0  # the other way than the ego; behind the ego itself
     last = max(int(vehicle.id[1:]) for vehicle in scene.state.vehicles)
@@ -178,8 +190,9 @@ def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Jitter the distances that sensors report with their noise once more,
-    as another look would.
+    """Return a scene graph whose measured distances have the sensors' noise added once more.
+
+    The noise is Gaussian, in metres, keyed by scene and viewer.
     """
     draws = noise.generator("twins", "jitter", scene.id, graph.viewer)
     nodes, moved_m = [], {}
@@ -205,7 +218,7 @@ def _farther(conflict: Conflict, by_m: float | None) -> Conflict:
 
 
 def reversed_lines(spec: Spec, request: Request) -> Request:
-    """Reverse neighbouring lines that begin with a vehicle's name."""
+    """Return a request in whose texts runs of lines about vehicles are in reverse order."""
 
     def turned(run: re.Match[str]) -> str:
         return "".join(reversed(run[0].splitlines(keepends=True)))
@@ -214,12 +227,15 @@ def reversed_lines(spec: Spec, request: Request) -> Request:
 
 
 def reversed_lists(graph: SceneGraph) -> SceneGraph:
-    """Reverse objects and conflicts."""
+    """Return a scene graph with its objects and its conflicts in reverse order."""
     return replace(graph, nodes=graph.nodes[::-1], conflicts=graph.conflicts[::-1])
 
 
 def in_feet(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Put feet and km/h where a template has metres and m/s as words that can be replaced."""
+    """Return a scene graph with distances in feet and speeds in km/h.
+
+    It is unchanged if the prompt's words for the units cannot be replaced.
+    """
     return changed(graph, _in_feet) if _says_units(spec, graph.role) else graph
 
 
@@ -252,7 +268,10 @@ def _speeds(spec: Spec, factor: float) -> str:
 
 
 def other_units(spec: Spec, request: Request) -> Request:
-    """Replace the words of units, and the target speeds."""
+    """Return a request whose texts say feet and km/h, with the target speeds converted.
+
+    It is unchanged if the prompt's words for the units cannot be replaced.
+    """
     if not _says_units(spec, request.role):
         return request
 
@@ -266,7 +285,7 @@ def other_units(spec: Spec, request: Request) -> Request:
 
 
 def paraphrased(spec: Spec, request: Request) -> Request:
-    """Put every sentence of `paraphrases.toml` in other words."""
+    """Return a request in which sentences are replaced by their paraphrases."""
 
     def reworded(text: str) -> str:
         for sentence, paraphrase in paraphrases().items():
@@ -278,13 +297,13 @@ def paraphrased(spec: Spec, request: Request) -> Request:
 
 @cache
 def paraphrases() -> dict[str, str]:
-    """Return other words for sentences."""
+    """Return the paraphrase of each sentence in `paraphrases.toml`."""
     text = text_of(Path(__file__).parent / "paraphrases.toml", "settings")
     return {str(sentence): str(paraphrase) for sentence, paraphrase in tomllib.loads(text).items()}
 
 
 def reordered_keys(spec: Spec, request: Request) -> Request:
-    """Reverse the members of the JSON objects that a prompt shows."""
+    """Return a request in which JSON objects that the prompt shows have their keys reversed."""
     return _reworded(request, _reversed_members)
 
 
@@ -318,7 +337,7 @@ def _closing(text: str, start: int) -> int:
 
 
 def permuted_letters(spec: Spec, request: Request) -> Request:
-    """Let each letter of a read-out stand for the next action, the first for the last."""
+    """Return a read-out request in which each letter stands for the next action, cyclically."""
     moved = (*request.actions[-1:], *request.actions[:-1])
     letters = readout.letters(moved)
     letter = dict(zip(letters, letters[1:] + letters[:1], strict=True))

@@ -18,29 +18,30 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Pair:
-    """The answers to a question and to its twin."""
+    """Hold the answers to a question and to its twin, the same question put another way."""
 
     twin: str  # name of the twin
     role: str  # `ego`, `helper`, or `fusion` for the ego's fusion call
     episode: int  # number of the episode
     scene: str  # id of the decision point
-    viewer: str  # who was asked
+    viewer: str  # id of the vehicle that was asked
     # distribution of the question's answer over the actions; None where it failed
     p: tuple[float, ...] | None
-    q: tuple[float, ...] | None  # the twin's, read back
+    # the same of the twin's answer, with its actions named as the question names them
+    q: tuple[float, ...] | None
     distance: float | None  # total variation between both; None where one failed
-    holds: bool  # whether what the twin declares holds; false where an answer failed
-    said: tuple[str, str]  # both answers as they came
-    status: tuple[str, str]  # of both answers, of the parser
+    holds: bool  # whether both answers agree as the twin demands; false where one failed
+    said: tuple[str, str]  # raw text of both answers
+    status: tuple[str, str]  # parsing status of both answers
     messages: tuple[str, str]  # the text of both questions
 
 
 @dataclass(frozen=True)
 class Row:
-    """The result of one twin in one role."""
+    """Hold the result of one twin in one role, over all its pairs of answers."""
 
-    twin: Twin  # the twin
-    role: str  # who was asked
+    twin: Twin  # how the questions were changed
+    role: str  # `ego`, `helper`, or `fusion`
     episodes: int  # how many episodes the pairs are of
     invariance_rate: Estimate  # share of pairs that hold; n is the pairs
     tv_distance: Estimate  # mean total variation; n is the pairs whose two answers were parsed
@@ -50,12 +51,15 @@ class Row:
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
-    """Return total variation between two distributions, 0 to 1; None where one is missing."""
+    """Return the total variation distance of two distributions, 0 to 1; None if one is missing."""
     return float(np.abs(np.subtract(p, q)).sum() / 2) if p and q else None
 
 
 def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
-    """Return whether what a twin declares holds of two distributions; not where one is missing."""
+    """Return whether two answers (A,) agree as a twin demands; false if one is missing.
+
+    They must be within a total variation distance, or have the same likeliest action.
+    """
     if not p or not q:
         return False
     if twin.within is not None:
@@ -64,7 +68,7 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 
 
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
-    """Return a row a twin and role that was asked."""
+    """Return a row for each twin and role that has pairs, in the order of the twins."""
     by_place: dict[tuple[str, str], list[Pair]] = {}  # by twin and role
     for pair in pairs:
         by_place.setdefault((pair.twin, pair.role), []).append(pair)
@@ -93,7 +97,7 @@ def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """Say what holds, and what holds least often."""
+    """Return a sentence on how many twins hold in every question, and which holds least often."""
     whole = sum(not row.broken for row in table)
     least = min(table, key=lambda row: row.invariance_rate.value)
     if not least.broken:
@@ -112,10 +116,10 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
-    """Hold a gate against the rows of its twin, in every role; of all twins if it names none.
+    """Test a gate (`--fail-if`) on the rows of the twin that it names, or on all rows.
 
     Raises:
-        UserError: its twin has no row, or its number is not known.
+        UserError: the named twin has no row, or the number that is tested is unknown.
     """
     shown = f"--fail-if {printable(gate.text)!r}"
     judged = [row for row in table if gate.condition in (None, row.twin.name)]

@@ -44,7 +44,7 @@ HEADS = (
 
 
 def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
-    """Write every pair of answers as a line of `pairs.jsonl`."""
+    """Write every pair of answers as a line of `pairs.jsonl` in the folder `out`."""
     lines = []
     for pair in pairs:
         values = asdict(pair)
@@ -56,7 +56,10 @@ def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
 def twins_study(
     questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
 ) -> Study:
-    """Declare the study of twins; `unanswered` says how many questions got no answer."""
+    """Return the study of twins for page, terminal and `--json`.
+
+    `verdicts` are those of the gates; `unanswered` says in words which questions got no answer.
+    """
     answer, spec = mapping(questions, rows, verdicts, unanswered), questions.spec
     return Study(
         "twins",
@@ -148,7 +151,11 @@ def _examples(actions: Sequence[str], rows: Sequence[Row]) -> Markup:
 def mapping(
     questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
 ) -> dict[str, Any]:
-    """Return the result as plain values; null where there is no number."""
+    """Return the result as plain values, with null for unknown numbers.
+
+    Its `rows` have each twin and role with the three metrics, `left_out` the twins that no question
+    has, and `gates` the verdicts.
+    """
     table, gates = list[dict[str, Any]](), list[dict[str, Any]]()
     for row in rows:
         place = {"twin": row.twin.name, "role": row.role, "holds": row.twin.holds}
@@ -174,7 +181,7 @@ def mapping(
 
 
 def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
-    """Return the twins that no question has, and what they need."""
+    """Return the twins that apply to no question, by name, with what they need in words."""
     with_rows = {row.twin.name for row in rows}
     needs = {}
     for name in questions.twins:
@@ -184,7 +191,10 @@ def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
 
 
 def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> list[str]:
-    """Return what a reader must know besides the rows."""
+    """Return the sentences with which a reader must take the results.
+
+    They say what the twins do not show, which were left out, and which questions got no answer.
+    """
     by_need = dict[str, list[str]]()
     for name, need in missing(questions, rows).items():
         by_need.setdefault(need, []).append(name)
@@ -203,16 +213,15 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 
 
 def constant_holds(questions: Questions, twin: Twin) -> bool:
-    """Return whether a twin holds of an ego that always gives the same answer:
-    every time, or never.
+    """Return whether a twin holds for an ego that always gives the same answer.
 
-    Over cyclic orders one letter is every action alike, which is the same for the twin.
+    With cyclic letter orders it does: one letter then is every action alike.
     """
     return twin.constant or questions.spec.ego.letters == "cyclic"
 
 
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
-    """Say what these twins would say of an ego that reads nothing."""
+    """Return a sentence on which twins hold for an ego that always gives the same answer."""
     broken = [row.twin.name for row in rows if not constant_holds(questions, row.twin)]
     twins = "every twin"
     if broken:
@@ -224,8 +233,9 @@ def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
 
 
 def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
-    """Yield the lines that two texts do not share, `-` of the first and `+` of the other,
-    words marked.
+    """Yield the lines in which two texts differ, as pairs of a sign and HTML.
+
+    The sign is `-` for a line of `a` and `+` for one of `b`; changed words are marked.
     """
     old, new = a.splitlines(), b.splitlines()
     for kind, i, j, k, n in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
