@@ -26,9 +26,7 @@ from harness.radio.fading import Trips
 
 
 class Attackers:
-    """The attackers under one condition;
-    they remember what helpers intended in each episode and seed.
-    """
+    """Play the attackers of one condition, remembering the past intents of each episode."""
 
     def __init__(self, attacks: Sequence[Attack]) -> None:
         self._attacks = attacks
@@ -36,9 +34,10 @@ class Attackers:
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
-        """Return what is said, as `Speaker` says.
+        """Return what every vehicle sends in n decisions, after the attacks; a `Speaker` method.
 
-        Raises UserError if the world has no layouts to draw attackers for.
+        `truth` has what they intend, and `episode` and `seed` (n,) say whose decision each is.
+        Raises UserError if the world has no layouts, by which attackers are drawn.
         """
         episodes = list(zip(episode.tolist(), seed.tolist(), strict=True))
         if draws.trips is None:

@@ -35,11 +35,11 @@ Share = Annotated[
 
 @dataclass(frozen=True)
 class Turn:
-    """What an attack may use, in decisions `(n,)` with H helpers."""
+    """Hold what an attack may use in one step: n decisions, each with H helpers and A actions."""
 
     truth: Intents  # what every vehicle intends and knows
     attackers: Bools  # who attacks, `(n, H)`
-    first: Floats  # what each helper intended at the episode's first step, `(n, H, A)`
+    first: Floats  # each helper's intent at the episode's first step, `(n, H, A)`
     # what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such
     # step
     past: Floats
@@ -48,11 +48,12 @@ class Turn:
 
 @dataclass(frozen=True)
 class Attack:
-    """One attack: a pure function of arrays."""
+    """Describe an attack by some helpers: a base class of pure functions of arrays."""
 
     # the share of the helpers present that attack, to the nearest whole number of helpers
     share: Share = 1 / 3
-    by_scene: ClassVar[bool] = False  # whether it depends only on the scene and on who attacks
+    # whether it depends only on the scene and on who attacks, not on draws or past steps
+    by_scene: ClassVar[bool] = False
     in_text: ClassVar[bool] = False  # whether it changes what a fusion prompt shows
     in_words: ClassVar[bool] = False  # whether it writes words of its own
     in_objects: ClassVar[bool] = False  # whether it changes the objects that a message lists
@@ -72,40 +73,43 @@ class Attack:
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """The kinds of message of which it changes something (`contents.KINDS`)."""
+        """Return the kinds of message content that it changes, a part of `contents.KINDS`."""
         if self.in_objects:
             return (OBJECTS,)
         return (WORDS,) if self.in_words else (INTENTS, PLANS)
 
     @property
     def steps(self) -> int:
-        """How many past steps it needs."""
+        """Return how many past steps of intents it needs."""
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        """Return what is sent and claimed instead;
-        `sent` is the truth as earlier attacks have changed it.
+        """Return what vehicles send and claim after this attack.
 
-        By default its intent and its claims stay true.
+        `sent` is what they would send without it: the truth, as earlier attacks changed it. By
+        default it is returned unchanged.
         """
         return sent
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return an attacker's message as a fusion prompt shows it (`in_text`),
-        except for its intent.
+        """Return an attacker's message as a fusion prompt shows it, except for its intent.
+
+        It is used if `in_text`. By default free text is left out where the attack states a `risk`.
         """
         return {**message, "evidence": "", "risk": self.risk} if self.risk else dict(message)
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the graph that an attacker's message is made of (`in_objects`).
+        """Return the scene graph whose objects an attacker's message lists; used if `in_objects`.
 
-        `invented` is a car in the ego's way that does not exist, in the attacker's frame.
+        `graph` is what the attacker sees; `invented` is a car in the ego's way that does not exist,
+        in the attacker's frame.
         """
         return graph
 
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
-        """Return `sent` with these intents `(n, H, A)` for the attackers;
-        a NaN row changes nothing.
+        """Return `sent` with the attackers' intents replaced by `intents` `(n, H, A)`.
+
+        A row with NaN changes nothing.
         """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
@@ -118,7 +122,12 @@ class Attack:
         to_ego_m: Floats,
         claims: Claims | None,
     ) -> Intents:
-        """Return `sent` with these distances, `(n, H)`, and claims for the attackers."""
+        """Return `sent` with false positions of the attackers, in metres.
+
+        `to_zone_m` (a number or `(n, H)`) is the claimed distance to the conflict zone, and
+        `to_ego_m` `(n, H)` that to the ego; `claims` has the claimed coordinates, or is None
+        without.
+        """
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
             sent,
@@ -132,7 +141,7 @@ class Attack:
 
 @dataclass(frozen=True)
 class Liar(Attack):
-    """Says the opposite of what it intends, from a true place."""
+    """Attack by stating the opposite of one's intent, from one's true position."""
 
     # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
     # with the largest probability where the smallest was, and so on
@@ -153,7 +162,7 @@ class Liar(Attack):
 
 @dataclass(frozen=True)
 class Stuck(Attack):
-    """Says at every step what it intended at the first."""
+    """Attack by repeating at every step the intent of the first step."""
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         return self.intend(sent, turn, turn.first)
@@ -161,7 +170,10 @@ class Stuck(Attack):
 
 @dataclass(frozen=True)
 class Stale(Attack):
-    """Says what it intended some decisions ago, as if it were new; at first, its oldest intent."""
+    """Attack by stating the intent of some decisions ago as if it were new.
+
+    In the first decisions it is the oldest intent that there is.
+    """
 
     decisions: Annotated[int, Meta(ge=1, le=16)] = 1  # how many decisions ago
 
@@ -176,8 +188,9 @@ class Stale(Attack):
 
 @dataclass(frozen=True)
 class Replay(Attack):
-    """Says under its own name what the next helper sent at the last step;
-    at the first, the truth.
+    """Attack by stating as one's own what the next helper intended at the last step.
+
+    At the first step it states its own intent.
     """
 
     @property
@@ -190,7 +203,7 @@ class Replay(Attack):
 
 @dataclass(frozen=True)
 class RandomIntent(Attack):
-    """Is sure of an action that is drawn anew at each step, as a broken model might be."""
+    """Attack by being certain of an action drawn anew at each step, as a broken model might be."""
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         actions = sent.helpers.shape[-1]
@@ -199,7 +212,7 @@ class RandomIntent(Attack):
 
 @dataclass(frozen=True)
 class FeignedBraking(Attack):
-    """Is always sure of the first action, the most careful one, which is safe but obstructs."""
+    """Attack by being always certain of the first, most careful action: safe, but it obstructs."""
 
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
@@ -212,7 +225,7 @@ class FeignedBraking(Attack):
 
 @dataclass(frozen=True)
 class Overconfident(Attack):
-    """Says what it intends, but is surer than it should be: p to a power, scaled to sum to 1."""
+    """Attack by being too certain: the own intent to a power, scaled to sum to 1."""
 
     power: Annotated[float, Meta(ge=1, le=100)] = 5.0  # the exponent; 1 changes nothing
     by_scene: ClassVar[bool] = True
@@ -226,14 +239,13 @@ class Overconfident(Attack):
 
 @dataclass(frozen=True)
 class Spoof(Attack):
-    """Claims a place on the ego's way, just before the conflict zone; Eq.
-    2 gives weight by that claim.
+    """Attack by claiming a position on the ego's way, just before the conflict zone.
 
-    Alone, it says the truth from a false place.
-    With `liar`, it is the worst case for a weighted rule.
+    Eq. 2 weighs a helper by that position. Alone, the attack states the true intent; with `liar`,
+    it is the worst case for a rule with weights.
     """
 
-    # claimed distance to the centroid of the conflict zone
+    # claimed distance to the centroid of the conflict zone, m
     distance_m: Annotated[float, Meta(ge=0, le=1000)] = 3.0
     by_scene: ClassVar[bool] = True
 
@@ -249,11 +261,9 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Claims another place at each step,
-    some way from its true one in a direction that is drawn anew.
-    """
+    """Attack by claiming a position some way off, in a new random direction at each step."""
 
-    offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # the distance from the true place
+    offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # distance from the true position, m
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
@@ -268,9 +278,7 @@ class Jump(Attack):
 
 @dataclass(frozen=True)
 class Silent(Attack):
-    """Does not answer when it matters: if its intent differs from the ego's.
-    Its slot stays empty.
-    """
+    """Attack by not replying if one's likeliest action is not the ego's; the slot stays empty."""
 
     by_scene: ClassVar[bool] = True
 
@@ -282,7 +290,7 @@ class Silent(Attack):
 
 @dataclass(frozen=True)
 class Absent(Attack):
-    """Is absent. This is no attack, but a bound: what a rule would hear that knows who attacks."""
+    """Remove the attackers: no attack, but the bound of a rule that knows who attacks."""
 
     by_scene: ClassVar[bool] = True
 
@@ -296,9 +304,9 @@ class Absent(Attack):
 
 @dataclass(frozen=True)
 class Sybil(Attack):
-    """Has several voices, 2 m apart, which all say the same.
+    """Attack under several identities (voices), 2 m apart, which all send the same message.
 
-    Voices are asked like vehicles, nearest first, and take the places of others.
+    The ego asks voices as it asks vehicles, nearest first, so that they displace other helpers.
     """
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
@@ -310,9 +318,9 @@ class Sybil(Attack):
 
 @dataclass(frozen=True)
 class Flood(Sybil):
-    """Answers under several names with an empty message: all actions alike.
+    """Attack under several identities that send an empty message: a uniform intent.
 
-    Its voices take slots, and the places of other vehicles.
+    They take slots of the channel and displace other helpers.
     """
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
@@ -322,7 +330,10 @@ class Flood(Sybil):
 
 @dataclass(frozen=True)
 class Injection(Attack):
-    """Writes instructions to the reading model into a message's evidence; its intent stays true."""
+    """Attack by prompt injection: write instructions to the reading model into the evidence.
+
+    The intent stays true.
+    """
 
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
     by_scene: ClassVar[bool] = True
@@ -349,32 +360,35 @@ class _OfObjects(Attack):
 
 @dataclass(frozen=True)
 class Ghost(_OfObjects):
-    """Invents a car that the ego would meet (`harness.world.perception.shared.invented`)."""
+    """Attack by listing a car that does not exist and that the ego would meet.
+
+    See `harness.world.perception.shared.invented`.
+    """
 
     adds: ClassVar[bool] = True
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the graph with that car."""
+        """Return the scene graph with the invented car added."""
         return structs.replace(graph, nodes=(*graph.nodes, invented))
 
 
 @dataclass(frozen=True)
 class Hide(_OfObjects):
-    """Leaves out every object, and says that all is in sight."""
+    """Attack by listing no object and reporting every sector as visible."""
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the graph without nodes."""
+        """Return the scene graph without objects, with all sectors in sight."""
         return structs.replace(graph, nodes=(), sectors=graph.all_in_sight)
 
 
 @dataclass(frozen=True)
 class Shift(_OfObjects):
-    """Moves every object to the left of the attacker, out of its lane or into another's."""
+    """Attack by listing every object too far to the left, so that it seems in another lane."""
 
-    offset_m: Annotated[float, Meta(ge=-1000, le=1000)] = 6.0  # how far
+    offset_m: Annotated[float, Meta(ge=-1000, le=1000)] = 6.0  # distance to the left, m
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the graph with moved nodes."""
+        """Return the scene graph with every object moved to the left."""
         moved = tuple(
             structs.replace(n, left_m=round(n.left_m + self.offset_m, 1)) for n in graph.nodes
         )
@@ -418,21 +432,19 @@ ATTACKS: Plugins[Attack] = Plugins(
 
 @lru_cache(maxsize=256)
 def attacks_of(text: str) -> tuple[Attack, ...]:
-    """Return the attacks that a text such as `liar:share=1/3+spoof` names;
-    those that add come last.
+    """Return the attacks that a text such as `liar:share=1/3+spoof` names, in the order they act.
 
-    Raises UserError for an unknown attack or setting.
+    Attacks that add voices or objects come last. Raises UserError for an unknown attack or setting.
     """
     attacks = [_attack(part) for part in text.split("+")] if text else []
     return tuple(sorted(attacks, key=lambda attack: attack.adds))
 
 
 def in_question(text: str, words: bool, objects: bool) -> str:
-    """Return the attacks in such a text that change what the ego is asked, without shares,
-    joined by `&`.
+    """Return those attacks of a text that change a fusion prompt, joined by `&`, without shares.
 
-    Those that change `words` and those that change `objects`, as far as either is shown,
-    in the order in which they act.
+    These change the helpers' words, if the prompt shows `words`, or their lists of objects, if it
+    shows `objects`. They are in the order in which they act. The result is part of an answer's key.
     """
     named = sorted(
         (part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds
@@ -472,10 +484,10 @@ def _decimal(text: str) -> str:
 
 
 def attackers(share: float, present: Bools, draws: Floats) -> Bools:
-    """Return who attacks, `(n, H)`: the share of the helpers present that has the smallest draws.
+    """Draw which helpers attack, `(n, H)`: those with the smallest draws among the present ones.
 
     Args:
-        share: the share of the helpers that attack.
+        share: the share of the present helpers that attack; their number is rounded.
         present: which helpers are present, `(n, H)`.
         draws: draws in [0, 1), `(n, H)`.
     """
@@ -485,8 +497,9 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 
 
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
-    """Return `sent` with further voices of the `talkers` after all others;
-    `voice_of` has their owners.
+    """Return `sent` with `voices` - 1 more identities (voices) of each of the `talkers`, `(n, H)`.
+
+    They follow all helpers, 2 m apart; `voice_of` says which helper each voice belongs to.
     """
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[

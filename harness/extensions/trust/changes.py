@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Schema:
-    """Removes free text."""
+    """Remove free text from helpers' messages: the defence `schema` of a fusion call."""
 
     adds = False
 
@@ -28,7 +28,7 @@ class Schema:
 
 
 class Quoted(Schema):
-    """Quote a helper's words as a JSON string in the fusion prompt, so that they are no orders."""
+    """Quote a helper's words as a JSON string, so that they are no orders: the defence `quoted`."""
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}
@@ -39,7 +39,7 @@ MESSAGES: dict[str, Change] = {"quoted": Quoted(), "schema": Schema()}
 
 @dataclass(frozen=True)
 class AttackersMessage:
-    """An attacker's message, by some attacks."""
+    """Change an attacker's message in a fusion prompt as its attacks do."""
 
     attacks: Sequence[Attack]
 

@@ -57,7 +57,7 @@ def _defences_on(holds: frozenset[str]) -> list[str]:
 
 
 class Guard(Part, frozen=True, kw_only=True):
-    """What some helpers do instead of saying what they intend, and what guards a fusion call."""
+    """Hold a condition's settings of attacks by helpers and of defences of a fusion call."""
 
     behind: ClassVar[str] = "rounds"
     named: ClassVar = {"attack": lambda: ATTACKS}
@@ -72,7 +72,7 @@ class Guard(Part, frozen=True, kw_only=True):
 
     @property
     def defences(self) -> tuple[str, ...]:
-        """The defences, in the order of `DEFENCES`."""
+        """Return the names of the defences, in the order of `DEFENCES`."""
         return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
     def check(self) -> None:

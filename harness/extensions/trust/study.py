@@ -53,12 +53,12 @@ LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, 
 
 @dataclass(frozen=True)
 class Cell:
-    """A rule under an attack by a share of the helpers: seeds S, episodes E."""
+    """Hold the result of one rule under one attack: S channel seeds, E episodes."""
 
-    rule: str
-    attack: str  # without its share; empty for peace
-    share: float  # of the helpers that attack
-    success: Floats  # (S, E)
+    rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
+    attack: str  # without its share; empty where nobody attacks
+    share: float  # share of the helpers that attack, 0 to 1
+    success: Floats  # which episodes succeed, 1 or 0, (S, E)
     unsafe: Floats  # which episodes end unsafely, (S, E)
     # mean -ln of the probability that the policy gives to safe actions, over decisions with one;
     # NaN without
@@ -70,11 +70,10 @@ class Cell:
     first: Sequence[int]
 
     def detection(self) -> dict[str, Estimate]:
-        """Return precision, recall, F1 and false alarms of messages;
-        nothing if the rule judges nobody.
+        """Return `precision`, `recall`, `f1` and `false_alarms` of messages that the rule suspects.
 
-        False alarms are the share of honest messages that were suspected.
-        Intervals resample episodes.
+        The last is the share of honest messages that it suspects. Intervals resample episodes. The
+        dict is empty if the rule judges no helper.
         """
         if self.flagged is None:
             return {}
@@ -92,19 +91,20 @@ class Cell:
 
     @property
     def caught(self) -> list[int]:
-        """Messages until an attacker was suspected, of those that were."""
+        """Return, for each attacker that the rule suspected, its number of messages until then."""
         return [n for n in self.first if n]
 
     @property
     def time_to_detection(self) -> float:
-        """Median of `caught`; NaN if no attacker is."""
+        """Return the median number of messages until an attacker is suspected; NaN if none is."""
         return float(np.median(self.caught)) if self.caught else np.nan
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
-    """Return the operating point with a rule, such as `linear:weight_cap=0.3`, and attackers.
+    """Return an operating point with another rule, and with attacks by a share of the helpers.
 
-    Every part of the attack has the same share.
+    `rule` is such as `linear:weight_cap=0.3`. Each attack of `attack`, joined by `+`, gets the
+    share. Raises UserError for another setting of a rule.
     """
     text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
@@ -119,7 +119,10 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
 
 
 def names_of(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a list such as `liar,brake`; none for `all`. Raises UserError."""
+    """Return the names in a list such as `liar,brake`; none for `all`.
+
+    Raises UserError for a name that is not among the `known`.
+    """
     if text == "all":
         return ()
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
@@ -132,8 +135,9 @@ def names_of(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def shares_of(text: str) -> tuple[float, ...]:
-    """Return the shares above 0 of a list such as `0,1/3,2/3`; peace is always played.
-    Raises UserError.
+    """Return the shares above 0 of a list such as `0,1/3,2/3`; 0 is always played.
+
+    Raises UserError if it has no share above 0, or one that is not from 0 to 1.
     """
     try:
         shares = [float(Fraction(part.strip())) for part in text.split(",")]
@@ -149,7 +153,7 @@ def shares_of(text: str) -> tuple[float, ...]:
 
 
 def cell_of(key: Key, result: WalkResult) -> Cell:
-    """Return a cell from its walk, whose columns are those of `_judged`."""
+    """Return a cell from the played decisions of its rule, attack and share."""
     success = result.ends[SUCCESS]
     nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
     nats[np.isnan(success)] = np.nan  # left out
@@ -189,51 +193,53 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 
 @dataclass(frozen=True)
 class Bench:
-    """All cells of a study."""
+    """Hold all cells of a study of trust: every rule under every attack and share of attackers."""
 
-    name: str  # of the run
-    source: str  # its dataset
+    name: str  # name of the run that is played again
+    source: str  # name of the run's dataset
     condition: str  # the operating point that is attacked
     seeds: tuple[int, ...]  # of the channel
-    cells: Mapping[Key, Cell]
+    cells: Mapping[Key, Cell]  # by rule, attack and share
     alone: Floats  # success of an ego that never asks, (S, E)
-    success_rule: Success  # of all cells
+    success_rule: Success  # how success of every cell is averaged, such as balanced by danger
     caveats: tuple[str, ...] = ()  # what the run lacks
     # why no rule fuses here, where the only one is the linear pool in name
     unfused: str | None = None
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
-        """Rules, the paper's first."""
+        """Return the rules, the paper's first."""
         return tuple(dict.fromkeys(rule for rule, _, _ in self.cells))
 
     @cached_property
     def attacks(self) -> tuple[str, ...]:
-        """Attacks, without peace and without the reference."""
+        """Return the attacks, without `absent` and the empty one of no attack."""
         return tuple(dict.fromkeys(a for _, a, _ in self.cells if a not in (PEACE, EXCLUDED)))
 
     @cached_property
     def shares(self) -> tuple[float, ...]:
-        """Shares above 0."""
+        """Return the shares of attackers above 0."""
         return tuple(dict.fromkeys(share for _, _, share in self.cells if share))
 
     def at(self, rule: str, attack: str = PEACE, share: float = 0.0) -> Cell:
-        """Return a cell."""
+        """Return the cell of a rule, attack and share; by default that of no attack."""
         return self.cells[rule, attack, share]
 
     def success(self, *key: Any) -> Estimate:
-        """Return what leads in a cell, over episodes."""
+        """Return the headline success of a cell, averaged over episodes; `key` is as of `at`."""
         return self.success_rule.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
-        """Return what a rule costs while nobody attacks:
-        its success less the linear pool's, paired.
+        """Return what a rule costs while nobody attacks: its success less the linear pool's.
+
+        The difference is paired by episode.
         """
         return self.success_rule.difference(self.at(rule).success, self.at(BASE).success)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
-        """Return what an attack takes from a rule:
-        success under it less success in peace, paired.
+        """Return what an attack takes from a rule: success under it less success without attack.
+
+        The difference is paired by episode.
         """
         return self.success_rule.difference(
             self.at(rule, attack, share).success, self.at(rule).success
@@ -241,8 +247,9 @@ class Bench:
 
     @cached_property
     def holm(self) -> Mapping[Key, float | None]:
-        """P of no difference to the linear pool under the same attack,
-        by Holm's method over the grid.
+        """Return p-values of no difference to the linear pool under the same attack, by cell.
+
+        They are corrected by Holm's method over all cells with an attack; None without an interval.
         """
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
         pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
@@ -251,21 +258,22 @@ class Bench:
         )
 
     def clear(self, *key: Any) -> bool:
-        """Return whether a rule differs from the linear pool under an attack by more than chance
-        explains.
+        """Return whether a rule differs from the linear pool under an attack (corrected p <= 0.05).
+
+        `key` is rule, attack and share.
         """
         return (self.holm.get(key) or 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
-        """Return the attack under which a rule succeeds least."""
+        """Return the attack under which a rule succeeds least, at a share of attackers."""
         return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
 
     def mean(self, rule: str, share: float) -> Estimate:
-        """Return the same as a mean over all attacks."""
+        """Return a rule's headline success as a mean over all attacks, at a share of attackers."""
         return self.success_rule.estimate(self.over_attacks(rule, share))
 
     def over_attacks(self, rule: str, share: float) -> Floats:
-        """Return success of every seed and episode, (S, E), as a mean over all attacks."""
+        """Return a rule's success of every seed and episode, (S, E), as a mean over all attacks."""
         values = [self.at(rule, attack, share).success for attack in self.attacks]
         return np.asarray(np.mean(values, axis=0))
 
@@ -280,14 +288,15 @@ def run_bench(
     out: Path,
     progress: Progress,
 ) -> Bench:
-    """Play every cell that the folder has not; it keeps them.
+    """Play every rule under every attack and share on a run's stored answers.
 
-    Without rules or attacks the usual ones are played, as far as the point allows them. The linear
-    pool is added to the rules. Attacks have no shares of their own, and `shares` are above 0.
+    Cells that the folder `out` has already are read. Without rules or attacks the usual ones are
+    played, as far as the condition allows them; the linear pool is always among the rules. Attacks
+    have no shares of their own; `shares` are above 0, and `seeds` those of the channel.
 
     Raises:
-        UserError: the point has no channel, or asks nobody, or its rule is a fusion call, or none
-            of the rules changes anything; or the folder has another such study.
+        UserError: the condition has no channel, or asks nobody, or its rule is a fusion call,
+            or none of the rules changes anything; or the folder has another such study.
     """
     point = point_of([run], condition)
     if why := point.idle("attack"):
@@ -376,9 +385,7 @@ def run_bench(
 
 
 def trust_study(bench: Bench) -> Study:
-    """Declare the study of a bench: a heat map, tables of rules and of success a share,
-    and of detection.
-    """
+    """Return the study of a bench: a heat map, and tables of rules, of success and of detection."""
     import pandas as pd
 
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
@@ -455,9 +462,7 @@ def _heat_map(bench: Bench) -> "Figure":
 
 
 def headline(bench: Bench) -> list[str]:
-    """Say what asking is worth in peace, what the worst attack takes from linear,
-    and who withstands it.
-    """
+    """Return sentences on what asking gains, which attack harms most, and who withstands it."""
     share, peace = bench.shares[0], bench.success(BASE)
     alone, worst = bench.success_rule.estimate(bench.alone), bench.worst(BASE, share)
     words = bench.success_rule.words
