@@ -39,13 +39,13 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 @dataclass(frozen=True)
 class Level:
-    """Decision points N of one step, seeds S, sets of helpers K."""
+    """Hold all choices at N decision points of one step, for S seeds and K sets of helpers."""
 
-    at: Ints  # the points, ascending, (N,)
-    action: Ints  # what the ego does if it asks a set, (S, N, K)
-    costs: Floats  # `COSTS` of asking a set, (S, N, K, C); NaN where unknown
-    intents: Intents  # what the vehicles of each decision intend, with the outlook, (S x N, ...)
-    draws: Draws  # the channel's, (S x N, ...)
+    at: Ints  # indices of the decision points in the forest, ascending, (N,)
+    action: Ints  # index of the ego's action if it asks a set, (S, N, K)
+    costs: Floats  # costs of asking a set, in the order of `COSTS`, (S, N, K, C); NaN where unknown
+    intents: Intents  # intents of all vehicles in each decision, with the outlook, (S x N, ...)
+    draws: Draws  # the channel's random numbers, (S x N, ...)
 
 
 Choose = Callable[[Level, Floats, Floats], Ints]
@@ -53,19 +53,22 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 
 @dataclass(frozen=True)
 class Choices:
-    """What each set of helpers comes to."""
+    """Hold what follows at each decision point if the ego asks each set of helpers."""
 
     forest: Forest  # of the run's dataset
     sets: Bools  # which helpers each has, the empty one first, (K, H)
     levels: tuple[Level, ...]  # of decision points, the first step's first
 
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
-        """Yield each level, the last first, with what its sets come to and which are chosen.
+        """Yield each level, the last first, with what its sets lead to and the chosen sets.
+
+        A tuple has the level, success (S, N, K), costs (S, N, K, C) until the episode's end, and
+        the chosen sets' indices (S, N).
 
         Args:
-            choose: index of the set chosen in each decision, (S, N), from the level, and from the
-                success, (S, N, K), and the costs, (S, N, K, C), that each set comes to with the
-                rest of the course.
+            choose: returns the index of the set asked in each decision, (S, N), given the level,
+                and the success, (S, N, K), and costs, (S, N, K, C), to which each set leads with
+                the choices of later steps.
         """
         # What the decision points of the next step come to, by what was chosen there.
         following = np.empty(0, dtype=int)
@@ -86,16 +89,15 @@ class Choices:
             yield level, ends, spent, k
 
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
-        """Return success, (S, E), and costs, (S, E, C), of every episode,
-        by a rule as in `backwards`.
-        """
+        """Return success, (S, E), and costs, (S, E, C), of every episode under a rule."""
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
         return _values_of(ends, k)[:, root], _values_of(spent, k)[:, root]
 
     def oracle(self) -> tuple[Floats, Floats]:
-        """Return what the best choice of helpers comes to,
-        with the fewest messages that it takes.
+        """Return success, (S, E), and costs, (S, E, C), of the best sets of helpers to ask.
+
+        Of equally good sets, those with the fewest messages are taken.
         """
 
         def best(level: Level, ends: Floats, spent: Floats) -> Ints:
@@ -105,7 +107,7 @@ class Choices:
         return self.played(best)
 
     def index(self, asked: Bools) -> Ints:
-        """Return the sets of these helpers `(..., H)`, by number."""
+        """Return the index in `sets` of each set of helpers, given as a mask `(..., H)`."""
         helpers = self.sets.shape[1]
         bits = 1 << np.arange(helpers)
         codes = self.sets @ bits
@@ -116,8 +118,9 @@ class Choices:
         return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
-        """Return the rule that asks whom a point's schedule asks,
-        with each level's `worths` if known.
+        """Return the rule that asks the helpers whom an operating point's schedule asks.
+
+        `worths` has what asking is worth at each level, if it is known, as `worths` returns it.
         """
         known = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
@@ -131,8 +134,9 @@ class Choices:
         return choose
 
     def worths(self, point: OperatingPoint) -> list[Floats]:
-        """Return what asking each helper is worth to a schedule,
-        `(S x N, H)` or `(S x N, 1)` a level.
+        """Return what asking each helper is worth to a schedule: an array `(S x N, H)` a level.
+
+        It is `(S x N, 1)` where the worth is the same for all helpers.
         """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
@@ -146,7 +150,11 @@ def _values_of(values: Floats, k: Ints) -> Floats:
 
 
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
-    """Raise UserError where what follows depends on more than who is heard now."""
+    """Raise UserError if decisions depend on more than whom the ego hears now.
+
+    Then the oracle is not exact: with a fusion call, a rule with memory, another content, or parts
+    that change messages. `helpers` and `actions` are their numbers.
+    """
     shown, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
         raise UserError(
@@ -171,12 +179,13 @@ def choices(
     seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> Choices:
-    """Return all choices of an operating point. What the run has no answer to its model is asked.
+    """Compute what each set of helpers leads to, at every decision point that any choice leads to.
 
-    Whom its schedule asks does not matter. `progress` is called with 1 for each step.
+    The run's model is asked for answers that the run lacks. The schedule of `point` does not
+    matter. `progress` is called with 1 for each step.
 
     Raises:
-        UserError: what follows depends on more than who is heard now, or there are too many sets.
+        UserError: decisions depend on more than whom the ego hears now, or there are too many sets.
     """
     dataset, forest, seed = stored.dataset, stored.dataset.forest, np.array(seeds)
     helpers = stored.vehicles - 1

@@ -38,10 +38,10 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
-    """Return a run with its layout seeds in words.
+    """Return a run's name with its dataset and layout seeds, in words.
 
-    Raises UserError unless all seeds are for this purpose, the layouts are those of the seeds,
-    and none of them is one of the runs that are reported.
+    Raises UserError unless all seeds are for the purpose `wanted`, the layouts are those of the
+    seeds, and none of them is in one of the `reported` runs.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -58,7 +58,11 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
 
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
-    """Return inputs (n, F) and gains (n,) of asking each helper alone, wherever it may be asked."""
+    """Return training data: inputs (n, F), and gains (n,) in success from asking one helper alone.
+
+    It has a row for each helper that may be asked at a decision point of the tree. `choose` decides
+    whom the ego asks in the rest of the episode.
+    """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
     for level, ends, _, _ in tree.backwards(choose):
@@ -72,8 +76,9 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
 
 def fit(x: Floats, y: Floats) -> Network:
-    """Fit the network that says y (n,) of x (n, F), by least squares:
-    Adam, whole batches, decay.
+    """Fit a network that predicts y (n,) from x (n, F), by least squares.
+
+    The optimiser is Adam on whole batches, with weight decay.
     """
     draws = noise.generator("schedule", "weights")
     centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
@@ -107,10 +112,11 @@ def fit(x: Floats, y: Floats) -> Network:
 def learn(
     train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> Network:
-    """Learn a network that says what asking the helpers is worth, from runs on train layouts.
+    """Learn a network that predicts the gain from asking each helper, from runs on train layouts.
 
-    It is learnt under an operating point: as many helpers are asked as that allows, and its
-    schedule decides in the first round of learning.
+    `point` is the operating point: its limit of helpers holds, and its schedule decides the rest of
+    an episode in the first round, the network in later ones. `progress` is called with 1 for each
+    step and round.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]
@@ -130,7 +136,10 @@ def learn(
 
 
 def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
-    """Return the rule that asks whom the network says to."""
+    """Return the rule that asks the helpers whose predicted gain is above the threshold.
+
+    It is for the decision points of `tree`, under the operating point's limit of helpers.
+    """
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]
     return tree.scheduled(point.changed(threshold=threshold), worths)
@@ -142,10 +151,10 @@ def tuned(
     point: OperatingPoint,
     progress: Callable[[int], None],
 ) -> float:
-    """Return the threshold with the most success on tune layouts, by each run's success rule,
-    averaged over runs.
+    """Return the threshold with the most success on tune layouts; of equal ones the highest.
 
-    Of equals it is the highest.
+    Success is by each run's success rule, averaged over runs. `progress` is called with 1 for each
+    step of a run.
     """
     success = np.zeros(len(THRESHOLDS))
     with_outlook = point.changed(schedule="coverage", threshold=None)
@@ -158,7 +167,7 @@ def tuned(
 
 
 def text(stated: Stated) -> str:
-    """Return the file of a schedule: TOML, whose strings and lists are JSON's."""
+    """Return the text of a schedule's file: TOML, whose strings and lists are JSON's."""
     fields = asdict(stated)
     network = fields.pop("network")
     lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
@@ -175,11 +184,11 @@ def run_learn(
     command: str,
     progress: Callable[[int], None],
 ) -> Stated:
-    """Learn a schedule, choose its threshold, and write its file.
+    """Learn a schedule, choose its threshold, write its file `out`, and return the file's content.
 
     Raises:
         UserError: a run is on layouts for another purpose,
-            or the operating point's answers are no function of who is heard.
+            or its decisions depend on more than who is heard (see `choices.refuse`).
         Unanswered: too many questions got no answer.
     """
     learnt_from = tuple(layouts(stored, "train") for stored in train)

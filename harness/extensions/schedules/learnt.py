@@ -37,7 +37,7 @@ INPUTS = (
 
 @dataclass(frozen=True)
 class Network:
-    """A network with one hidden layer, of F inputs and J units."""
+    """Hold a network with one hidden layer of tanh units: F inputs, J units, one output."""
 
     centre: Floats  # what is subtracted from each input, (F,)
     scale: Floats  # what each input is then divided by, (F,)
@@ -54,24 +54,23 @@ class Network:
 
 @dataclass(frozen=True)
 class Learnt:
-    """A schedule whose worth is the expected gain in success probability from asking only this
-    helper.
-    """
+    """Schedule requests by a network: the expected gain in success from asking one helper alone."""
 
-    network: Network
-    threshold: float
+    network: Network  # from `inputs` to the gain in success probability
+    threshold: float  # gain above which a helper is asked, unless the condition has its own
     needs: ClassVar[tuple[str, ...]] = ("outlook",)
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return the network's output for each helper, `(..., H)`;
-        NaN for one that may not be asked.
+        """Return the expected gain from asking each helper, `(..., H)`.
+
+        It is NaN for a helper that may not be asked.
         """
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A `Network` as a file states it."""
+    """Hold the numbers of a `Network` as a schedule's file states them, unchecked."""
 
     centre: tuple[float, ...]
     scale: tuple[Annotated[float, between(1e-6, 1e6)], ...]
@@ -83,7 +82,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Stated:
-    """The content of a file of `schedules/`."""
+    """Hold the content of a schedule's file in `schedules/`."""
 
     description: str  # one sentence
     command: str  # the command that made the file
@@ -95,8 +94,9 @@ class Stated:
     network: Weights  # the network's weights
 
     def schedule(self, where: str) -> Learnt:
-        """Return the schedule. Raises UserError for other inputs than `INPUTS`,
-        or weights of other sizes.
+        """Return the schedule; `where` names the file in messages.
+
+        Raises UserError if its inputs are not `INPUTS`, or its weights have other sizes.
         """
         f, j = len(INPUTS), len(self.network.bias)
         shapes = {
@@ -121,7 +121,10 @@ class Stated:
 
 
 def inputs(known: ScheduleInputs) -> Floats:
-    """Return `INPUTS` for each helper, `(..., H, F)`; arbitrary for one that may not be asked."""
+    """Return the network's inputs for each helper, `(..., H, F)`, in the order of `INPUTS`.
+
+    They are arbitrary for a helper that may not be asked.
+    """
     outlook, may_ask = known.outlook, known.may_ask
     assert outlook is not None
     ranked = np.sort(known.own, axis=-1)
@@ -163,6 +166,6 @@ def inputs(known: ScheduleInputs) -> Floats:
 
 @read_once
 def read(path: Path) -> Learnt:
-    """Return the schedule in a file. Raises UserError if the file is wrong."""
+    """Read a learnt schedule from its file. Raises UserError if the file is wrong."""
     where = f"schedule file {printable(path)}"
     return convert(toml(path, where), Stated, where).schedule(where)

@@ -51,14 +51,14 @@ FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A schedule with a threshold, None without one, that asks `most` helpers at most."""
+    """Describe one setting of a schedule: its threshold and how many helpers it asks at most."""
 
-    schedule: str
-    threshold: float | None
-    most: int
+    schedule: str  # its name
+    threshold: float | None  # what asking must be worth; None for a schedule without threshold
+    most: int  # most helpers asked in a decision
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """Return the operating point with this schedule."""
+        """Return an operating point with this schedule and setting."""
         if self.schedule == PAPER and self.threshold is not None:
             changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
@@ -71,35 +71,30 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Play:
-    """The outcome of a candidate: success, (S, E), and `COSTS`, (S, E, C), of every episode.
-
-    Success counts as `success_rule` says; costs are means over all episodes.
-    """
+    """Hold the outcome of one setting of a schedule for S channel seeds and E episodes."""
 
     candidate: Candidate
-    success: Floats
-    costs: Floats
-    success_rule: Success
+    success: Floats  # which episodes succeed, (S, E)
+    costs: Floats  # costs of each episode, in the order of `COSTS`, (S, E, C)
+    success_rule: Success  # how success is averaged, such as balanced by danger
 
     @property
     def rate(self) -> float:
-        """Success, as it counts."""
+        """Return the mean success, by `success_rule`."""
         return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
-        """Return one of `COSTS` of every episode, (S, E)."""
+        """Return one of `COSTS`, by its name, of every episode, (S, E)."""
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
     @property
     def messages(self) -> Floats:
-        """Of every episode, (S, E)."""
+        """Return the number of messages of every episode, (S, E)."""
         return self.of("messages")
 
     @property
     def means(self) -> dict[str, float]:
-        """Messages, milliseconds on air and joules of an episode,
-        and milliseconds of a decision.
-        """
+        """Return mean costs, by name as in `COSTS`: per episode, but latency (ms) per decision."""
         of_episode = self.costs.sum(axis=(0, 1)) / self.success.size
         means = dict(zip(COSTS, of_episode.tolist(), strict=True))
         decisions = means.pop("decisions")
@@ -109,9 +104,9 @@ class Play:
 def plays(
     choices: Choices, point: OperatingPoint, candidates: Sequence[Candidate], success_rule: Success
 ) -> list[Play]:
-    """Play a schedule at several thresholds, the candidates; return a play of each, in their order.
+    """Play settings of one schedule, which differ in threshold or limit; return their outcomes.
 
-    What asking is worth by the schedule is computed once for all.
+    What asking is worth to the schedule is computed once for all.
     """
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
@@ -120,8 +115,9 @@ def plays(
 
 
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
-    """Return what to try of a schedule:
-    tenths of what asking is worth, its own threshold, and 0.
+    """Return the settings of a schedule to try: thresholds, each with every limit of helpers.
+
+    The thresholds are deciles of what asking is worth, the schedule's own, and 0.
     """
     most = range(1, point.ask.max_helpers + 1)
     own = point.changed(schedule=schedule, threshold=None)
@@ -135,13 +131,13 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 
 @dataclass(frozen=True)
 class Chosen:
-    """A schedule's chosen candidate, and what it is worth."""
+    """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle."""
 
-    play: Play  # it, and success and costs of every episode
-    success: Estimate  # of episodes, as it counts
-    plain: Estimate  # the same over all episodes alike
+    play: Play  # the setting, with success and costs of every episode
+    success: Estimate  # mean success by the success rule
+    plain: Estimate  # mean success over all episodes alike
     over_paper: Estimate  # success less that of the paper's schedule
-    # of no such difference, by Holm's method for all schedules of the run; None without an
+    # p-value of no such difference, by Holm's method for all schedules of the run; None without an
     # interval, and for the paper's own and the oracle
     p: float | None
     over_random: Estimate  # success less that of `random` with as many messages
@@ -155,11 +151,11 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Compared:
-    """All schedules on one run."""
+    """Hold all schedules that were compared on one run."""
 
     name: str  # the run's model, prompt and answer mode
     point: OperatingPoint  # the operating point
-    names: tuple[str, ...]  # of the schedules that are compared
+    names: tuple[str, ...]  # names of the schedules that are compared
     plays: Mapping[str, Sequence[Play]]  # of every candidate, by schedule
     tune: Mapping[str, Sequence[Play]]  # the same on tune layouts; empty without
     oracle: Play  # the bound
@@ -167,14 +163,12 @@ class Compared:
 
     @property
     def paper(self) -> Play:
-        """The paper's schedule at the operating point's tau,
-        with all the helpers that it allows.
-        """
+        """Return the outcome of the paper's schedule at the operating point's own setting."""
         return _at(self.plays[PAPER], self._untuned(PAPER))
 
     @property
     def everybody(self) -> Play:
-        """Always asking all the helpers that the point allows."""
+        """Return the outcome of always asking all helpers that the operating point allows."""
         return _at(self.plays[ALWAYS], self._untuned(ALWAYS))
 
     def _untuned(self, schedule: str) -> Candidate:
@@ -184,20 +178,23 @@ class Compared:
 
     @property
     def success_rule(self) -> Success:
-        """How success counts."""
+        """Return how success is averaged over episodes, such as balanced by danger."""
         return self.oracle.success_rule
 
     @cached_property
     def counts(self) -> Ints:
-        """How often each episode counts, as played and in each resample, (1 + RESAMPLES, E)."""
+        """Return how often each episode counts in each bootstrap resample, (1 + RESAMPLES, E).
+
+        The first row is the episodes as played, once each.
+        """
         return self.success_rule.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
     def chosen(self, schedule: str) -> Play:
-        """Return the play with the most success on tune layouts within the budget;
-        of equals the cheapest.
+        """Return a schedule's outcome at the setting chosen for it.
 
-        Where none is within the budget, it is the cheapest.
-        Without tune layouts it is the untuned one.
+        That is the setting with the most success on tune layouts within the budget of messages; of
+        equal ones the cheapest, and the cheapest of all if none is within it. Without tune layouts
+        it is the default setting.
         """
         if not self.tune:
             return _at(self.plays[schedule], self._untuned(schedule))
@@ -211,14 +208,14 @@ class Compared:
 
     @property
     def energy(self) -> bool:
-        """Whether joules are known."""
+        """Return whether energy in joules is known."""
         return bool(np.isfinite(self.oracle.means["energy_j"]))
 
     def front(self, schedule: str, cost: str = "messages") -> list[Play]:
-        """Return what is taken as the budget grows:
-        of the settings it allows, the best on tune layouts.
+        """Return the outcomes of the settings to use as a cost's budget grows, the cheapest first.
 
-        Without tune layouts the best on these, which flatters them. The first asks nobody.
+        A setting is in it if no cheaper one succeeds more on tune layouts; without them, on these
+        layouts, which flatters it. `cost` is one of `COSTS`. The first asks nobody.
         """
 
         def order(ranked: tuple[Play, float]) -> tuple[float, float]:
@@ -241,7 +238,10 @@ class Compared:
         return [(play, tuned.get(play.candidate, play).rate) for play in every]
 
     def oracle_front(self) -> list[Play]:
-        """Return the oracle where a success may cost so many messages at most, from none on."""
+        """Return the oracle's outcomes where an episode may take 0, 1, 2, ... messages at most.
+
+        An episode that needs more to succeed is played without asking.
+        """
         bound, alone = self.oracle, self.plays[NEVER][0].costs
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
         costs = [np.where(of[..., None], bound.costs, alone) for of in cheap]
@@ -251,8 +251,10 @@ class Compared:
         ]
 
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
-        """Return success averaged over budgets beyond never asking,
-        with a bootstrap over episodes.
+        """Return a schedule's success averaged over budgets of a cost, with a bootstrap interval.
+
+        Budgets go from the cost of never asking to that of always asking all; `cost` is one of
+        `COSTS`.
         """
         of_bound = [(play, play.rate) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
@@ -276,12 +278,12 @@ class Compared:
 
     @cached_property
     def regret(self) -> Estimate:
-        """Success of the oracle less that of the paper's schedule."""
+        """Return the success of the oracle less that of the paper's schedule, paired by episode."""
         return self.success_rule.difference(self.oracle.success, self.paper.success)
 
     @cached_property
     def rows(self) -> list[Chosen]:
-        """The paper's schedule, the chosen candidate of every one, and last the oracle."""
+        """Return the rows to show: the paper's schedule, all compared ones, then the oracle."""
         chosen = [self.chosen(name) for name in self.names]
         raw = [self.success_rule.p_value(play.success, self.paper.success) for play in chosen]
         rows = [self._row(self.paper, None)]
@@ -306,8 +308,9 @@ class Compared:
         )
 
     def random_like(self, play: Play) -> Floats:
-        """Return success of `random` with as many messages, (S, E):
-        a mean of its two shares next to it.
+        """Return the success of asking at random with as many messages as `play`, (S, E).
+
+        It is interpolated between the two nearest random shares.
         """
         most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
@@ -331,14 +334,14 @@ def compare(
     success_rules: Mapping[ReplayedRun, Success],
     progress: Callable[[int], None],
 ) -> Compared:
-    """Play every schedule on a run, and on one on tune layouts;
-    `success_rules` has the success rule of each.
+    """Play every schedule on a run, and on a run on tune layouts if there is one.
 
-    What is tried of a schedule follows from the run on tune layouts, where there is one. Candidates
-    are chosen within `budget`, a share of the messages that the paper's schedule takes.
+    Settings are tried as the tune run suggests, and chosen within `budget`, a share of the messages
+    that the paper's schedule takes. `success_rules` has how success of each run is averaged;
+    `progress` is called with 1 for each step and schedule.
 
     Raises:
-        UserError: no schedule can change anything at the point.
+        UserError: no schedule can change anything at the operating point.
     """
     if why := point.idle("schedule"):
         raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
@@ -367,10 +370,13 @@ def run_schedules(
     out: Path,
     progress: Progress,
 ) -> list[Compared]:
-    """Compare schedules on runs, each with its run on tune layouts, or with none.
+    """Compare schedules on runs, each with its run on tune layouts, or without any.
+
+    `names` are the schedules, `seeds` those of the channel, and `budget` the share of the paper's
+    messages within which settings are chosen.
 
     Raises:
-        UserError: as `compare` does, or the folder has another comparison,
+        UserError: as `compare` does, or the folder `out` has another comparison,
             or a run is on other layouts.
         Unanswered: too many questions got no answer; the runs keep all others.
     """
@@ -399,7 +405,7 @@ def run_schedules(
 
 
 def in_order(names: Collection[str]) -> list[str]:
-    """Return names of schedules, those that ship first."""
+    """Return names of schedules in the order of tables: those that ship first."""
     first = [name for name in FIRST if name in names]
     return [*first, *(name for name in names if name not in FIRST)]
 
@@ -463,9 +469,7 @@ JOULES, IF_BALANCED = ("J", "area over joules, %"), ("balanced %",)
 def schedule_study(
     compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]
 ) -> Study:
-    """Declare the study of schedules on one or several runs;
-    `runs` are these and those on tune layouts.
-    """
+    """Return the study of compared schedules; `runs` are all runs that were played."""
     first, data = compared[0], tables(compared)
     words = first.success_rule.words
     tuned = bool(first.tune)
@@ -514,14 +518,12 @@ def schedule_study(
 
 
 def name_of(row: Chosen) -> str:
-    """Return a schedule with the setting chosen for it:
-    at most so many helpers, above a threshold.
-    """
+    """Return the label of a row: the schedule, its most helpers, and its threshold."""
     return f"{row.play.candidate.schedule} {row.play.candidate}"
 
 
 def headline(compared: Compared) -> list[str]:
-    """Say the paper's regret, and what the best schedule within half of its messages closes."""
+    """Return sentences on the oracle's lead over the paper's schedule, and the best schedule."""
     regret, words = compared.regret, compared.success_rule.words
     bound = compared.oracle.means["messages"]
     sentences = [
@@ -629,9 +631,7 @@ def _table(run: Compared) -> Table:
 
 
 def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
-    """Return `schedules`, each at the setting chosen for it, and `settings`,
-    all that were played.
-    """
+    """Return the tables `schedules` (each at its chosen setting) and `settings` (all played)."""
     import pandas as pd
 
     def ends(name: str, e: Estimate) -> dict[str, Any]:
