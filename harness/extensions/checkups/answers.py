@@ -17,19 +17,17 @@ Pictured = tuple[Request, Request, Request]
 
 @dataclass(frozen=True)
 class Looks:
-    """A model's answers by answer mode to an image prompt,
-    with what the cameras see and a blank picture.
+    """Hold a model's answers to an image prompt: with a camera picture, a blank one, and none."""
 
-    `text` is an answer to the text alone, in the last answer mode that worked; None if none did.
-    """
-
-    answers: dict[AnswerMode, Completion]  # one in each mode, asked alone after a warm-up
-    blank: dict[AnswerMode, Completion]
+    # answers to the camera picture, one in each answer mode, asked alone after a warm-up
+    answers: dict[AnswerMode, Completion]
+    blank: dict[AnswerMode, Completion]  # answers to a blank picture
+    # answer without picture, in the last answer mode that worked; None if none did
     text: Completion | None
 
     @property
     def fault(self) -> str | None:
-        """Why the model takes no pictures; None if it does.
+        """Return in words why the model takes no pictures; None if it does.
 
         A model that answers all pictures alike still reads them if its prompt has more tokens with
         one.
@@ -56,7 +54,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """Result of checking a model."""
+    """Hold the result of checking a language model: its prompt, its tokens and its answers."""
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
     # its ids, each with its text; None if only a server knows them
@@ -80,8 +78,8 @@ def check(
 ) -> Checkup:
     """Check a model with some questions, one in each answer mode.
 
-    For a model with vision, `shown` has questions of an image prompt.
-    `progress` is called with 1 after each.
+    For a model with vision, `shown` has questions of an image prompt, each with a camera picture, a
+    blank one and none. `progress` is called with 1 after each.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:

@@ -96,7 +96,10 @@ def _lacking(remedies: list[tuple[str, str]]) -> None:
 
 
 def look(gpu: bool) -> dict[str, Any]:
-    """Return what `harness model doctor --json` prints.
+    """Return the facts that `harness model doctor --json` prints, as plain values.
+
+    They are versions, cores, memory (GiB), GPUs, energy meters, engines and models with what they
+    lack, and the completion cache.
 
     Args:
         gpu: ask torch for GPUs too, which takes seconds to load.

@@ -27,16 +27,17 @@ PROMPT, IMAGE_PROMPT = "v2", "v7"
 
 @dataclass(frozen=True)
 class Check:
-    """What a check of a model showed."""
+    """Hold the result of `harness model check`: answers, and what fixed questions showed."""
 
     spec: Spec  # how the model was asked
     seen: Checkup  # its prompt and answers
-    findings: Findings | None  # what its read-outs follow; None where it was not examined
+    # what its read-outs follow, the letter or the scene; None where it was not examined
+    findings: Findings | None
     unanswered: str | None = None  # why the fixed questions got no answer
 
     @property
     def completions(self) -> list[Completion]:
-        """Every answer that has to come, those to pictures too."""
+        """Return every answer that the model must give, those to pictures included."""
         return [
             *self.seen.answers.values(),
             *(self.seen.looks.answers.values() if self.seen.looks else ()),
@@ -44,7 +45,7 @@ class Check:
 
     @property
     def usable(self) -> bool:
-        """Whether an answer in any mode says what to do."""
+        """Return whether an answer in any answer mode can be parsed to an intent."""
         asked = self.spec.ego.blank("ego", self.spec.actions)
         answers = self.seen.answers.items()
         return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in answers)
@@ -53,10 +54,11 @@ class Check:
 def check(
     card: Card, thinking: bool, device: str | None, dtype: str | None, progress: Progress
 ) -> Check:
-    """Check a model, examine it if it answers by letters, and keep what was found.
+    """Check a language model in every answer mode, with and without pictures.
 
-    The card is a language model's. Without a device or number format, `dtype`, the engine's choice
-    and the card's hold. `progress` counts answers.
+    If it answers by letters, fixed questions also show what its read-outs follow, and the findings
+    are kept in the user's cache. Without `device` the engine chooses; without `dtype`, a number
+    format, the card's holds. `progress` counts answers.
     """
     data = load.load(load.find(DATASET), 1)
     can = capabilities(card.engine).answer_modes

@@ -22,18 +22,18 @@ CLEAR = 1.2  # times as fast as another, which chance on a shared machine does n
 
 @dataclass(frozen=True)
 class Pace:
-    """An engine's wall time of an answer that is asked alone, after a warm-up."""
+    """Hold an engine's wall time for one answer, asked alone after a warm-up."""
 
     engine: str  # its name
-    readout_s: float  # of a read-out whose letters are read once
-    text_s: float  # of the first `TOKENS` tokens of a free answer
+    readout_s: float  # seconds of a read-out (letters in one order)
+    text_s: float  # seconds of the first `TOKENS` tokens of a free answer
 
 
 def paces(stem: str) -> list[Pace]:
-    """Time the engines of a card file:
-    those that run here, if there are several and weights are small.
+    """Time the engines of a model's card file that can run here.
 
-    Raises UserError if weights do not load or the model cannot answer so, and Unanswered.
+    It is empty unless there are several and the weights are small. Raises UserError if weights do
+    not load or the model cannot answer, and Unanswered if an answer fails.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
     if len(able) < 2 or not all(_small(card) for card in able):
@@ -42,7 +42,8 @@ def paces(stem: str) -> list[Pace]:
 
 
 def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
-    """Time the engines of card files, as far as `paces` can.
+    """Time the engines of several card files, by the file's name; cards without times are left out.
+
     `progress` is called with 1 after each.
     """
     measured = {}
@@ -55,7 +56,7 @@ def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, 
 
 
 def advice(measured: Sequence[Pace]) -> str:
-    """Say in one line which of several engines is faster here, and how to choose it."""
+    """Return a line that says which of several engines is faster here, and how to choose it."""
     engines = " and ".join(pace.engine for pace in measured)
     by_letters = _fastest(measured, [pace.readout_s for pace in measured])
     by_text = _fastest(measured, [pace.text_s for pace in measured])

@@ -38,19 +38,19 @@ PASSES = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing compared."""
+    """Hold one comparison of an engine with the reference: a figure and its limit."""
 
     what: str  # what was compared
     measured: float  # the figure
     allowed: float | None  # its limit; None where there is none
-    holds: bool  # whether it is within
-    n: int  # prompts
+    holds: bool  # whether the figure is within the limit
+    n: int  # number of prompts
     differences: tuple[str, ...] = ()  # the first prompts that differ, and how
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was compared, and what could not be."""
+    """Hold all findings on one model, and what could not be compared."""
 
     findings: tuple[Finding, ...]  # everything compared
     left_out: str | None  # why llama.cpp was not held to the same float32 weights; None if it was
@@ -58,12 +58,12 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of one engine, a prompt at a time."""
+    """Hold the outputs of one engine for the same prompts."""
 
     tokens: list[list[int]]  # token ids of the text of each prompt, of those for JSON first
     logits: Floats  # log-probabilities of the whole vocabulary after each json prompt, (n, V)
     texts: list[str]  # greedy answers to the json prompts
-    readouts: Floats  # distributions read out, (n, A)
+    readouts: Floats  # distributions over actions from the read-out prompts, (n, A)
 
 
 def compare(
@@ -73,12 +73,12 @@ def compare(
     letters: Sequence[Request],
     progress: Callable[[int], None],
 ) -> Comparison:
-    """Hold a GGUF card's model against the same model on transformers.
+    """Compare a model on llama.cpp with the same model on transformers, token by token.
 
-    `reference` is a card on transformers: of a checkpoint, or of a GGUF file, which is unpacked. Of
-    `asked`, requests for JSON, there may be none; `letters` ask for a read-out. `progress` is
-    called with 1 after each of `PASSES` passes over the prompts, or with those left out. Raises
-    UserError for weights that are not there or do not load.
+    `reference` is its card on transformers: of a checkpoint, or of a GGUF file, which is unpacked;
+    `gguf` is its card on llama.cpp. `asked` are requests for JSON, perhaps none; `letters` ask for
+    a read-out. `progress` is called with 1 after each of `PASSES` passes over the prompts, or with
+    the number left out. Raises UserError if weights are missing or do not load.
     """
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")

@@ -28,7 +28,7 @@ CHUNK = 8  # requests that are asked together
 
 
 class Answers(Struct, frozen=True):
-    """What one role's answers to the fixed questions are like."""
+    """Describe the answers of one role (ego or helper) to the fixed questions."""
 
     role: Role  # the role
     n: int  # number of questions
@@ -36,7 +36,7 @@ class Answers(Struct, frozen=True):
     strict: int  # answers that need no repair
     distinct: int  # answers that differ in their text
     action: str | None  # the commonest likeliest action of the readable ones; None without any
-    action_count: int  # in how many of them it is the likeliest
+    action_count: int  # number of readable answers in which that action is the likeliest
     example_copies: int  # answers that are one of the prompt's examples' answers
     placeholder_copies: int  # answers that copy a placeholder of the prompt
     bad_sums: int  # answers whose numbers do not sum to one
@@ -47,7 +47,7 @@ class Answers(Struct, frozen=True):
     sample: str  # the first text of the commonest kind
 
     def sentences(self) -> Iterator[str]:
-        """Yield what the role's answers do with the prompt, the most telling first."""
+        """Yield sentences on the faults of the answers, the most frequent first."""
         causes = {
             "copy a placeholder of the prompt": self.placeholder_copies,
             "are word for word the answer of an example": self.example_copies,
@@ -68,7 +68,7 @@ class Answers(Struct, frozen=True):
 
 
 class Trial(Struct, frozen=True):
-    """What a model does with a prompt."""
+    """Hold what a model does with a prompt: its answers to the fixed questions, by role."""
 
     model: str  # name of the model
     prompt: str  # the prompt version
@@ -78,7 +78,7 @@ class Trial(Struct, frozen=True):
 
 
 def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
-    """Return the card of the model that a prompt is tried on.
+    """Return the card of the model on which a prompt is to be tried.
 
     Raises UserError if it is no language model, or the prompt cannot ask the fixed questions.
     """
@@ -99,9 +99,10 @@ def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
 def try_on(
     prompt: Prompt, card: Card, device: str | None, dtype: str | None, progress: Progress
 ) -> tuple[Trial, Findings | str | None]:
-    """Return what a model does with a prompt, in words and in read-outs.
+    """Try a prompt on a model: ask the fixed questions for answers in words, and by read-outs.
 
-    The second is None where its engine reads none out, and a reason where they got no answer.
+    The second value is None if the engine has no read-outs, and an error's text if a read-out got
+    no answer.
     """
     agent = Agent(card, prompt)
     reads_out = "readout" in agent.can.answer_modes and not agent.thinking
@@ -114,10 +115,9 @@ def try_on(
 def try_out(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Trial:
-    """Ask a model the fixed questions in both roles, and the ego the pairs of scenes;
-    `COUNT` requests.
+    """Ask a model the fixed questions in both roles, and the ego pairs of scenes: `COUNT` requests.
 
-    Raises Unanswered if a question got no answer.
+    The scenes of a pair differ in one fact. Raises Unanswered if a question got no answer.
     """
     pairs = questions.scene_pairs(agent)
     by_role = {role: questions.requests(agent, role) for role in ROLES}
@@ -144,7 +144,7 @@ def try_out(
 def described(
     prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]
 ) -> Answers:
-    """Return what a role's answers are like, for a prompt whose examples they may copy."""
+    """Return a summary of one role's answers, with how many copy an example of the prompt."""
     examples = []
     if prompt.examples:
         examples = [_value(example.answer) for example in prompt.examples.of(role)]

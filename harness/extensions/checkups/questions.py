@@ -37,7 +37,7 @@ _NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
 
 
 class Question(msgspec.Struct, frozen=True):
-    """A decision point of a tune layout."""
+    """Hold a decision point of a tune layout, about which a model is asked to try it out."""
 
     layout_seed: int  # seed of the layout
     step: int  # number of the decision point in its episode
@@ -45,7 +45,7 @@ class Question(msgspec.Struct, frozen=True):
 
 
 class Pair(NamedTuple):
-    """Two requests that differ in one fact."""
+    """Hold two requests that differ in one fact, to test whether the answer follows it."""
 
     fact: Fact  # the kind of fact
     expected: str  # the action that should be likelier with the fact
@@ -55,18 +55,18 @@ class Pair(NamedTuple):
 
 @cache
 def questions() -> tuple[Question, ...]:
-    """Return the twelve questions."""
+    """Return the twelve fixed questions, which ship with the program."""
     text = text_of(Path(__file__).with_name("questions.json"), "settings")
     return msgspec.json.decode(text, type=tuple[Question, ...])
 
 
 def scenario() -> Scenario:
-    """Return the scenario of the questions."""
+    """Return the scenario of the fixed questions."""
     return scenarios.get(SCENARIO)
 
 
 def requests(agent: Agent, role: Role = "ego") -> list[Request]:
-    """Return the twelve questions as an agent is asked them in a role, at temperature 0."""
+    """Return the twelve fixed questions as requests to an agent in a role, at temperature 0."""
     return [
         _request(agent, question.graphs[role], f"question-{n}/{role}")
         for n, question in enumerate(questions())
@@ -74,7 +74,7 @@ def requests(agent: Agent, role: Role = "ego") -> list[Request]:
 
 
 def scene_pairs(agent: Agent) -> list[Pair]:
-    """Return the pairs of scenes as an agent is asked them as the ego: four of each kind of fact.
+    """Return pairs of scenes as requests to an agent as the ego: four of each kind of fact.
 
     A conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the ego:
     SLOWER should be likelier with the conflict, and with the small gap.
@@ -97,10 +97,10 @@ def scene_pairs(agent: Agent) -> list[Pair]:
 
 
 def plain_pairs(agent: Agent) -> list[Pair]:
-    """Return the pairs of plain questions to an agent that reads out: four of each kind of fact.
+    """Return pairs of simple questions, without a scene, to an agent that reads out.
 
-    They are answered YES or NO: whether to brake in danger or without,
-    and whether the first of two numbers is greater.
+    Four of each kind are answered YES or NO: whether to brake, in danger or without, and whether
+    the first of two numbers is greater.
     """
     every = []
     for n, (present_text, absent_text) in enumerate(_DANGER):

@@ -31,16 +31,16 @@ COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scene
 
 
 class Moved(Struct, frozen=True):
-    """How the `n` pairs of questions that differ in one fact were answered."""
+    """Hold how the answers to pairs of questions followed the one fact in which they differ."""
 
     fact: str  # the kind of fact
-    n: int
+    n: int  # number of pairs with two answers that can be parsed
     moved: int  # in how many the expected action became clearly likelier with the fact
-    mean: float  # mean change of its probability
+    mean: float  # mean change of the expected action's probability
 
     @property
     def change(self) -> str:
-        """The mean change with its sign; what rounds to nothing has none of its own."""
+        """Return the mean change with its sign, such as `+0.123`; a rounded zero is `+0.000`."""
         return f"{round(self.mean, 3) + 0.0:+.3f}"
 
     @property
@@ -49,7 +49,7 @@ class Moved(Struct, frozen=True):
 
 
 class Findings(Struct, frozen=True):
-    """What fixed questions showed of a model, as it was asked and not otherwise."""
+    """Hold what fixed questions showed of a model's read-outs, for one prompt and answer mode."""
 
     prompt: str  # the prompt version that they were asked with
     prompt_sha256: str  # digest of its files
@@ -61,20 +61,20 @@ class Findings(Struct, frozen=True):
     label_mass: float  # mean probability of the letters
     pairs: tuple[Moved, ...]
     # the pairs with letters read the other way, where these showed nothing
-    others: tuple[Moved, ...] = ()
+    others: tuple[Moved, ...] = ()  # under `other_letters`
 
     @property
     def reads_scene(self) -> bool:
-        """Whether a conflict in the scene, or its gap, moves the answer."""
+        """Return whether a conflict in the scene, or its time gap, moves most answers."""
         return any(pair.read for pair in _of_scene(self.pairs))
 
     @property
     def other_letters(self) -> str:
-        """The other way to read letters."""
+        """Return the other way to read letters: `raw` or `cyclic`."""
         return "raw" if self.letters == "cyclic" else "cyclic"
 
     def sentences(self) -> Iterator[str]:
-        """Yield what a reader of runs that asked the model so has to know."""
+        """Yield the sentences that a page of runs with this model and prompt must show."""
         if not self.reads_scene:
             others = _of_scene(self.others)
             otherwise = (
@@ -108,12 +108,12 @@ def _moved_of(pairs: Sequence[Moved]) -> str:
 def examine(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Findings | str:
-    """Ask a model the fixed questions by read-outs;
-    return what was found, or why a question got no answer.
+    """Ask a model the fixed questions by read-outs, and return the findings.
 
-    Letters are read over cyclic orders to see what follows them, and in the pairs as the agent
-    reads them. If no scene moved these, the pairs are asked the other way as well: weights may have
-    learnt one order alone.
+    If a question gets no answer, the error's text is returned. Letters are read over cyclic orders
+    to see what follows them, and in the pairs as the agent reads them. If no scene moved the
+    answers, the pairs are asked with the other way to read letters: weights may have learnt one
+    order alone.
     """
     letters = agent.letters if agent.answer in BARE else None
     reader = replace(agent, answer="readout", letters=letters)
@@ -166,10 +166,9 @@ def _answers(
 
 
 def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
-    """Return by fact how the answers to some pairs moved,
-    of the pairs of which both halves can be read.
+    """Return, by kind of fact, how the answers to pairs moved; unparsed pairs do not count.
 
-    A pair has two completions: with the fact, and without.
+    `completions` has two for each pair: with the fact, and without.
     """
     changes_by_fact: dict[Fact, list[float]] = {}
     for pair in pairs:
@@ -195,7 +194,7 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
-    """Keep what was found of the model with an identity."""
+    """Store findings in the user's cache, by the model's identity, prompt and answer mode."""
     name = _name(identity, findings.prompt_sha256, findings.answer)
     kept.keep(name, msgspec.json.encode(findings))
 
@@ -203,8 +202,9 @@ def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
 def recall_findings(
     identity: Mapping[str, Any], prompt_sha256: str, answer: str
 ) -> Findings | None:
-    """Return what was found of the model with an identity, asked so;
-    None if nobody asked it so here.
+    """Return the stored findings on a model with this identity, prompt and answer mode.
+
+    None if there are none on this machine.
     """
     data = kept.recall(_name(identity, prompt_sha256, answer))
     try:
@@ -221,9 +221,7 @@ def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
 
 
 def caveats(manifest: Manifest) -> Iterator[str]:
-    """Yield what `harness model check` found here of a run's models,
-    if they were asked as in the run.
-    """
+    """Yield sentences of stored findings on a run's models, if they were asked as in the run."""
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
