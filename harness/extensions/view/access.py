@@ -19,12 +19,18 @@ TOKEN = "token"
 
 
 def cookie(port: int) -> str:
-    """Return the name of the cookie; browsers send the cookies of one port to all."""
+    """Return the name of the cookie that holds the token on a port.
+
+    Browsers send the cookies of one port to all ports, so the name has the port.
+    """
     return f"swarmdrive-view-{port}"
 
 
 class Access:
-    """Answers 403 to whoever may not read, and passes on all other requests."""
+    """Guard the pages, as ASGI middleware: answer 403 to requests without the token.
+
+    Requests that another website causes are refused, too; all others are passed on to the app.
+    """
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self.app, self._token = app, token

@@ -72,7 +72,7 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
 
 
 def app(folder: Path, token: str) -> ASGIApp:
-    """Return the application for one folder of runs, for who has the token."""
+    """Return the web application for one folder of runs; requests need the token."""
     view = View(folder)
     routes = {
         "/": view.index,
@@ -121,8 +121,9 @@ class _Guarded:
 
 
 class View:
-    """One folder of runs. What reads files runs in threads;
-    pages that take seconds are made one by one.
+    """Answer the requests of the web application for one folder of runs.
+
+    Files are read in threads; pages that take seconds are made one at a time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -136,7 +137,7 @@ class View:
         return HTMLResponse(page, headers=OF_LIST if "<script>" in page else None)
 
     def progress(self, request: Request) -> Response:
-        """Return what changes in the list while runs go."""
+        """Return as JSON what changes in the list while runs go on."""
         every = runs(self.folder)
         return JSONResponse(pages.now(every, pages.extents(self.folder, every)))
 
@@ -168,7 +169,7 @@ class View:
         )
 
     async def notes(self, request: Request) -> Response:
-        """Return the notes on a run, with a form for more."""
+        """Return the page with the notes on a run, and a form for another."""
         [run] = await run_in_threadpool(self._picked, request)
         [path] = self._whole([run])
         scene = request.query_params.get("scene", "")
@@ -177,8 +178,9 @@ class View:
         return HTMLResponse(page, headers={"Referrer-Policy": "same-origin"})
 
     async def note(self, request: Request) -> Response:
-        """Write a note on a decision point of a run. `Access` refuses another origin;
-        browsers state one.
+        """Write the note that a form sent, and lead back to the run's notes.
+
+        A request that names no origin is refused here; `Access` refuses one from another origin.
         """
         if "origin" not in request.headers:
             raise HTTPException(
@@ -228,7 +230,7 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Compare two runs; the older is A, unless the address names another."""
+        """Return the page that compares two runs; A is the older, or the one in the address."""
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
@@ -245,7 +247,7 @@ class View:
         return await self._drawn(request, partial(pages.report, self._whole(picked), None, scene))
 
     def wrong(self, request: Request, error: Exception) -> Response:
-        """Return a page of one line about a request that cannot be answered."""
+        """Return an error page of one line, with the error's status, 400 for a UserError."""
         status, reason = (
             (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
         )
@@ -253,7 +255,7 @@ class View:
         return HTMLResponse(pages.wrong(str(reason)), status, headers)
 
     def bug(self, request: Request, error: Exception) -> Response:
-        """Return the same for a bug, of which the terminal has the traceback."""
+        """Return an error page of one line for a bug (status 500), and print its traceback."""
         traceback.print_exception(error)
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 

@@ -11,8 +11,9 @@ from harness.report.runs import Runs
 
 
 def with_decision(page: str, runs: Runs, scene: str) -> str:
-    """Return the page of some runs with everything about one decision of theirs,
-    prompts and pictures too.
+    """Return the HTML page of some runs with all details of one decision point put in.
+
+    The details are prompts, answers and pictures, which the page itself has for few points.
     """
     detail = library.packed({scene: everything(runs, scene)})
     return page.replace(
@@ -21,7 +22,10 @@ def with_decision(page: str, runs: Runs, scene: str) -> str:
 
 
 def everything(runs: Runs, name: str) -> dict[str, Any]:
-    """Return what a full page has of one decision point. Raises UserError if no run has it."""
+    """Return all details of one decision point, as a run's page shows them.
+
+    `name` is the point's id. Raises UserError if no run has it.
+    """
     if not any(name in run.decisions.scenes for run in runs.runs):
         raise UserError(
             f"no run here has a decision {printable(name, 40)}; see the list on its page"

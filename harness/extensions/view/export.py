@@ -47,19 +47,18 @@ NOTE = (
 
 
 def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[str]:
-    """Write the pages of a folder's finished runs, suites and studies to a new folder,
-    to be published.
+    """Write the pages of a folder's finished runs, suites and studies to a new folder, to publish.
 
     Every page of a run is drawn anew: what else lies in its folder is not published. A study's page
     is published as it is, if it begins as one that may run no script.
 
     Args:
-        folder: what `harness view` lists.
-        out: the folder, which exists only once it is complete.
-        progress: counts runs.
+        folder: the folder whose runs `harness view` lists.
+        out: the folder to make; it exists only once it is complete.
+        progress: called with 1 for each run.
 
     Returns:
-        What was left out, each with the reason.
+        A line for each run that was left out, with the reason.
 
     Raises:
         UserError: `out` is there already or cannot be written, or no run can be shown.

@@ -17,8 +17,9 @@ MAYBE = (NOTES, DIFFICULTY)  # what it may have besides
 
 
 def own_file(root: Path, run: str, name: str) -> Path | None:
-    """A file of a listed run's folder by its real path;
-    None if it has none, or that may not be read.
+    """Return the real path of a file in a listed run's folder, with links resolved.
+
+    It is None if there is no such regular file, or if it lies outside `root` or in a hidden folder.
     """
     base = os.path.realpath(root)
     file = Path(os.path.realpath(os.path.join(base, run, name)))
@@ -33,10 +34,10 @@ def own_file(root: Path, run: str, name: str) -> Path | None:
 
 
 def whole(root: Path, run: str) -> Path:
-    """Return the folder of a listed run, every file of which may be read.
+    """Return the folder of a listed run, all of whose files may be read.
 
     Raises:
-        UserError: one is missing, no file or a link that leads out.
+        UserError: a file is missing, is no regular file, or is a link that leads out of the folder.
     """
     for name in READ:
         if own_file(root, run, name) is None:
@@ -48,9 +49,7 @@ def whole(root: Path, run: str) -> Path:
 
 
 def pictures(root: Path, run: str) -> list[str]:
-    """Return the names of a listed study's pictures;
-    of one in several formats the one that scales.
-    """
+    """Return the file names of a listed study's pictures; of one in two formats only the SVG."""
     names = sorted(os.listdir(root / run))
     scaled = {Path(name).stem for name in names if name.endswith(".svg")}
     return [

@@ -23,9 +23,9 @@ from harness.runs.records import Score
 
 @dataclass(frozen=True)
 class Line:
-    """One run."""
+    """Hold one run in a history, with its value of the metric."""
 
-    name: str  # its folder, from the folder that is looked through
+    name: str  # its folder, relative to the folder of all runs
     date: datetime  # when it began
     run: Run  # as it was read
     score: Score | None  # its value in the group's condition; None where it has none
@@ -33,13 +33,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs of the same scenes."""
+    """Hold the runs of the same scenes, whose values may be compared."""
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
-    # of the values: the one that was asked for, or the last of those that most of the runs have;
+    # condition of the values: the given one, or the last of those that most of the runs have;
     # `all` of a metric that depends on none
     condition: str
-    metric: str  # of the values
+    metric: str  # metric of the values, such as `success_rate`
     lines: tuple[Line, ...]  # by date, the oldest first
 
 
@@ -50,11 +50,13 @@ def history(
     dataset: str | None = None,
     wrong: Callable[[str, UserError], object] = lambda name, error: None,
 ) -> list[Group]:
-    """Return the finished runs in a folder, the group whose last run is the newest first.
+    """Return the finished runs in a folder in groups of the same scenes, by date.
+
+    The group with the newest run comes first.
 
     Args:
-        folder: is looked through as `harness run ls` does.
-        metric: a metric of `summary.csv`; None for the success that leads in a group.
+        folder: is searched as `harness run ls` does.
+        metric: a metric of `summary.csv`; None for each group's headline success.
         condition: of the values; None for the last of those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
         wrong: called with the name of a run that is left out since a file of it is broken,
@@ -114,7 +116,7 @@ def _group(lines: Sequence[Line], metric: str | None, condition: str | None) -> 
 
 
 def write(groups: Sequence[Group], out: Path) -> None:
-    """Write the page. Raises UserError if `out` cannot be written."""
+    """Write a history as an HTML page. Raises UserError if `out` cannot be written."""
     place, labels = beside(out), dict.fromkeys(entry(group.metric).label for group in groups)
     about = (
         "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or "

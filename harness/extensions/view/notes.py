@@ -16,17 +16,17 @@ MOST, LONGEST = 1000, 4000  # notes of a run, and characters of one
 
 
 class Note(msgspec.Struct, frozen=True, kw_only=True):
-    """A note, of which a decision point has one at most."""
+    """Hold a user's note on a decision point, which has one at most."""
 
     scene: str  # id of the decision point
-    text: str
+    text: str  # what the user wrote
     date: str  # when it was written, UTC, ISO 8601
 
 
 def notes(run: Path) -> list[Note]:
-    """Return a run's notes, sorted by decision point; none without the file.
+    """Return the notes in a run's folder, sorted by decision point; empty without the file.
 
-    Raises UserError if it is broken.
+    Raises UserError if the file is broken.
     """
     try:
         return msgspec.json.decode(text_of(run / FILE, "text"), type=list[Note])
@@ -39,23 +39,22 @@ def notes(run: Path) -> list[Note]:
 
 
 def note_on(notes: Sequence[Note], scene: str) -> Note:
-    """Return the note on a decision point; an empty one if it has none."""
+    """Return the note on the decision point with the id `scene`; an empty one if there is none."""
     return next(
         (note for note in notes if note.scene == scene), Note(scene=scene, text="", date="")
     )
 
 
 def write(run: Path, scene: str, text: str, before: str) -> None:
-    """Note something on a decision point, in the place of what was noted there;
-    an empty text deletes that.
+    """Write a note on a decision point, in place of the old one; an empty text deletes it.
 
     Args:
-        run: its folder.
+        run: the run's folder.
         scene: id of the decision point.
         text: the note.
-        before: the date of the note whose place it takes; empty if there is none.
+        before: the date of the note that is replaced; empty if there is none.
 
-    Raises UserError if another note is there, it is too long, or the file is full,
+    Raises UserError if the note there has another date, the text is too long, or the file is full,
     broken or cannot be written.
     """
     every = notes(run)

@@ -40,8 +40,9 @@ COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
 def report(folders: Sequence[Path], written: Path | None = None, scene: str | None = None) -> str:
-    """Return the report of one run or several, `written` or new,
-    with all there is of a scene's decision.
+    """Return the HTML report of one or several runs: the file `written`, or a new one.
+
+    With `scene`, it has all details of that decision point.
     """
     runs = gather(folders)
     page = render(runs) if written is None else whole_text(written)
@@ -49,8 +50,9 @@ def report(folders: Sequence[Path], written: Path | None = None, scene: str | No
 
 
 def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = "/") -> str:
-    """Return a page of a run with links before all that it says itself:
-    to the list, and more with texts.
+    """Return a run's HTML page with links put in at its top: to the list, and others.
+
+    Each of `links` is a text and an address.
     """
     more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
     way_back = WAY_BACK.replace('"/"', f'"{home}"').replace("</p>", f"{more}</p>")
@@ -58,18 +60,19 @@ def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = 
 
 
 def whole_text(page: Path) -> str:
-    """Return the page that a run's folder holds."""
+    """Return the text of an HTML page that lies in a run's folder."""
     return bytes_of(page, "rows").decode("utf-8", "replace")
 
 
 def compared(folder: Path, a: Path, b: Path) -> str:
-    """Run B compared with run A, both of a folder."""
+    """Return the HTML page that compares run B with run A, both in `folder`."""
     return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, partial(_place, folder))
 
 
 def around(a: str, b: str) -> list[tuple[str, str]]:
-    """Return links of a comparison, each with its text:
-    A and B swapped, and all answers of both.
+    """Return the links of a comparison's page, each a text and an address.
+
+    They lead to the comparison with A and B swapped, and to all answers of both.
     """
     both = [("path", a), ("path", b)]
     differing = urlencode({"decisions": "", "differ": "answers"})
@@ -80,7 +83,7 @@ def around(a: str, b: str) -> list[tuple[str, str]]:
 
 
 def suite_of(folder: Path, name: str) -> SuiteRun:
-    """Read a listed suite, every file of which may be read. Raises UserError if one may not."""
+    """Read a listed suite. Raises UserError if a file of it may not be read."""
     for family in contents_of(folder / name).families.values():
         whole(folder, f"{name}/{family}")
     if own_file(folder, name, SUMMARY) is None:
@@ -89,7 +92,7 @@ def suite_of(folder: Path, name: str) -> SuiteRun:
 
 
 def suite(folder: Path, name: str) -> str:
-    """Return the page of a suite's runs, in a folder of it."""
+    """Return the HTML page of a listed suite of runs."""
     done = suite_of(folder, name)
     return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
@@ -99,11 +102,10 @@ def _place(folder: Path, run: Run) -> str:
 
 
 def listed(folder: Path, words: str, order: str) -> str:
-    """The runs that have all of these words somewhere, sorted by a column;
-    `-` before it turns it around.
+    """Return the HTML list of the runs that contain all of these words, sorted by a column.
 
-    While one of them is going, the page runs `script`,
-    and is allowed it by the digest of that alone.
+    `-` before the column's name reverses the order. While a run goes on, the page has a script,
+    allowed by its digest.
     """
     every = runs(folder)
     how_far = extents(folder, every)
@@ -129,7 +131,7 @@ def listed(folder: Path, words: str, order: str) -> str:
 
 
 def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
-    """Return how far the unfinished ones of these runs are, by name."""
+    """Return how far each unfinished run is, by the run's name."""
     return {run.name: extent(folder / run.name) for run in every if run.state == "unfinished"}
 
 
@@ -137,9 +139,8 @@ def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any
     """Return what changes in the list while runs go on.
 
     Returns:
-        `listed`, another text once a run begins or ends, `going`,
-            whether one goes on, and `unfinished`, by
-        the name that the list shows how far each is.
+        `listed`, a digest that changes once a run begins or ends; `going`, whether one goes on;
+        and `unfinished`, how far each is in words, by the run's name.
     """
     states = json.dumps([(run.name, run.state) for run in every])
     return {
@@ -154,7 +155,7 @@ def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any
 
 
 def progress(run: Listed, extent: Extent) -> str:
-    """Say how far an unfinished run is."""
+    """Return in words how far an unfinished run is."""
     due = "" if extent.due is None else f" of {'at most ' * extent.early}{extent.due}"
     text = f"{extent.done}{due} episodes"
     if extent.answers:
@@ -163,7 +164,7 @@ def progress(run: Listed, extent: Extent) -> str:
 
 
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
-    """Sorted by a column, those that have nothing there last."""
+    """Return listed runs sorted by a column; those without a value are last."""
     column = attrgetter(order.removeprefix("-"))
     known = [run for run in runs if column(run) is not None]
     unknown = [run for run in runs if column(run) is None]
@@ -171,24 +172,22 @@ def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:
-    """Return the pictures of a study that has no page of its own."""
+    """Return an HTML page of a study's pictures, for a study without a page of its own."""
     return _page("study.html.j2", run=run, pictures=pictures)
 
 
 def wrong(reason: str) -> str:
-    """Return one line about a request that cannot be answered."""
+    """Return the HTML page of one line on why a request cannot be answered."""
     return _page("wrong.html.j2", reason=reason)
 
 
 def style() -> str:
-    """Return the report's style, and the list's own."""
+    """Return the CSS of all pages of the list."""
     return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
 
 
 def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
-    """Return a link to the notes on a run, with its text;
-    or to a new note on one decision point of it.
-    """
+    """Return a link, as text and address, to a run's notes, or to that on a decision point."""
     where = {"path": run}
     if scene is not None:
         where["scene"] = scene
@@ -196,17 +195,16 @@ def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
 
 
 def notes(path: Path, name: str, scene: str) -> str:
-    """Return the notes on a run, with a form for one on a scene."""
+    """Return the HTML page of a run's notes, with a form for the note on `scene`."""
     every = run_notes.notes(path)
     here = run_notes.note_on(every, scene)
     return _page("notes.html.j2", run=name, notes=every, here=here, longest=run_notes.LONGEST)
 
 
 def note(path: Path, scene: str, text: str, before: str) -> None:
-    """Write a note on a decision point of a run,
-    in the place of the one that was written at `before`.
+    """Write a note on a decision point of a run, in place of the one with the date `before`.
 
-    Raises UserError if the run has no such point, or that another note.
+    Raises UserError if the run has no such point, or if the note there has another date.
     """
     if scene not in read_run(path).decisions.labels("scene"):
         raise UserError(
@@ -217,7 +215,7 @@ def note(path: Path, scene: str, text: str, before: str) -> None:
 
 
 def script() -> str:
-    """Return the one script of the list."""
+    """Return the JavaScript of the list, its only script."""
     return text_of(TEMPLATES / "list.js")
 
 

@@ -13,10 +13,10 @@ from harness.runs.folder import Run
 
 
 class Remarks:
-    """The remarks of notes; see `harness.report.remarks.Remarks`."""
+    """Show users' notes on the page of their run; see `harness.report.remarks.Remarks`."""
 
     def sentences(self, runs: Runs) -> Iterator[Markup]:
-        """Each note on a decision point that its run has."""
+        """Yield each note on a decision point of these runs, as HTML."""
         template = environment(Path(__file__).parent).get_template("remark.html.j2")
         for place, run in enumerate(runs.runs):
             if noted := notes(run.path):
@@ -26,7 +26,7 @@ class Remarks:
                         yield Markup(template.render(note=note, place=place, runs=runs))
 
     def left_out(self, run: Run) -> LeftOut:
-        """Notes leave nothing out."""
+        """Return nothing: notes are not about what was left out of a prompt."""
         return {}
 
 

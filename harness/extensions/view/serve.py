@@ -10,12 +10,12 @@ from harness.extensions.view.app import app
 
 
 def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C.
+    """Serve a folder of runs to browsers on this machine until Ctrl-C.
 
     Args:
-        folder: the runs.
-        port: 0 for a free one.
-        listening: called with the address, which holds the token, as soon as it is listened on.
+        folder: the folder of runs.
+        port: the port; 0 for a free one.
+        listening: called with the address, which holds the token, once the server listens.
 
     Raises:
         UserError: the port is not available.
