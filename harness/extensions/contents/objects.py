@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class ListsObjects(Call):
-    """Adds to the ego's graph what helpers list, and themselves."""
+    """Ask the ego's model again with a scene graph that also has what helpers list."""
 
     name = "objects"
     in_graph = True
@@ -35,7 +35,7 @@ class ListsObjects(Call):
 
 
 class ShowsTruth(Call):
-    """Takes the true graph, of which every region is in sight, for the ego's."""
+    """Ask the ego's model again with the true scene graph, in which every region is in sight."""
 
     name = "truth"
     in_graph = True
@@ -53,10 +53,10 @@ class ShowsTruth(Call):
 
 
 class OfLists(Content):
-    """A message that lists the objects which a helper's sensors see.
+    """Describe a message that lists the objects which a helper's sensors see.
 
-    No model is asked for it, so it leaves as soon as the request is there. The ego's model is asked
-    once more, with a scene graph that has these objects as well, and the ego acts on that answer.
+    The helper's model is not asked, so the message leaves at once. The ego's model is asked again,
+    with a scene graph that has these objects as well, and the ego acts on that answer.
     """
 
     needs = (kinds.OBJECTS,)
@@ -73,8 +73,10 @@ class OfLists(Content):
 
 
 class OfBoth(Content):
-    """Two messages, of which one holds an intent and one objects:
-    the ego's answer to the larger graph is fused with the intents.
+    """Describe two messages of a helper: one with its intent, one with its list of objects.
+
+    The ego's model answers again to the larger scene graph, and that answer is fused with the
+    intents.
     """
 
     holds = frozenset((INTENTS, WORDS, kinds.OBJECTS))

@@ -49,7 +49,7 @@ PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size"
 
 
 def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
-    """Declare the study of what some models' runs came to."""
+    """Return the study of contents of messages; `results` has one for each model."""
     manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
     points, by_group = points_table(results), groups_table(results)
     runs = [run for result in results for run in result.model.runs.values()]
@@ -101,7 +101,7 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 
 
 def headline(result: Result) -> list[str]:
-    """Say which content wins where, and what each costs at the first condition."""
+    """Return sentences on which content gains over intents and where, and what each costs."""
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
     for content in result.sent:
@@ -387,7 +387,7 @@ def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
 
 
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
-    """Return a row for each model, grid point, content and family, with the mean over families."""
+    """Return a table with a row for each model, grid point, content and family."""
     import pandas as pd
 
     rows = []
@@ -425,7 +425,7 @@ def _points_row(
 
 
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
-    """Return a row for each model, group of episodes and content, at the first condition."""
+    """Return a table of the first condition, a row a model, group of episodes and content."""
     import pandas as pd
 
     rows = []

@@ -57,46 +57,46 @@ Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and th
 
 
 class Panel(NamedTuple):
-    """One axis in one condition; without an axis, the condition as it is."""
+    """Describe one axis of the study in one condition; without an axis, the condition as it is."""
 
-    name: str
-    axis: str  # empty without one
-    settings: tuple[Setting, ...]  # its grid points, whatever a message holds
+    name: str  # such as `6g:encoding=etsi over loss`
+    axis: str  # the setting that is varied; empty without one
+    settings: tuple[Setting, ...]  # its grid points, the same for every content
 
 
 @dataclass(frozen=True)
 class Model:
-    """The runs of one model."""
+    """Hold the runs of one model, and what its messages cannot hold."""
 
-    name: str
+    name: str  # model, prompts and answer mode
     runs: Mapping[str, ReplayedRun]  # by family of scenes
     left_out: Mapping[str, str]  # contents that its agents cannot play, and why
 
     @property
     def contents(self) -> list[str]:
-        """The contents that it plays."""
+        """Return the contents of messages that its agents can play."""
         return [content for content in PLAYED if content not in self.left_out]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a model's runs came to at one point."""
+    """Hold the metrics of a model's runs with one content at one grid point."""
 
     families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
     success_rules: Mapping[str, Success]  # of each family; the metric is the same in all
 
     @property
     def headline_metric(self) -> str:
-        """The metric of success by which it is read, plain or balanced."""
+        """Return the name of the metric of success that is shown first, plain or balanced."""
         return next(iter(self.success_rules.values())).metric
 
     @property
     def success(self) -> Estimate:
-        """The headline metric's estimate, the mean over families."""
+        """Return the headline metric, as a mean over families of scenes."""
         return self.estimate(self.headline_metric)
 
     def estimate(self, metric: str, family: str = MEAN) -> Estimate:
-        """Return a metric of a family, or its mean over families."""
+        """Return a metric of a family of scenes, or its mean over families, over episodes."""
         estimates = []
         for name in self._of(family):
             values = self.families[name]
@@ -109,11 +109,18 @@ class Outcome:
     def over(
         self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = ""
     ) -> Estimate:
-        """Return success less another outcome's, paired by episode; plain if `metric` is."""
+        """Return this outcome's success less another's, paired by episode.
+
+        It is of a family or the mean over families, at a confidence level. The metric is the
+        headline's, or plain success if `metric` names it.
+        """
         return mean_difference([*self._pairs(other, family, metric)], level)
 
     def p_over(self, other: "Outcome") -> float | None:
-        """Return the p-value of no such difference in the mean over families."""
+        """Return the p-value of no difference in success to another outcome.
+
+        It is of the mean over families, and None without an interval.
+        """
         return p_of_mean([*self._pairs(other, MEAN)])
 
     def _pairs(
@@ -127,7 +134,10 @@ class Outcome:
             yield rule, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
-        """Return success of the episodes of all families that are in a group, (S, n)."""
+        """Return success of the episodes in a group, all families together, (S, n).
+
+        `groups` has a mask of each family's episodes, (E,).
+        """
         parts = []
         for family, values in self.families.items():
             parts.append(values[SUCCESS][:, groups[family]])
@@ -139,34 +149,34 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """All points of one model."""
+    """Hold the outcomes of one model with every content at every grid point."""
 
-    model: Model
-    panels: Sequence[Panel]
-    outcomes: Mapping[Place, Outcome]
+    model: Model  # the model and its runs
+    panels: Sequence[Panel]  # the axes and conditions that were played
+    outcomes: Mapping[Place, Outcome]  # by operating point and number of vehicles
 
     def at(self, setting: Setting, content: str) -> Outcome:
-        """Return the outcome of a content at a grid point."""
+        """Return the outcome with a content at a grid point."""
         return self.outcomes[place(setting, content)]
 
     @property
     def base(self) -> Setting:
-        """The first condition as it is."""
+        """Return the grid point of the first condition as it is."""
         return self.panels[0].settings[0]
 
     @property
     def points(self) -> list[Setting]:
-        """Each different grid point once."""
+        """Return every grid point once, though panels may share it."""
         return distinct(self.panels)
 
     @property
     def others(self) -> list[str]:
-        """The contents that are compared with intents."""
+        """Return the contents that are compared with intents: all others that it plays."""
         return [content for content in self.model.contents if content != INTENT]
 
     @property
     def sent(self) -> list[str]:
-        """The contents beside intents that a message can hold."""
+        """Return the contents beside intents that messages can hold: not `nothing` or `oracle`."""
         return [
             content
             for content in self.others
@@ -184,70 +194,69 @@ class Result:
         return dict(zip(places, corrected(p_values), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
-        """Return the p of a content against intents,
-        by Holm's method for all of the model; of these None.
+        """Return the p-value of no difference in success between a content and intents.
+
+        It is corrected by Holm's method over all of the model; None for intents.
         """
         return self._p.get(place(setting, content))
 
     @property
     def headline_metric(self) -> str:
-        """The metric of success by which it is read, plain or balanced."""
+        """Return the name of the metric of success that is shown first, plain or balanced."""
         return self.at(self.base, INTENT).headline_metric
 
     @property
     def words(self) -> str:
-        """The headline metric's name for people."""
+        """Return the headline metric's name for people."""
         return IN_WORDS[self.headline_metric]
 
     @property
     def successes(self) -> tuple[str, ...]:
-        """The headline metric, then the metrics that it is the mean of."""
+        """Return the headline metric; if it is balanced, also the two that it is the mean of."""
         return self.headline_metric, *entry(self.headline_metric).halves
 
     @property
     def families(self) -> list[str]:
-        """The families, and their mean where there are several."""
+        """Return the families of scenes, and `mean` where there are several."""
         names = list(self.model.runs)
         return [*names, MEAN] if len(names) > 1 else names
 
 
 def holding(point: OperatingPoint, content: str) -> OperatingPoint:
-    """Return the operating point with this content."""
+    """Return an operating point with this content; with `nothing`, the ego never asks."""
     if content == NOTHING:
         return point.changed(content=INTENT, schedule=NEVER, threshold=None)
     return point.changed(content=content)
 
 
 def place(setting: Setting, content: str) -> Place:
-    """Return what decides an outcome: the operating point with this content,
-    and the number of vehicles.
-    """
+    """Return the key of an outcome: operating point with this content, and number of vehicles."""
     return holding(setting.point, content), setting.vehicles
 
 
 def distinct(panels: Sequence[Panel]) -> list[Setting]:
-    """Return each different grid point once, in order."""
+    """Return the grid points of all panels in order, each once."""
     every = [setting for panel in panels for setting in panel.settings]
     last_first = {place(setting, INTENT): setting for setting in reversed(every)}
     return list(last_first.values())[::-1]
 
 
 def folders(path: Path) -> list[Path]:
-    """Return the folders of a suite's runs, or a run's own."""
+    """Return the folders of the runs in a suite's folder; of a run's folder, itself."""
     if (path / SUITE).is_file():
         return [path / name for name in contents_of(path).families.values()]
     return [path]
 
 
 def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> list[Model]:
-    """Return the models of some runs, each with the contents that it can play in these panels.
+    """Group runs by model, each with the contents that it can play in these panels.
 
     Args:
         given: the runs of a suite together, which are of one model, or a run alone.
-        panels: what is played.
+        panels: the conditions and axes that are to be played.
 
     Raises:
-        UserError: two runs of a model are on the same family, or a model can play no intents.
+        UserError: two runs of a model are on the same family, or a model cannot play intents.
     """
     by_model: dict[str, dict[str, ReplayedRun]] = {}
     for runs in given:
@@ -294,10 +303,10 @@ def panels_of(
     over: Sequence[str],
     grids: Sequence[str],
 ) -> list[Panel]:
-    """Return the conditions as they are, and each axis in each of them;
-    the usual ones if none is given.
+    """Return a panel for each condition as it is, and for each axis in each of them.
 
-    Raises UserError as `sweep.settings` does, or if there are more grids than axes.
+    `over` names the axes, and `grids` their values; without conditions and axes, the usual ones are
+    taken. Raises UserError as `sweep.settings` does, or if there are more grids than axes.
     """
     if len(grids) > len(over):
         raise UserError(
@@ -320,9 +329,9 @@ def panels_of(
 
 
 def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, int]]:
-    """Return how many questions each run may lack, by family and role.
+    """Return how many questions each run may lack at most, by family and role.
 
-    They are about the decision points that the run or a reference driver comes to.
+    They are about the decision points that the run or a reference driver visits.
     """
     points = set[OperatingPoint]()
     for setting in distinct(panels):
@@ -338,7 +347,7 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 def manifest_of(
     swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Return what a study is made of."""
+    """Return what identifies a study, as plain values: runs, contents, seeds and panels."""
     return {
         "sources": [run.manifest() for model in swarms for run in model.runs.values()],
         "contents": list(PLAYED),
@@ -357,7 +366,7 @@ def run_contents(
     """Play every content at every grid point with every model's runs.
 
     Raises:
-        UserError: the folder holds another study.
+        UserError: the folder `out` holds another study.
         Unanswered: too many questions got no answer; the runs keep all others.
     """
     refuse_other(out, "contents", manifest_of(swarms, panels, seeds))
@@ -414,7 +423,8 @@ def _columns(parameters: Parameters, part: Decided[Any]) -> dict[str, Floats]:
 def witnesses(run: ReplayedRun) -> Ints:
     """Return how many helpers have the danger in sight at the first decision of each episode, (E,).
 
-    `SAFE` without a danger, `HEARD` where it has a radio: its beacons tell of it, whoever sees it.
+    It is `SAFE` (-1) without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons
+    tell of it.
     """
     forest, scenario = run.dataset.forest, run.dataset.scenario
     roots = [forest.ids[n] for n in forest.root.tolist()]
@@ -435,8 +445,9 @@ def witnesses(run: ReplayedRun) -> Ints:
 
 
 def groups(model: Model) -> dict[str, dict[str, Bools]]:
-    """Return by name which episodes of each family, (E,), are in each group:
-    by who sees the danger.
+    """Return groups of episodes by how many helpers see the danger, by the group's name.
+
+    Each has a mask of the episodes, (E,), of every family.
     """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(of_family.max()) for of_family in counts.values())

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 
 class SaysWords(Call):
-    """Shows each helper's words in one line, and nothing else."""
+    """Ask the ego's model again with each helper's words in a line, and nothing else of it."""
 
     name = "text"
     in_words = True
 
 
 class OfText(Content):
-    """Words without an intent."""
+    """Describe a message that holds a helper's words without an intent."""
 
     holds = frozenset((WORDS,))
     call = SaysWords()
