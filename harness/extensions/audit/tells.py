@@ -41,7 +41,7 @@ Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 
 @dataclass(frozen=True)
 class Audit:
-    """How well a danger that is out of sight can be told from what is in sight."""
+    """Hold how well the hidden danger of a scenario can be predicted from what the ego sees."""
 
     scenario: str  # name of the scenario
     layouts: int  # number of layouts
@@ -49,8 +49,8 @@ class Audit:
     # decision points that were compared: those at which at least half of the dangers are hidden.
     # Later, an empty road is an observation and gives nothing away
     steps: tuple[int, ...]
-    # for each question (`danger`, and each sector that it can come from) the probability that a
-    # layout with it ranks above one without. Intervals are a bootstrap over layouts, for these
+    # for each question (`danger`, and each sector that it can come from) the AUC: probability that
+    # a layout with it ranks above one without. Intervals are a bootstrap over layouts, for these
     # models
     auc: Mapping[str, Estimate]
     # the numbers that gave it away, with the AUC lost without each; empty unless it `tells`
@@ -67,7 +67,7 @@ class Audit:
 
 @dataclass(frozen=True)
 class HiddenPoints:
-    """Decision points of some layouts at which the danger is out of sight."""
+    """Hold m decision points of some layouts at which the danger is out of sight."""
 
     layout: Ints  # index of each point's layout, (m,)
     step: Ints  # index of its decision, (m,)
@@ -85,8 +85,8 @@ def audit(
 ) -> Audit:
     """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
 
-    Raises UserError without scikit-learn, or if too few layouts have a danger,
-    or too few have none.
+    `progress` is called with the number of layouts just done. Raises UserError without
+    scikit-learn, or if too few layouts have a danger, or too few have none.
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
@@ -160,7 +160,12 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
 def judge(
     points: HiddenPoints, sectors: tuple[str, ...]
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """Return the AUC of each question, and what gave the best answered one away (`Audit`)."""
+    """Return the AUC of each question, and the numbers that give the danger away.
+
+    A question is whether there is a danger, or whether it comes from one of the `sectors`. Each
+    number is returned with the AUC lost without it, for the question with the highest AUC, if that
+    is too high. Cross-validated gradient-boosted trees answer.
+    """
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.model_selection import StratifiedGroupKFold
 
@@ -225,7 +230,7 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Comparisons between layouts with the danger in question and layouts without."""
+    """Hold pairwise comparisons of scores of layouts with the danger in question and without."""
 
     # number of pairs of points in which the layout with it ranks higher, (with, without); a tie
     # counts half
@@ -234,9 +239,10 @@ class Ranks:
 
     @classmethod
     def compare(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
-        """Compare the scores of points (m,) of layouts with the danger (`there`, (m,)) and without.
+        """Compare the scores (m,) of points of layouts with the danger (`there`, (m,)) and without.
 
-        Only points with the same value of `alike` (m,) are compared.
+        `layout` (m,) has each point's layout. Only points with the same value of `alike` (m,) are
+        compared.
         """
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
@@ -268,7 +274,7 @@ class Ranks:
 
 
 class OfDatasets:
-    """The audit of a dataset that is built."""
+    """Audit a dataset while it is built: what `harness dataset build` calls."""
 
     def ready(self) -> None:
         extras.need("an audit", "sklearn")
