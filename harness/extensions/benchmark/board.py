@@ -25,18 +25,22 @@ from harness.runs.suite import SuiteRun, plays
 
 @dataclass(frozen=True)
 class Line:
-    """One entry."""
+    """Hold one entry of a benchmark's board, with its rank and scores."""
 
     entry: Rescored  # the file of results, computed again
     # one more than the number of ranked entries that are clearly better; None of one that sees what
     # no vehicle can see, which is no contestant
     rank: int | None
-    success: Mapping[str, Score | None]  # by condition, means over families, that to rank by first
-    gain: Score | None  # of that one over `BASELINE`
+    # success by condition, a mean over families; the condition that ranks comes first
+    success: Mapping[str, Score | None]
+    gain: Score | None  # success under the first condition less that under `BASELINE`
 
     @property
     def name(self) -> str:
-        """The agents in words, with all that entries may choose; of a rule without the prompt."""
+        """Return the entry's name: model, prompt, answer mode and other choices.
+
+        For a rule, which reads no prompt, it is the model alone.
+        """
         variant, manifest = self.entry.suite.variant, self.entry.suite.manifest
         if not reads_prompts(str(manifest.model["engine"])):
             return f"{variant.model} · a rule"
@@ -45,8 +49,9 @@ class Line:
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:
-    """Return the entries of one edition, the best first.
-    Raises UserError if they are of several, or none.
+    """Return the board's lines for the entries of one edition, the best first.
+
+    Raises UserError if the entries are of several editions, or if there are none.
     """
     names = dict.fromkeys(entry.edition.name for entry in entries)
     if len(names) != 1:
@@ -109,13 +114,16 @@ def _gain(suite: SuiteRun, edition: Edition, metric: str) -> Score | None:
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
-    """Write the page; `left_out` says of other files why they are not on it."""
+    """Write a board's HTML page to `out`, and return its path.
+
+    `left_out` has, for other files, the reason why they are not on the board.
+    """
     save([render(ordered, left_out)], out, "--out")
     return out
 
 
 def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
-    """Return the page of a board's lines."""
+    """Return a board's HTML page; `left_out` has reasons why other files are not on it."""
     first = ordered[0].entry
     edition, suite = first.edition, first.suite
     by = edition.ranked_by

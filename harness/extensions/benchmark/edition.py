@@ -39,26 +39,24 @@ Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of d
 
 
 class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A small file of results, `editions/NAME.golden.zip`,
-    whose figures pin how all figures are computed.
-    """
+    """Describe `editions/NAME.golden.zip`, a results file that pins how figures are computed."""
 
-    sha256: str  # of the file
-    layouts: Count  # how many of each dataset it has, from the first
+    sha256: str  # digest of the file
+    layouts: Count  # number of layouts of each dataset that it has, from the first
 
 
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A version of the benchmark that never changes: all that a score on it depends on."""
+    """Describe a version of the benchmark that never changes: all that a score on it depends on."""
 
-    name: str  # of its file
-    digest: str  # of its tables, hex SHA-256
+    name: str  # name of its file, without .toml
+    digest: str  # hex SHA-256 of its file's tables
     description: str  # its purpose
     datasets: Digests  # digests of the datasets' manifests, by name, in the order of tables
     prompts: Digests  # digests of the prompts that an entry may choose from, by version
     condition: Names  # the operating points that are scored
     ranked_by: str  # the one of them by which entries are ranked
-    seeds: str  # of the channel, as `--seeds` reads them
-    latency: str  # of every answer, as `--latency` reads it
+    seeds: str  # channel seeds, as `--seeds` reads them
+    latency: str  # latency of every answer, as `--latency` reads it
     ties: str  # how equally likely actions are taken, as `--ties` reads it
     metrics: Names  # the figures that a file of results states
     # the kind of the intervals of gains: of all layouts taken together, or combined from those of
@@ -72,11 +70,14 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return find(KIND, f"{self.name}.golden.zip")
 
     def layouts(self, file_sha256: str) -> int | None:
-        """Return how many layouts of each dataset a file with this digest has; None for all."""
+        """Return how many layouts of each dataset a file with this digest has; None for all.
+
+        It is a file of results; only the edition's golden file has fewer than all.
+        """
         return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
 
     def figures(self, run: Run) -> list[Score]:
-        """Return the figures of a run that a file of results states."""
+        """Return the scores of a run that a results file of this edition states."""
         scores = [score for score in run.scores if score.metric in self.metrics]
         if self.gains == PAIRED:
             return scores
@@ -85,14 +86,16 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ]
 
     def difference(self, pairs: Pairs) -> Estimate:
-        """Return the mean over families of success a - b,
-        with the interval of the edition's gains.
+        """Return the mean difference in success a - b over families, with the edition's interval.
+
+        `pairs` has, for each family, its success rule and both sides' success (S, E).
         """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
     def settings(self, dataset: str, **asked: Any) -> Settings:
-        """Return the settings of an evaluation on one of the datasets;
-        `asked` says who answers, and how.
+        """Return the settings of an evaluation on one of the edition's datasets.
+
+        `asked` are further settings, such as `model`, `prompt` and `answer`.
         """
         return Settings(
             world=FrozenSettings(dataset=dataset),
@@ -104,8 +107,9 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         )
 
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
-        """Return one of the datasets, or its first layouts.
-        Raises UserError if the one here is another.
+        """Return one of the edition's datasets; with `limit`, its first layouts.
+
+        Raises UserError if the dataset of that name here has another digest.
         """
         source = FrozenSource(load.load(load.find(dataset), limit), Selection(limit))
         if source.dataset.sha256 != self.datasets[dataset]:
@@ -117,8 +121,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
         """Return the runs of one entry by dataset, in the edition's order.
 
-        Raises UserError unless each is of this edition, each dataset has one, and all are of one
-        agent. `limit` is how many layouts they are of; None for all, as an entry is.
+        `limit` is how many layouts they are of; None for all, as an entry is. Raises UserError
+        unless each run is of this edition, each dataset has one, and all are of one agent.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
@@ -175,8 +179,9 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 yield f"its {what}: {printable(value)}, not {printable(wanted)}"
 
     def spec(self, run: Run, source: FrozenSource) -> Spec:
-        """Return the evaluation that a run of this edition is;
-        of the run it takes who answered, and how.
+        """Return the evaluation that computes a run again: the edition's settings, the run's agent.
+
+        Raises UserError if the prompt here is another than the edition's.
         """
         m = run.manifest
         prompt = versions.load(str(m.prompt["version"]))
@@ -205,8 +210,9 @@ def _agent(m: Manifest) -> dict[str, Any]:
 
 
 def named(name: str) -> Edition:
-    """Return an edition, shipped or the project's.
-    Raises UserError if there is none, or it is wrong.
+    """Return an edition by name, shipped or the project's.
+
+    Raises UserError if there is none, or its file is wrong.
     """
     if name not in names(KIND):
         raise unknown("edition", name, names(KIND))
@@ -214,7 +220,7 @@ def named(name: str) -> Edition:
 
 
 def of_file(file: Path) -> Edition:
-    """Read an edition's file. Raises UserError if it is wrong."""
+    """Read an edition from its TOML file. Raises UserError if the file is wrong."""
     where = f"edition {printable(file)}"
     tables = toml(file, where)
     try:

@@ -24,27 +24,27 @@ from harness.runs.suite import SuiteRun
 
 @dataclass(frozen=True)
 class Rescored:
-    """A file of results, computed again here."""
+    """Hold a results file whose figures were computed again here from its answers."""
 
-    contents: Contents  # what the file says of itself
-    edition: Edition  # the one that it names
+    contents: Contents  # the file's own `results.json`
+    edition: Edition  # the edition that the file names
     suite: SuiteRun  # the runs as they were computed here, by family
     # what differs from the figures in the file, by dataset, in words; none where all are equal
     differences: Mapping[str, Sequence[str]]
-    compared: int  # how many figures were
+    compared: int  # number of figures that were compared
     # whether the file is the one that pins the edition, of a few layouts, and no entry
     golden: bool = False
 
 
 class Here:
-    """This installation: its datasets, each of which is read once, and how it computes figures."""
+    """Represent this installation: its datasets, each read once, and how it computes figures."""
 
     def __init__(self) -> None:
         self._sources: dict[tuple[str, str], FrozenSource] = {}
         self._checked: set[str] = set()  # digests of editions
 
     def source(self, edition: Edition, name: str) -> FrozenSource:
-        """Return a dataset of an edition. Raises UserError if the one here is another."""
+        """Return a dataset of an edition. Raises UserError if the one here has another digest."""
         key = edition.digest, name
         if key not in self._sources:
             self._sources[key] = edition.source(name)
@@ -74,20 +74,20 @@ class Here:
 
 
 def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: Here) -> Rescored:
-    """Compute a file's runs again under the edition that it names, in an empty folder.
+    """Compute a results file's runs again from its answers, under the edition that it names.
 
-    Of the file, only what the models wrote is used. Rules are here and are asked again; no other
-    model is asked, and nothing of the file is run.
+    Only what the models wrote is used of the file. Rules are asked again here, no other model is,
+    and nothing in the file is run.
 
     Args:
         file: the file of results.
-        folder: where the runs are unpacked and computed.
+        folder: an empty folder, where the runs are unpacked and computed.
         progress: called with the number of answers that were read again.
         here: this installation, which several files share.
 
-    Raises UserError if the file is broken, too large or of another edition than the one here, or
-    has not the answer to every question, or one to another question; or if figures are computed
-    otherwise here.
+    Raises UserError if the file is broken, too large or of another edition than the one here, if it
+    lacks the answer to a question, or has one to another question; or if this installation computes
+    the edition's golden figures otherwise.
     """
     contents, stated = contents_of(file), folder / "stated"
     with _about(file, stated):
@@ -131,11 +131,10 @@ def _about(file: Path, stated: Path) -> Iterator[None]:
 
 
 def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
-    """Yield what differs between the figures of two runs that an edition names,
-    and between their episodes.
+    """Yield the names of figures in which two runs of an edition differ, and of episodes' columns.
 
-    Numbers are compared as they are written, to the last digit;
-    but not a column of episodes that the stated run, which may be older, lacks.
+    Numbers are compared as they are written, to the last digit. A column of episodes that the
+    stated run, which may be older, lacks is not compared.
     """
     stated_scores = {score.key: score for score in edition.figures(stated)}
     computed_scores = {score.key: score for score in edition.figures(computed)}

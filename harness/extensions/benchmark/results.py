@@ -51,9 +51,12 @@ BROKEN_ZIP = (*BROKEN, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedE
 
 
 class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The content of `results.json`."""
+    """Hold the content of `results.json`, which describes a file of results.
 
-    format: str
+    Raises ValueError for another format, bad names of runs, or a `made_by` that is too long.
+    """
+
+    format: str  # `FORMAT`
     edition: str  # its name
     digest: str  # the edition's digest
     made_by: str  # who made the file, in their own words
@@ -78,10 +81,9 @@ def pack(
     figures: Callable[[Run], Sequence[Score]],
     out: Path,
 ) -> None:
-    """Write the runs, by dataset, to one file.
-    What a run says of the machine's folders is left out.
+    """Write an entry's runs, by dataset, to one zip file.
 
-    `figures` returns those that count of a run.
+    `figures` returns the scores of a run that are written. Paths of this machine are left out.
     """
     with (
         replacing(out) as part,
@@ -120,19 +122,20 @@ def _files(
 
 
 def contents_of(file: Path) -> Contents:
-    """Return what a file says of itself. Raises UserError if it is no such file;
-    nothing else is unpacked.
+    """Read `results.json` in a file of results; nothing else is unpacked.
+
+    Raises UserError if the file is not one of results.
     """
     with _archive(file) as archive:
         return msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
 
 
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
-    """Write a file's runs to a folder, by dataset.
+    """Write a results file's runs to a folder, by dataset.
 
-    Only the files that `contents` call for are written, each under a name that is made here and no
-    larger than `FILES` allows. Raises UserError, before anything is unpacked, if it states others
-    or larger ones.
+    Only the files that `contents` call for are written, under names made here and no larger than
+    `FILES` allows. Raises UserError, before anything is unpacked, if it holds others or larger
+    ones.
     """
     with _archive(file) as archive:
         wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
