@@ -35,16 +35,16 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 
 @dataclass(frozen=True)
 class Correction:
-    """What is done to the answers of one role."""
+    """Hold the correction of one role's answers: a prior to divide out, and a temperature."""
 
-    answers: Count  # how many it was fitted on
+    answers: Count  # number of answers that it was fitted on
     # the exponent is 1 / temperature; 1 changes nothing
     temperature: Annotated[float, Meta(ge=COOLEST, le=HOTTEST)] = 1.0
     # the mean answer, a probability an action; empty where none is divided out
     prior: tuple[Annotated[float, Meta(ge=LEAST_PRIOR, le=1)], ...] = ()
 
     def of(self, p: Floats) -> Floats:
-        """Return intents `(..., A)` corrected; NaN stays."""
+        """Return intents `(..., A)` corrected; rows with NaN stay as they are."""
         powers = (p / np.array(self.prior or 1.0)) ** (1.0 / self.temperature)
         total = powers.sum(axis=-1, keepdims=True)
         return np.where(total > 0, powers / np.where(total > 0, total, 1.0), p)
@@ -52,22 +52,23 @@ class Correction:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The content of a file of `calibrations/`."""
+    """Hold the content of a file of `calibrations/`: corrections for one model and one question."""
 
     level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
     command: str  # the command that made the file
     fitted_on: str  # the run, with its layouts
-    first_seed: int  # of the layouts
-    last_seed: int
-    scenario: str
+    first_seed: int  # least layout seed that it was fitted on
+    last_seed: int  # greatest layout seed
+    scenario: str  # name of the scenario
     actions: tuple[str, ...]
     question: dict[str, str]  # what answers: model, prompt and answer mode (`question_of`)
-    ego: Correction
-    helper: Correction | None = None  # None where no helper answered
+    ego: Correction  # of the ego's answers
+    helper: Correction | None = None  # of helpers' answers; None where no helper answered
 
     def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
-        """Return why it does not fit an agent's settings (`question_of`) in a scenario;
-        None if it does.
+        """Return why it must not correct an agent's answers in a scenario; None if it may.
+
+        `agent` has the agent's settings, as `question_of` takes them.
         """
         of_scenario = {"scenario": scenario.name, "actions": " ".join(scenario.actions)}
         now = {**question_of(agent), **of_scenario}
@@ -80,13 +81,16 @@ class Calibration:
         return None
 
     def of(self, intents: Intents) -> Intents:
-        """Return intents corrected."""
+        """Return intents of all vehicles with the answers of ego and helpers corrected."""
         helpers = self.helper.of(intents.helpers) if self.helper else intents.helpers
         return replace(intents, own=self.ego.of(intents.own), helpers=helpers)
 
 
 def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a calibration is frozen by, of an agent's settings as `run.json` has them."""
+    """Return the settings of an agent for which a calibration is valid, as texts by name.
+
+    `agent` has the agent's settings as `run.json` states them: model, prompt, answer mode and more.
+    """
     model, prompt = agent["model"], agent["prompt"]
     return {
         **{f"model.{key}": str(model[key]) for key in OF_MODEL if model.get(key) is not None},
@@ -96,7 +100,7 @@ def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
 
 
 def names() -> list[str]:
-    """Return the names of all calibrations, with a project's."""
+    """Return the names of all calibrations, the project's included."""
     return resources.names(FOLDER)
 
 
@@ -126,7 +130,10 @@ def _read(path: Any) -> Calibration:
 
 
 def check_seeds(what: str, first: int, last: int) -> None:
-    """Raise UserError unless layout seeds are all for tuning."""
+    """Raise UserError unless layout seeds `first` to `last` are all for tuning.
+
+    `what` names their source in the message.
+    """
     if not 0 <= first <= last or purposes(first, last - first + 1) != ["tune"]:
         raise UserError(
             f"{what}: {ONLY_TUNE}, and these are {stated(first, max(last - first, 0) + 1)}"

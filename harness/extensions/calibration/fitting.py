@@ -37,20 +37,20 @@ DIGITS = 6  # of a prior
 
 @dataclass(frozen=True)
 class Fitted:
-    """What the answers of one role were corrected to, on the layouts that it was fitted on."""
+    """Hold the correction of one role's answers, and their likelihood without and with it."""
 
-    role: str
-    correction: Correction
-    # mean negative log-likelihood of the optimal actions, where any action is optimal
+    role: str  # `ego` or `helper`
+    correction: Correction  # the fitted correction
+    # mean negative log-likelihood of the optimal actions in nats, where any action is optimal
     before_nats: float
     after_nats: float
 
 
 def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
-    """Fit a correction on answers and the actions that are optimal there, both (n, A).
+    """Fit a correction on answers `p` (n, A) and a mask of the optimal actions there, (n, A).
 
-    The prior is the mean of all answers.
-    Of the temperatures that do best, it has the one nearest to 1.
+    Level `L0` has a prior, the mean of all answers; `L1` the temperature with the best likelihood,
+    of equal ones that nearest to 1. Raises UserError for `L1` if no action is optimal anywhere.
     """
     prior: tuple[float, ...] = ()
     if "L0" in level:
@@ -70,8 +70,10 @@ def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
 
 
 def nats_of(p: Floats, optimal: Bools) -> float:
-    """Return the mean negative log-likelihood of the optimal actions,
-    over answers (n, A) where any is.
+    """Return the mean negative log-likelihood of the optimal actions, in nats.
+
+    `p` (n, A) has answers and `optimal` (n, A) a mask; answers without an optimal action are left
+    out. NaN if that leaves none.
     """
     return float(np.nanmean(likelihood_nats(p, optimal))) if optimal.any() else float("nan")
 
@@ -81,8 +83,9 @@ def calibrate(
 ) -> tuple[Calibration, list[Fitted]]:
     """Fit a calibration on the answers of a finished run on tune layouts.
 
-    Raises UserError for layouts of another purpose, several models, sampled answers,
-    or none at all.
+    Returns it with what each role gained. `command` is stated in its file. Raises UserError for
+    layouts of another purpose, several models, sampled answers, or if no answer of the ego could be
+    parsed.
     """
     run, name = read(folder), printable(folder)
     manifest = run.manifest
@@ -137,7 +140,7 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
 
 
 def write(found: Calibration, out: Path) -> None:
-    """Write the file of a calibration: TOML, whose strings and lists are JSON's."""
+    """Write a calibration's file: TOML, whose strings and lists are JSON's."""
     fields = asdict(found)
     tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Calibrated(Part, frozen=True, kw_only=True):
-    """What corrects the probabilities of every answer."""
+    """Hold a condition's setting of the calibration that corrects all answers."""
 
     behind: ClassVar[str] = "content"
     of_ego: ClassVar[bool] = True
