@@ -21,7 +21,7 @@ MESSAGES = (OWN, SHUFFLED, BLIND)
 
 @dataclass(frozen=True)
 class Blinded(Question):
-    """Ask helpers with nothing in sight, in graphs and in pictures."""
+    """Ask helpers the usual question with nothing in sight, in scene graphs and in pictures."""
 
     name: str = BLIND
     words: str = "are shown nothing, which messages=blind needs"
@@ -40,7 +40,10 @@ def _others(holds: frozenset[str]) -> list[str]:
 
 
 class Controlled(Part, frozen=True, kw_only=True):
-    """What the ego hears. A gain that remains under a control is not from what helpers see."""
+    """Hold a condition's setting of what the ego hears in place of its helpers' messages.
+
+    A gain that remains under a control does not come from what helpers see.
+    """
 
     behind: ClassVar[str] = "on_demand"
     questions: ClassVar = (Blinded(),)
@@ -85,8 +88,9 @@ class Controlled(Part, frozen=True, kw_only=True):
         return self.messages == SHUFFLED
 
     def sources(self, episodes: Ints, seeds: Ints) -> Ints:
-        """Return the decision that each hears, (n,):
-        the next layout's in which the same seed has one.
+        """Return the index of the decision whose helpers each decision hears, (n,), if shuffled.
+
+        It is that of the next layout which has a decision under the same seed.
         """
         order = np.lexsort((episodes, seeds))
         following = np.roll(order, -1)
