@@ -42,11 +42,12 @@ _OVERFLOW = "context overflow"
 
 @dataclass(frozen=True)
 class Shape:
-    """One wire shape."""
+    """Describe one HTTP API for decisions: its path, and how its JSON is read and written."""
 
-    path: str
-    body: type[Any]
-    read: Callable[[Any], Enquiry]
+    path: str  # path of the POST request
+    body: type[Any]  # msgspec type of the request's JSON
+    read: Callable[[Any], Enquiry]  # from the body to questions
+    # from model name and answers to JSON
     write: Callable[[str, Sequence[Answered]], dict[str, Any]]
 
 
@@ -57,7 +58,7 @@ SHAPES = (
 
 
 class Service:
-    """Answers the requests for one model."""
+    """Answer HTTP requests for decisions of one model."""
 
     def __init__(
         self,
@@ -68,21 +69,21 @@ class Service:
         places: int = PLACES,
         answer_s: float = ANSWER_S,
     ) -> None:
-        """Prepare to answer.
+        """Start the queue to the model.
 
         Args:
-            model: the model.
-            batch_size: most questions that it is asked together.
-            token: what clients must give as their key; None asks for none.
+            model: the model that answers.
+            batch_size: most questions that the model is asked together.
+            token: the API key that clients must give; None asks for none.
             local: whether only this machine is served.
-            places: most questions that wait.
-            answer_s: seconds within which a request is answered.
+            places: most questions that may wait.
+            answer_s: seconds within which a request must be answered.
         """
         self._model, self._token, self._local, self._answer_s = model, token, local, answer_s
         self._desk = Desk(model.backend, batch_size, places)
 
     def app(self) -> Starlette:
-        """Return the application."""
+        """Return the Starlette application, with the paths of `SHAPES` and `/v1/models`."""
         routes = [Route("/v1/models", self._models, methods=["GET"])]
         routes += [Route(shape.path, self._answerer(shape), methods=["POST"]) for shape in SHAPES]
         handlers: Any = {HTTPException: self._missing, Exception: self._bug}

@@ -16,7 +16,7 @@ MOST_DEPTH = 32
 
 
 class Refusal(Exception):
-    """A request that gets no answer: an HTTP status and one line, with a word for programs."""
+    """Signal that a request gets no answer, with HTTP status, one line of text and a code."""
 
     def __init__(self, words: str, status: int = 400, code: str = "invalid_request") -> None:
         super().__init__(words)
@@ -25,10 +25,10 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class Asked:
-    """One question of a request."""
+    """Hold one question of a client's request, with its options."""
 
-    name: str | None  # by which its answer is known
-    question: Question
+    name: str | None  # name of the question in the client's request, if it has one
+    question: Question  # state, instructions, and each option's meaning
     values: tuple[Any, ...]  # its options as the client writes them, in their order
 
     @property
@@ -37,7 +37,7 @@ class Asked:
 
     @property
     def length(self) -> int:
-        """How many characters its texts have."""
+        """Return the number of characters of all its texts."""
         meanings = self.question.meanings
         texts = (self.question.state, self.question.instructions, *meanings, *meanings.values())
         return sum(len(text or "") for text in texts)
@@ -45,20 +45,21 @@ class Asked:
 
 @dataclass(frozen=True)
 class Enquiry:
-    """A whole request."""
+    """Hold a client's request: questions about one state, and pictures of it."""
 
-    model: str | None  # the name that it asks for; None takes the one that there is
+    model: str | None  # name of the model that it asks for; None takes the served one
     questions: tuple[Asked, ...]
     images: tuple[str, ...] = ()  # URLs of the pictures before the state
 
 
 @dataclass(frozen=True)
 class Answered:
-    """The answer to one question; `shares` is None where the model refused it."""
+    """Hold the answer to one question of a client."""
 
     asked: Asked
-    shares: tuple[float, ...] | None  # probability of each option, as the model states it
-    tokens: int | None  # that were read; None if nobody counts them
+    # probability of each option, as the model states it; None where the model refused
+    shares: tuple[float, ...] | None
+    tokens: int | None  # number of prompt tokens; None if nobody counts them
 
     @property
     def likeliest(self) -> int:
@@ -67,8 +68,9 @@ class Answered:
 
     @property
     def confidence(self) -> float:
-        """0 where all options are equally likely, 1 where one is certain:
-        (K max p - 1) / (K - 1).
+        """Return the confidence (K max p - 1) / (K - 1) of K options.
+
+        It is 0 where all options are equally likely, and 1 where one is certain.
         """
         assert self.shares is not None
         k = len(self.shares)
@@ -81,7 +83,7 @@ class Answered:
 
 
 def text_of(content: Any) -> str:
-    """Return content as the model reads it: text as it is, anything else as JSON.
+    """Return content as text for the model: text as it is, anything else as JSON.
 
     Raises Refusal if it is nested too deep.
     """
@@ -102,9 +104,10 @@ def _check_depth(content: Any, left: int) -> None:
 
 
 def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]) -> Asked:
-    """Return a question with its options, a value and what it means each.
+    """Return a question with its options, each of which has a value and a meaning or None.
 
-    Raises Refusal if there are too few options, too many, or two of one name.
+    `name` is the question's, in messages. Raises Refusal if there are too few options, too many, or
+    two with the same text.
     """
     who = "a question" if name is None else f"question {printable(name, 40)!r}"
     if not 2 <= len(options) <= MOST_OPTIONS:
@@ -117,7 +120,10 @@ def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str
 
 
 def answered(asked: Asked, completion: Completion) -> Answered:
-    """Read a completion. Raises Refusal if it has no probability of each option."""
+    """Return the answer in a model's completion.
+
+    Raises Refusal if it does not state a probability for each option.
+    """
     if completion.finish_reason == "refusal":
         return Answered(asked, None, completion.prompt_tokens)
     try:

@@ -20,19 +20,19 @@ from harness.prompts.decision import Question
 
 
 class Text(Struct, tag_field="type", tag="input_text"):
-    """A part that is text."""
+    """Hold a part of a message or of instructions that is text."""
 
     text: str
 
 
 class Json(Struct, tag_field="type", tag="input_json"):
-    """A part that is data."""
+    """Hold a part of a message or of instructions that is JSON data."""
 
     data: dict[str, Any] | list[Any]
 
 
 class Picture(Struct, tag_field="type", tag="input_image"):
-    """A part that is a picture."""
+    """Hold a part of a message that is a picture, by its URL."""
 
     image_url: str
 
@@ -41,21 +41,21 @@ Part = Text | Json | Picture
 
 
 class Message(Struct):
-    """A message of the input; those of other roles than the user's are refused."""
+    """Hold a message of the request's input; other roles than `user` are refused."""
 
     content: str | list[Part]
     role: str
 
 
 class Option(Struct):
-    """One option of a choice."""
+    """Hold one option of a `Choice`."""
 
     value: str | bool
     description: str | None = None
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
-    """One of several options."""
+    """Ask which of several options is right."""
 
     instructions: str | list[Part]
     choices: list[Option]
@@ -63,14 +63,14 @@ class Choice(Struct, tag_field="type", tag="choice"):
 
 
 class Level(Struct):
-    """One level of a score."""
+    """Hold one level of a `Score`."""
 
     label: str
     description: str | None = None
 
 
 class Score(Struct, tag_field="type", tag="score"):
-    """A level, the lowest first."""
+    """Ask for a level on a scale, whose levels are listed from the lowest."""
 
     instructions: str | list[Part]
     levels: list[Level]
@@ -78,14 +78,14 @@ class Score(Struct, tag_field="type", tag="score"):
 
 
 class Predicate(Struct, tag_field="type", tag="predicate"):
-    """Whether a statement is true."""
+    """Ask whether a statement is true."""
 
     instructions: str | list[Part]
     name: str | None = None
 
 
 class Body(Struct):
-    """A request; fields that are not listed are ignored."""
+    """Hold the JSON of a request; fields that are not listed are ignored."""
 
     input: str | list[Message]
     questions: Annotated[
@@ -95,7 +95,7 @@ class Body(Struct):
 
 
 def read(body: Body) -> Enquiry:
-    """Return what is asked. Raises Refusal where it cannot be."""
+    """Return the questions of a request. Raises Refusal if it holds what is not supported."""
     messages = body.input
     contents = [messages] if isinstance(messages, str) else [_user(each) for each in messages]
     texts, images = list[str](), list[str]()
@@ -152,7 +152,7 @@ def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the answer's JSON. Tokens are 0 where nobody counts them."""
+    """Return the JSON of the response. Token counts are 0 where nobody counts them."""
     read = sum(each.tokens or 0 for each in answers)
     usage = {
         "input_tokens": read,

@@ -18,7 +18,7 @@ AGAIN_S = 1  # after which a client that found no place may ask again
 
 
 class Desk:
-    """Takes requests from one event loop and answers them one batch after the other."""
+    """Queue requests of one event loop; a thread answers them in batches, in their order."""
 
     def __init__(self, backend: Backend, batch_size: int, places: int = PLACES) -> None:
         self._backend, self._batch_size = backend, batch_size
@@ -26,10 +26,10 @@ class Desk:
         Thread(target=self._work, daemon=True).start()  # no pool: Ctrl-C would wait for its threads
 
     async def ask(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return the completions of some requests;
-        where this is cancelled, what still waits is dropped.
+        """Wait for the completions of some requests, and return them.
 
-        Raises Refusal if there is no place for all, and what the backend raises.
+        If the caller is cancelled, requests that still wait are dropped. Raises Refusal (status
+        429) if the queue has too few places, and what the backend raises.
         """
         futures: list[Future[Completion]] = [Future() for _ in requests]
         if self._waiting.qsize() + len(requests) > self._waiting.maxsize:

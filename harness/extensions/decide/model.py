@@ -25,8 +25,9 @@ _PROMPT = "v9"  # no text of it is asked
 
 
 def served(card: Card, letters: Any = None) -> Agent:
-    """Return the agent that answers for a card.
-    Raises UserError if its model cannot be asked questions.
+    """Return the agent that answers questions with a card's model; `letters` is its option.
+
+    Raises UserError if the model cannot be asked such questions.
     """
     can = capabilities(card.engine)
     if not ("decision" in can.answer_modes and can.closed_loop):
@@ -38,7 +39,7 @@ def served(card: Card, letters: Any = None) -> Agent:
 
 
 class ServedModel:
-    """Turns questions into requests of a model."""
+    """Hold a model that is served, and turn clients' questions into its requests."""
 
     def __init__(self, agent: Agent, backend: Backend) -> None:
         self._agent, self.backend = agent, backend
@@ -50,9 +51,7 @@ class ServedModel:
         self._digest = digest({**backend.identity(), "letters": agent.letters})
 
     def listed(self) -> dict[str, Any]:
-        """Return its entry in `GET /v1/models`;
-        a served model gives decisions and writes nothing.
-        """
+        """Return the model's entry in the JSON of `GET /v1/models`."""
         reads = ["text", *(["image"] if self.sees else [])]
         return {
             "id": self.name,
@@ -64,7 +63,10 @@ class ServedModel:
         }
 
     def requests(self, enquiry: Enquiry) -> list[Request]:
-        """Return a request for each question. Raises Refusal if the model cannot be asked one."""
+        """Return a request to the model for each question of a client.
+
+        Raises Refusal if it asks for another model, or for what this one cannot take.
+        """
         if enquiry.model not in (None, ANY, self.name):
             raise Refusal(
                 f"there is no model {printable(enquiry.model)!r}; ask for "

@@ -17,7 +17,10 @@ _URL = re.compile(r"data:image/(png|jpeg);base64,", re.IGNORECASE)
 
 
 def picture(url: str) -> Image:
-    """Return the picture of a data URL. Raises Refusal if it is none, or too large."""
+    """Return the picture in a data URL of a PNG or JPEG.
+
+    Raises Refusal if it is none, cannot be read, or is too large.
+    """
     if not (head := _URL.match(url)):
         raise Refusal(
             "a picture is no data URL of a PNG or JPEG; nothing is fetched", code="picture"

@@ -14,28 +14,28 @@ Content = str | dict[str, Any] | list[Any]
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
-    """One of several options."""
+    """Ask which of several options is right; `criteria` has each option's meaning."""
 
     criteria: dict[str, Content | None]
     instructions: Content | None = None
 
 
 class Score(Struct, tag_field="type", tag="score"):
-    """A level, the lowest first."""
+    """Ask for a level on a scale; `criteria` has the levels' meanings, from the lowest."""
 
     criteria: Annotated[list[Content], Meta(min_length=2, max_length=10)]
     instructions: Content | None = None
 
 
 class Noul(Struct, tag_field="type", tag="noul"):
-    """Whether something is true."""
+    """Ask whether something is true; `criteria` may say what true and false mean."""
 
     instructions: Content | None = None
     criteria: dict[str, Content | None] | None = None
 
 
 class Body(Struct):
-    """A request; fields that are not listed are ignored."""
+    """Hold the JSON of a request; fields that are not listed are ignored."""
 
     state: Content
     questions: Annotated[
@@ -47,7 +47,7 @@ class Body(Struct):
 
 
 def read(body: Body) -> Enquiry:
-    """Return what is asked. Raises Refusal where it cannot be."""
+    """Return the questions of a request. Raises Refusal if it holds what is not supported."""
     state = text_of(body.state)
     questions = tuple(_asked(name, each, state) for name, each in body.questions.items())
     return Enquiry(body.model, questions, (*body.files, *body.images))
@@ -74,7 +74,7 @@ def _meaning(content: Content | None) -> str | None:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the answer's JSON. `input_tokens` is 0 where nobody counts them."""
+    """Return the JSON of the response. `input_tokens` is 0 where nobody counts them."""
     written = {each.asked.name: _answer(each) for each in answers}
     usage = {"input_tokens": sum(each.tokens or 0 for each in answers), "output_tokens": 0}
     return {"model": model, "answers": written, "usage": usage}
