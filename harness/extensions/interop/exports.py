@@ -6,7 +6,7 @@ from harness.runs.folder import Run
 
 
 class InspectLog:
-    """A log of Inspect AI."""
+    """Export a run as a log of Inspect AI (`harness run export --inspect`)."""
 
     help = "Write an Inspect AI log, NAME.eval: one sample per answer."
     doing = "writing a log"

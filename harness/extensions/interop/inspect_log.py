@@ -38,11 +38,10 @@ SPOKEN = {
 
 
 def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
-    """Write a run to an `.eval` file, or to JSON if its name ends so;
-    its dataset may be in another folder.
+    """Write a run as an Inspect AI log to `path`: an `.eval` file, or JSON if its name ends so.
 
-    Raises:
-        UserError: the file is there already, and would lose the prompts.
+    `dataset` is the folder of the run's dataset; None takes the one that the run states. Returns
+    the path. Raises UserError if the file is there and the new one would lose its prompts.
     """
     frozen, scenes = _scenes(run, dataset)
     if isinstance(run.manifest.world, FrozenScenes):
@@ -58,8 +57,10 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
 
 
 def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> log.EvalLog:
-    """Return the log: its task is dataset and prompt version,
-    its results the run's summary over episodes.
+    """Return a run as an Inspect AI log, with a sample for each answer and the run's summary.
+
+    `scenes` has the decision points by id; without `dataset` and them, samples have no prompts. The
+    task is named by dataset and prompt version.
     """
     manifest, variant = run.manifest, run.manifest.variant
     whole = msgspec.to_builtins(manifest)
