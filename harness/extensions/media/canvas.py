@@ -43,7 +43,7 @@ GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 
 
 class Canvas:
-    """A figure whose fixed parts are drawn once; what moves is drawn over a copy of them."""
+    """Draw the stills of one episode on a figure, whose fixed parts are drawn only once."""
 
     def __init__(
         self, played: ReplayedEpisode, buildings: Sequence[Building], agents: Sequence[str]
@@ -85,7 +85,11 @@ class Canvas:
         self.sides: dict[str, int] = {}
 
     def picture(self, still: Still, seen: dict[str, list[str]], view: View) -> Pixels:
-        """Return one still, with what each viewer saw when the decision began."""
+        """Return the pixels of one still, (height, width, 3).
+
+        `seen` has, by viewer, the ids of the vehicles that it saw when the decision began; `view`
+        is the part of the world to show from above.
+        """
         viewers = _watched(still.state, seen)
         self._words(still, viewers)
         self._above(still, seen, view)

@@ -7,15 +7,16 @@ from harness.core import extras
 
 
 class Failures:
-    """Draws the first episodes that failed under a run's last condition."""
+    """Draw the failed episodes of a run as videos: what `harness drive --save-video` calls."""
 
     def ready(self) -> None:
         extras.need("--save-video", "matplotlib")
 
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
-        """Draw each with the first seed that failed, to the run's `videos`.
+        """Draw at most `most` failed episodes of the run's last condition; return the files.
 
-        They are of the best kind that can be written here.
+        Each is drawn with the first seed that failed, to the run's folder `videos`, as .mp4 if that
+        can be written here, else as .gif.
         """
         from harness.evaluate.replay import played
         from harness.extensions.media.video import formats, write_video

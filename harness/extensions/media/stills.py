@@ -26,7 +26,7 @@ STILLS_HZ = 10  # while no decision is open
 
 @dataclass(frozen=True)
 class Turn:
-    """The decision of an agent that began last."""
+    """Hold the latest decision of one agent, at the time of a still."""
 
     decision: Decision  # the decision, open or taken
     since_s: float  # seconds since it began
@@ -36,25 +36,25 @@ class Turn:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture of an episode."""
+    """Hold the state of an episode at the time of one picture of its video."""
 
     state: WorldState  # the state of the world
     seen: WorldState  # the state when the last decision began
-    turns: Mapping[str, Turn]  # of each agent, by its id, the ego first
+    turns: Mapping[str, Turn]  # latest decision of each agent, by its id, the ego first
     outcome: str  # how the episode ended; empty until it has
     danger: str | None  # id of the dangerous vehicle, or None
 
     @property
     def since_s(self) -> float:
-        """Seconds since the last decision began."""
+        """Return the seconds since the last decision began."""
         return min(turn.since_s for turn in self.turns.values())
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
-    """Return an episode of a run folder; by default of the last condition and the first seed.
+    """Return one episode of a run's folder to replay; by default, last condition and first seed.
 
-    Raises UserError if the folder holds no closed-loop run, or has no such episode,
-    condition or seed.
+    Raises UserError if the folder holds no closed-loop run, or has no such episode, condition or
+    seed.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):
@@ -76,7 +76,10 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> R
 def stills(
     played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None
 ) -> Iterator[Still]:
-    """Yield the stills of an episode: ten a second, and one each frame while a decision is open."""
+    """Yield the stills of an episode: ten a second, and one each frame while a decision is open.
+
+    `progress` is called with 1 for each.
+    """
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
     acting = actions_by_frame(played)

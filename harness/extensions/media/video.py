@@ -31,13 +31,13 @@ COLOURS = 64  # of a GIF
 
 
 def formats() -> list[str]:
-    """Ends of the files that can be written here, the best one last."""
+    """Return the file name endings of videos that can be written here, the best last."""
     return [".gif", ".mp4"] if find_spec("imageio_ffmpeg") else [".gif"]
 
 
 @styled
 def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], None]) -> None:
-    """Draw an episode into a `.gif` or an `.mp4`; `progress` is called for each still.
+    """Draw an episode as a video to a `.gif` or `.mp4` file; `progress` is called with 1 a still.
 
     Raises:
         UserError: the file's name ends otherwise, or an .mp4 cannot be written here.
@@ -47,7 +47,7 @@ def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], No
 
 
 def check(out: Path) -> None:
-    """Raise UserError if no video can be written to this file."""
+    """Raise UserError if no video can be written to this file, such as for its ending."""
     shown = f"--out {printable(out)}"
     if out.suffix not in (".gif", ".mp4"):
         raise UserError(f"{shown}: end it in .gif or .mp4")

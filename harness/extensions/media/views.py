@@ -12,13 +12,15 @@ EASE = 8  # stills before a decision in which a video turns to its view
 
 
 def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> list[View]:
-    """A view for each still of a video:
-    held through each part, it turns to the next in its last stills.
+    """Return the part of the world that each still of a video shows.
+
+    The view is fixed through each part of the video, such as a decision, and moves to the next
+    one's in the part's last stills.
 
     Args:
-        held: spots of each still.
-        parts: the part that each still is of, such as the decision, in order.
-        shape: height by width.
+        held: for each still, the places that must be in view: their coordinates in metres, (n, 2).
+        parts: for each still, the number of its part, ascending.
+        shape: height of the view by its width.
     """
     starts = [0, *(n for n, (a, b) in enumerate(pairwise(parts), 1) if a != b), len(parts)]
     turns = [
