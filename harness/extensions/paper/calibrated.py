@@ -49,7 +49,10 @@ TIES = "first"  # no two actions that these intents lead to are alike
 
 @dataclass(frozen=True)
 class Parameters:
-    """What `harness/extensions/paper/fit.py` gives; nothing of it knows a panel or a grid point."""
+    """Hold the parameters of the calibrated proxy, fitted by `harness/extensions/paper/fit.py`.
+
+    None of them depends on a panel or a grid point of the paper.
+    """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
     left_share: float = 0.406
@@ -136,10 +139,10 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
 
 
 class CalibratedWorld:
-    """Episodes whose decision points are drawn: each step's, for all episodes at once.
+    """Play drawn episodes as a world: the decision points of one step for all episodes at once.
 
-    An ego that has fused the witness's message knows from its next decision on.
-    The last decision decides.
+    An ego that has fused the message of the witness (the helper that sees the danger) knows of the
+    danger from its next decision on. The last decision of an episode decides its success.
     """
 
     def __init__(self, steps: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
@@ -151,7 +154,7 @@ class CalibratedWorld:
         self.success: Bools = self._knows
 
     def observe(self) -> Sequence[int]:
-        """Return the episodes, while there are decisions to make."""
+        """Begin the next step; return the episodes' indices, none after the last step."""
         self._step += 1
         if self._step == STEPS:
             return ()
@@ -159,40 +162,38 @@ class CalibratedWorld:
         return range(len(self._knows))
 
     def __call__(self, decision_points: Sequence[int]) -> Intents:
-        """Return what every vehicle intends at this step."""
+        """Return the intents of all vehicles at this step, in every episode."""
         own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=own)
 
     def others(self, *_: Any, **__: Any) -> Any:
-        """Refuse: the intents of all are drawn, and nobody can be asked."""
+        """Raise NotImplementedError: all intents are drawn, so no model can be asked."""
         raise NotImplementedError
 
     helpers = fusion_call = plan_call = others
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return every episode."""
+        """Return the decisions of this step, one in every episode, with the channel's draws."""
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
-        """Return None: the study's vehicles are nowhere in particular,
-        see nothing and claim nothing.
-        """
+        """Return None: vehicles of this study have no positions, see nothing and claim nothing."""
 
     site = claims = plans = listed = outlook
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
-        """Learn what was heard, and see whether the last action is the right one."""
+        """Update which egos know of the danger, and whether each episode's last action is right."""
         [part] = decided
         self._knows = self._knows | any_of(part.result.on_time & self._now.witness)
         self.success = part.result.action == self._now.right
 
 
 class Calibrated:
-    """The proxy as a source of scored decisions.
+    """Play operating points with the calibrated proxy, as a source of results for studies.
 
     Attributes:
         name: what reports call it.
-        same_episodes: a seed has episodes of its own.
+        same_episodes: false, since each seed has episodes of its own.
     """
 
     name = "calibrated proxy"
@@ -205,7 +206,7 @@ class Calibrated:
         self._of_seeds = lru_cache(maxsize=2)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
-        """Return what a reader needs to know of where the intents come from."""
+        """Return as plain values the proxy's version, parameters and rows that it was fitted on."""
         rows = sorted({row for rows in FITTED_ON.values() for row in rows})
         return {
             "proxy_model_version": VERSION,
@@ -219,7 +220,7 @@ class Calibrated:
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Return episodes of every seed, `CHUNK` at a time, which bounds memory."""
+        """Yield each setting's results of all seeds, in parts of at most `CHUNK` episodes."""
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
             yield self._walked(setting, most, seeds)
@@ -292,10 +293,10 @@ class Calibrated:
 
 
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
-    """Return uniform draws for rows of kinds, both (n,):
-    of the k rows of a kind one in each k-th of [0, 1).
+    """Return uniform draws in [0, 1), (n,), stratified within each of the `kinds`, (n,).
 
-    One such column a dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
+    Of the k rows of one kind, each k-th of [0, 1) has one. One such column for each dimension is a
+    Latin hypercube (McKay, Beckman and Conover 1979).
     """
     # a kind's rows together, in random order
     order = np.lexsort((generator.random(len(kinds)), kinds))
@@ -307,7 +308,10 @@ def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
 
 
 def peaked(nats: Floats, top: Ints) -> Floats:
-    """Return intents `(..., A)` of a given entropy: most on one action, the rest shared alike."""
+    """Return intents `(..., A)` of given entropies `nats`, with the most on the action `top`.
+
+    The rest is shared evenly by the other actions.
+    """
     entropies, shares = _by_entropy()
     most = np.interp(nats, entropies, shares)[..., None]
     return np.where(
@@ -323,7 +327,10 @@ def _by_entropy() -> tuple[Floats, Floats]:
 
 
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
-    """Return draws of a normal distribution, cut at `CUT` standard deviations, by its quantiles."""
+    """Return normal draws with mean and standard deviation `sd`, by quantiles of `uniforms`.
+
+    The distribution is cut at `CUT` standard deviations on either side.
+    """
     from harness.core.special import ndtr, ndtri
 
     below = ndtr(-CUT)

@@ -34,8 +34,9 @@ RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
-    """Return the paper's panels as conditions named by what they change;
-    size has density-coupled loss.
+    """Return the grid points of the paper's panels, by panel, for runs in closed loop.
+
+    Each is a condition named by what it changes; the panel `size` has density-coupled loss.
     """
 
     def setting(panel: str, value: Value, vehicles: int, changes: str) -> Setting:
@@ -57,11 +58,10 @@ def panels() -> dict[str, list[Setting]]:
 def run_closed_loop(
     spec: Spec, out: Path, workers: Workers, progress: Callable[[int], None], cache: Path | None
 ) -> Study:
-    """Drive all grid points. A study that was stopped in `out` continues;
-    `run/` there has the live run.
+    """Drive all grid points of `panels` as conditions of one run, and return the study.
 
-    The evaluation's conditions are those of `panels`.
-    `progress` is called with the number of layouts just driven under all of them.
+    A study that was stopped in `out` continues; the run lies in `out/run`. `progress` is called
+    with the number of layouts just driven under all conditions.
     """
     if (out / RUN / "run.json").is_file():
         done = finished(spec, out / RUN)

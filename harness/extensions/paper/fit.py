@@ -15,7 +15,7 @@ from harness.studies.paper_numbers import paper_numbers
 
 
 def fit() -> Parameters:
-    """Return parameters from the rows of `paper_numbers.csv` that `FITTED_ON` names."""
+    """Compute the proxy's parameters from the rows of `paper_numbers.csv` named in `FITTED_ON`."""
     from harness.core.special import ndtri
 
     paper = {row["id"]: row for row in paper_numbers()}

@@ -38,14 +38,14 @@ ASSUMED = {
 
 
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
-    """Return a row for each number of the paper.
+    """Compare each number of the paper with ours: a table with a row for each.
 
-    Columns: `id`, `panel`, `condition`, `variable`, `value`, `metric`, `unit`, `paper_low`,
-    `paper_high`, `ours`, `ci_low`, `ci_high`, `difference` (to the nearest end of the paper's
-    range), `allowed`, `verdict`, `kind` (`fitted`, `predicted` or `cited`) and `assumed`. Where the
-    paper gives a range over grid points, ours is one row a grid point. A verdict is `within` where
-    the difference is allowed, `unclear` where it is not but the interval reaches what is, `misses`
-    where it does not, or `cited`.
+    `summary` has our results, as `studies.play` makes it. Columns: `id`, `panel`, `condition`,
+    `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`, `ours`, `ci_low`, `ci_high`,
+    `difference` (to the nearest end of the paper's range), `allowed`, `verdict`, `kind` (`fitted`,
+    `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points, ours is
+    one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it
+    is not but the interval reaches what is, `misses` where it does not, or `cited`.
     """
     import pandas as pd
 
@@ -83,7 +83,10 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
-    """Return the verdict on a mean with its interval, where `least` to `most` is allowed."""
+    """Return `within`, `misses` or `unclear` for a mean of which `least` to `most` is allowed.
+
+    It is `unclear` if the mean is not allowed, but its interval reaches what is, or is unknown.
+    """
     if least <= mean <= most:
         return "within"
     # also where no interval is known
@@ -114,10 +117,10 @@ def _our_rows(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> l
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the paper's values for figures, a row a grid point,
-    with our names of condition and metric.
+    """Return the paper's values to draw in figures, a row a grid point, by our names.
 
-    `low` and `high` are in the unit of the ledger, equal where the paper gives one value.
+    Columns: `panel`, `condition`, `value`, `metric`, `low` and `high`, which are in the unit of the
+    ledger and equal where the paper gives one value.
     """
     ran = ledger[ledger.kind != "cited"]
     our_metrics = {paper_name: our_name for paper_name, (our_name, *_) in METRICS.items()}
@@ -127,7 +130,10 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
-    """Count the numbers of the paper that can be run, by verdict, and those that are predicted."""
+    """Count the numbers of the paper that can be played.
+
+    The keys are `total`, the verdicts `within`, `unclear` and `misses`, and `predicted`.
+    """
     ran = ledger[ledger.kind != "cited"]
     total, misses = set(ran.id), set(ran[ran.verdict == "misses"].id)
     unclear = set(ran[ran.verdict == "unclear"].id) - misses
@@ -141,7 +147,7 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
 
 
 def headline(ledger: "pd.DataFrame") -> list[str]:
-    """Say how many numbers of the paper are met, and which are not."""
+    """Return sentences on how many numbers of the paper are met, and which are not."""
     counts = tally(ledger)
     sentences = [
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss "
@@ -159,7 +165,7 @@ def headline(ledger: "pd.DataFrame") -> list[str]:
 
 
 def tables(ledger: "pd.DataFrame") -> list[Table]:
-    """Return the numbers that the proxy plays, and those that are only cited."""
+    """Return a table of the numbers that the proxy plays, and one of those that are only cited."""
     played, cited = list[Sequence[str]](), list[Sequence[str]]()
     for row in ledger.to_dict("records"):
         low, high = row["paper_low"], row["paper_high"]

@@ -26,17 +26,18 @@ VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 @dataclass(frozen=True)
 class Panel:
-    """One panel of the study."""
+    """Hold one panel of the paper's study: its grid points and number of episodes."""
 
-    name: str  # as in the paper's numbers
+    name: str  # the panel's name in `paper_numbers.csv`
     settings: tuple[Setting, ...]  # its grid points
-    episodes: int  # per seed
+    episodes: int  # number of episodes per seed
 
 
 def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
-    """Return the paper's four panels, and one of our own that takes Equation 2 away.
+    """Return the paper's four panels, and one of our own with equal weights in Equation 2.
 
-    Seeds times episodes is read as 5 x 1 500 and, at a grid point, 5 x 300.
+    `core` and `sweep` are episodes per seed: of the operating points, and at each other grid point.
+    The paper's numbers are read as 5 seeds x 1 500, and 5 x 300.
     """
     # Helpers whose entropy is above tau open rounds of their own everywhere; at 0.7 nats none is.
     points = {name: point.changed(helper_rounds=True) for name, point in POINTS.items()}
@@ -62,9 +63,7 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
 def run_paper(
     panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]
 ) -> Study:
-    """Play the paper's panels with the calibrated proxy,
-    and hold them against the paper's numbers.
-    """
+    """Play the panels with the calibrated proxy, and compare with the paper's numbers."""
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
     whole = joined(results)
@@ -138,8 +137,9 @@ def _figures(
 
 
 def equation_2(weights: "pd.DataFrame") -> str:
-    """Say what the weights by distance do in the calibrated proxy,
-    from the summary of their panel.
+    """Return a sentence on the effect of the weights by distance in the calibrated proxy.
+
+    `weights` is the summary of their panel.
     """
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it = percent(success.loc[1.0], "mean", "ci_low", "ci_high")
