@@ -24,7 +24,11 @@ SYSTEM = re.compile(r"(\{%-?\s*block\s+system\s*-?%\})(.*?)(\{%-?\s*endblock\b)"
 
 @dataclass(frozen=True)
 class Candidate:
-    """Hold one wording of a prompt that a search tries."""
+    """Hold one wording of a prompt that a search tries.
+
+    It has the wording as a prompt version, its difference from the original in words, and, by role,
+    system texts that a model rewrote.
+    """
 
     prompt: Prompt  # the wording as a prompt version, under the name of the one searched
     what: str  # how it differs from the base, in a line
@@ -37,7 +41,7 @@ class Candidate:
 
 
 def space(prompt: Prompt) -> dict[str, int]:
-    """Return how many alternatives a prompt's author marked for each choice, by the choice's name.
+    """Return how many alternative wordings a prompt's author marked at each choice, by its name.
 
     Raises UserError if a mark is malformed.
     """
@@ -68,7 +72,10 @@ def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
 
 
 def systems(base: Prompt) -> dict[str, str]:
-    """Return the text of the template block `system` of each role, with its first alternatives."""
+    """Return the text of the Jinja block `system` of each role's template, by role.
+
+    Marked choices have their first alternatives.
+    """
     texts = {}
     for role in ROLES:
         match = SYSTEM.search(resolved(base.texts[role]))
@@ -78,7 +85,7 @@ def systems(base: Prompt) -> dict[str, str]:
 
 
 def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
-    """Return a prompt whose template block `system` is replaced by `texts`, by role.
+    """Return a prompt whose Jinja block `system` is replaced by `texts`, by role.
 
     Raises UserError if the prompt's files are wrong.
     """

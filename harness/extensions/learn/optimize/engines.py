@@ -45,7 +45,8 @@ def alternatives(tuning: Tuning) -> None:
 
     Each alternative of each choice is played with the best of the others, first on half of the
     layouts, and on the rest if it is not worse there. The search ends when a round over all choices
-    changes nothing, or raises Spent when the budget of questions is spent.
+    changes nothing, or raises Spent when the budget of questions is spent. `tuning` keeps all
+    results.
     """
     base = tuning.base
     sizes = space(base)

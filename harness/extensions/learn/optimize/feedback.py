@@ -12,9 +12,10 @@ from harness.world.scene_graph import Conflict
 
 
 def of_course(played: Played) -> tuple[Decision, str]:
-    """Return the decision of an episode that lost most, and feedback in words about it.
+    """Return the decision of an episode whose policy lost most, and feedback in words on it.
 
-    The feedback is that of `of_decision`, and whether the episode succeeded.
+    A policy loses the best action's worth less its own mean worth. The feedback is that of
+    `of_decision`, and whether the episode succeeded.
     """
     lost = [_lost(decision) for decision in played.course]
     worst = played.course[int(np.argmax(lost))]

@@ -37,8 +37,9 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
 def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSource]:
     """Return the user's datasets of tune layouts, one for each dataset of report layouts.
 
-    Raises UserError unless they are of the same scenarios in the same order, share no layout with
-    them, and hold the layouts of their own seeds.
+    A search chooses on tune layouts and is measured on report layouts. Raises UserError unless both
+    are of the same scenarios in the same order, share no layout, and hold the layouts of their
+    seeds.
     """
     if len(names) != len(reported):
         raise UserError(

@@ -41,7 +41,12 @@ OLD, NEW = "base", "winner"  # the folders of the two runs on report layouts
 
 @dataclass(frozen=True)
 class Search:
-    """Describe a search for a better wording of a prompt: its layouts, its budget, its output."""
+    """Describe a search for a better wording of a prompt.
+
+    Wordings are compared by evaluations on tune layouts (`tune`), within a budget of questions; the
+    winner is measured once on report layouts, the test set (`report`), and written as a new
+    version.
+    """
 
     base: Prompt  # the prompt version whose wording is searched
     # evaluations of the base on tune layouts, one a family, each of one condition
@@ -141,10 +146,10 @@ def search(
 
 
 def looks(base: Prompt, where: Path) -> int:
-    """Return how often report layouts were read for the versions from which `base` was made.
+    """Return how often report layouts (the test set) were read to make a prompt version.
 
-    `where` is the folder of prompt versions. It is 0 if the version has no history file of a
-    search.
+    It counts the searches from which `base` came, by the history file in its folder under `where`;
+    0 without one.
     """
     with suppress(*BROKEN):
         return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))

@@ -40,7 +40,7 @@ class Spent(Exception):
 
 
 class Decision(NamedTuple):
-    """Hold one decision of an episode, from which feedback is written."""
+    """Hold one decision of an episode: its scene, the messages heard, the policy and the action."""
 
     dataset: Dataset  # the layouts that were played, with their trees
     scene: Scene
@@ -51,7 +51,11 @@ class Decision(NamedTuple):
 
 
 class Played(NamedTuple):
-    """Hold the result of a candidate on one layout."""
+    """Hold the result of a candidate on one layout: success and worth, and the decisions.
+
+    Success is a share over channel seeds. Worth is the mean probability of success under the stated
+    policies if all later actions are drawn evenly. The decisions are those under the first seed.
+    """
 
     success: float  # share of successful episodes over the channel seeds
     # mean probability of success under the stated distributions if later actions are drawn evenly,
@@ -66,7 +70,7 @@ class Played(NamedTuple):
 
 @dataclass
 class Record:
-    """Hold all results of one candidate so far."""
+    """Hold all results of one candidate so far, by layout index, and the questions charged."""
 
     candidate: Candidate
     length: int  # characters of the ego's prompt, in the first decision point of each family
@@ -118,7 +122,10 @@ class Tuning:
 
     @cached_property
     def first_half(self) -> Ints:
-        """Return indices (n,) of every second layout with a danger, and without, by scenario."""
+        """Return indices (n,) of half of the layouts, on which a worse candidate is given up.
+
+        It is every second one of each scenario, of those with a danger and of those without.
+        """
         kinds: dict[tuple[int, bool], list[int]] = {}
         for n, (family, _) in enumerate(self.layouts):
             kinds.setdefault((family, bool(self._dangerous[n])), []).append(n)
@@ -160,7 +167,8 @@ class Tuning:
     def score(self, candidate: Candidate, layouts: Ints) -> float:
         """Return a candidate's mean score on the layouts of these indices (n,).
 
-        Raises Spent before the budget would be exceeded.
+        A score is success plus 0.001 times the worth. Raises Spent before the budget would be
+        exceeded.
         """
         scores = [played.score for played in self.play(candidate, layouts.tolist())]
         return float(self.weights(layouts) @ scores)

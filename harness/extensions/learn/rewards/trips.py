@@ -71,7 +71,10 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Trees:
-    """Take episodes from the decision trees of a dataset, without a simulator."""
+    """Take the environment's episodes from the decision trees of a dataset, without a simulator.
+
+    A tree has every decision point of a layout that actions can lead to, and how each episode ends.
+    """
 
     dataset: Dataset  # the trees, and the scenes of their decision points
     then: str = BEST  # who decides after the action whose worth is asked: `best`, or a driver
@@ -173,7 +176,7 @@ class TreeTrip:
 
 @dataclass(frozen=True)
 class Roads:
-    """Drive episodes in the simulator, so that no tree is built."""
+    """Take the environment's episodes from the simulator, so that no tree is built."""
 
     scenario: Scenario
     seeds: Sequence[int]

@@ -47,7 +47,10 @@ PRIOR = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}
 
 
 class Point(msgspec.Struct, frozen=True):
-    """Hold one decision point to learn from: a scene, and the answer that it should have."""
+    """Hold one decision point to learn from: a scene, and its soft label.
+
+    The label (A,) has the probabilities that a model should give to the A actions.
+    """
 
     record: Record  # the scene: its state, and every viewer's scene graph
     label: list[float]  # soft label, (A,): probabilities of the scenario's A meta-actions
@@ -55,7 +58,10 @@ class Point(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Lessons:
-    """Hold the decision points of one scenario that a model learns from, and their labels."""
+    """Hold the scenes of one scenario that a model learns from, and their soft labels by scene id.
+
+    If `balanced`, layouts with a danger and those without weigh alike in training.
+    """
 
     scenario: Scenario  # whose actions and words the prompts have
     prompts: tuple[Prompt, ...]  # versions that are learnt

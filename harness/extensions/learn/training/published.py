@@ -32,7 +32,7 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 
 @dataclass(frozen=True)
 class Adapt:
-    """Describe how a published model is fine-tuned."""
+    """Describe how a published model is fine-tuned: its LoRA rank (None: all weights) and rate."""
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
