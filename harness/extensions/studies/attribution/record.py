@@ -15,7 +15,11 @@ FILE = "attribution.json"
 
 
 class LeftOut(Struct, frozen=True, kw_only=True):
-    """Hold what changed when one object or message was left out of a prompt or of the fusion."""
+    """Hold what changed when one object or message was left out of a prompt or of the fusion.
+
+    `change` is that of the likeliest action's probability, `shift` the total variation distance of
+    both answers; None if the answer without the item failed.
+    """
 
     scene: str  # id of the decision point
     episode: int  # the episode's number
@@ -33,7 +37,10 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 
 
 class Attribution(Struct, frozen=True, kw_only=True):
-    """Hold the result of leaving out objects and messages of a run, one at a time."""
+    """Hold the result of leaving out objects and messages of a run, one at a time.
+
+    A sample of `decision_points` was drawn out of all `of` decision points of the condition.
+    """
 
     condition: str  # name of the condition whose decision points were drawn
     decision_points: int  # how many were drawn

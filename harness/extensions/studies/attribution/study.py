@@ -49,7 +49,11 @@ KINDS = (
 
 @dataclass(frozen=True)
 class Row:
-    """Hold how much one kind of object or message moves answers, over all that were left out."""
+    """Hold how much one kind of object or message moves answers, over all that were left out.
+
+    `shift` is the mean total variation distance, `flips` the share of answers whose likeliest
+    action changed, and `failed` the share that could not be parsed without the item.
+    """
 
     role: str  # whose prompt it was left out of, `ego` or `helper`; or `fusion`, for messages
     kind: str  # kind of object or message, such as `hidden conflict vehicle`

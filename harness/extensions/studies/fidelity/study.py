@@ -37,7 +37,11 @@ SHOWN = 20  # ways to disagree that the page lists
 
 @dataclass(frozen=True)
 class Fidelity:
-    """Hold the comparison of success on frozen scenes with success in closed loop."""
+    """Hold the comparison of success on frozen scenes with success in closed loop.
+
+    `table` has a row for each model, prompt, answer mode and condition, `episodes` one for each
+    episode; `rank` is Spearman's correlation of both successes over `ranked` distinct rows.
+    """
 
     # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
     # minus closed, paired by episode) and `agreement` (share of episodes and seeds with the same

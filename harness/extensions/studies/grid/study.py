@@ -62,7 +62,10 @@ class Factor:
 
 @dataclass(frozen=True)
 class Cell:
-    """Hold one combination of an ego agent and a helper agent, and their run."""
+    """Hold one cell of the grid: an ego agent, a helper agent, and their run.
+
+    An agent is a model with a prompt version and an answer mode.
+    """
 
     ego: Agent
     helper: Agent
@@ -391,7 +394,7 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
 
 
 def headline(grid: Grid) -> list[str]:
-    """Return a sentence a condition: whether the choice of ego or of helpers matters more."""
+    """Return a sentence for each condition: whether the choice of ego or helpers matters more."""
     sentences = []
     for condition in grid.conditions:
         halves = grid.halves(condition)

@@ -42,7 +42,11 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 
 @dataclasses.dataclass(frozen=True)
 class Twin:
-    """Describe one change of a question, and how the answers to both versions must agree."""
+    """Describe one change of a question, and how the answers to both versions must agree.
+
+    A twin changes the scene graph, the text, the picture or the messages, by the function that is
+    not None. The answers must have the same action, or be `within` a total variation distance.
+    """
 
     name: str  # how commands call it
     says: str  # what is changed, in words

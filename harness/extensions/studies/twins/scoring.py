@@ -18,7 +18,11 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Pair:
-    """Hold the answers to a question and to its twin, the same question put another way."""
+    """Hold the answers to a question and to its twin, the same question put another way.
+
+    `p` and `q` (A,) are their distributions over the actions, `distance` is the total variation
+    between them, and `holds` says whether they agree as the twin demands.
+    """
 
     twin: str  # name of the twin
     role: str  # `ego`, `helper`, or `fusion` for the ego's fusion call
@@ -38,7 +42,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Row:
-    """Hold the result of one twin in one role, over all its pairs of answers."""
+    """Hold the result of one twin in one role (who was asked), over all its pairs of answers.
+
+    `invariance_rate` is the share of pairs that agree as the twin demands, `broken` has the others.
+    """
 
     twin: Twin  # how the questions were changed
     role: str  # `ego`, `helper`, or `fusion`

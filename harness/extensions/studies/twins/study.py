@@ -181,7 +181,7 @@ def mapping(
 
 
 def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
-    """Return the twins that apply to no question, by name, with what they need in words."""
+    """Return what each twin that applies to no question needs, in words, by the twin's name."""
     with_rows = {row.twin.name for row in rows}
     needs = {}
     for name in questions.twins:
