@@ -26,7 +26,7 @@ from harness.radio.fading import Trips
 
 
 class Attackers:
-    """Play the attackers of one condition, remembering the past intents of each episode."""
+    """Play the attackers of one condition; remember what helpers intended at past steps."""
 
     def __init__(self, attacks: Sequence[Attack]) -> None:
         self._attacks = attacks

@@ -35,7 +35,11 @@ Share = Annotated[
 
 @dataclass(frozen=True)
 class Turn:
-    """Hold what an attack may use in one step: n decisions, each with H helpers and A actions."""
+    """Hold what an attack may use in one step: n decisions, each with H helpers and A actions.
+
+    That is who attacks, what every vehicle truly intends now, at the first step and K steps back,
+    and random draws.
+    """
 
     truth: Intents  # what every vehicle intends and knows
     attackers: Bools  # who attacks, `(n, H)`
@@ -48,7 +52,11 @@ class Turn:
 
 @dataclass(frozen=True)
 class Attack:
-    """Describe an attack by some helpers: a base class of pure functions of arrays."""
+    """Describe an attack by some helpers: a base class of pure functions of arrays.
+
+    A subclass overrides `act`, `rewritten` or `listed`, and sets the class variables that say what
+    it changes. `share` is the share of the helpers that attack.
+    """
 
     # the share of the helpers present that attack, to the nearest whole number of helpers
     share: Share = 1 / 3

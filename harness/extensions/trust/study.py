@@ -53,7 +53,11 @@ LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, 
 
 @dataclass(frozen=True)
 class Cell:
-    """Hold the result of one rule under one attack: S channel seeds, E episodes."""
+    """Hold the result of one consensus rule under one attack: S channel seeds, E episodes.
+
+    Success, unsafe ends, and the negative log-likelihood of safe actions are (S, E); `flagged` (4,
+    E) counts messages of attackers that the rule suspected and did not, then of honest helpers.
+    """
 
     rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
     attack: str  # without its share; empty where nobody attacks
@@ -153,7 +157,7 @@ def shares_of(text: str) -> tuple[float, ...]:
 
 
 def cell_of(key: Key, result: WalkResult) -> Cell:
-    """Return a cell from the played decisions of its rule, attack and share."""
+    """Return a cell from the decisions that were played under `key`: rule, attack and share."""
     success = result.ends[SUCCESS]
     nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
     nats[np.isnan(success)] = np.nan  # left out
@@ -193,7 +197,10 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 
 @dataclass(frozen=True)
 class Bench:
-    """Hold all cells of a study of trust: every rule under every attack and share of attackers."""
+    """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
+
+    `alone` (S, E) is the success of an ego that never asks.
+    """
 
     name: str  # name of the run that is played again
     source: str  # name of the run's dataset
@@ -208,7 +215,7 @@ class Bench:
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
-        """Return the rules, the paper's first."""
+        """Return the consensus rules, the paper's first."""
         return tuple(dict.fromkeys(rule for rule, _, _ in self.cells))
 
     @cached_property
