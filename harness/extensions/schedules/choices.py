@@ -53,7 +53,10 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 
 @dataclass(frozen=True)
 class Choices:
-    """Hold what follows at each decision point if the ego asks each set of helpers."""
+    """Hold what follows at each decision point of a dataset if the ego asks each set of helpers.
+
+    `sets` (K, H) has the helpers of each set, the empty one first.
+    """
 
     forest: Forest  # of the run's dataset
     sets: Bools  # which helpers each has, the empty one first, (K, H)
@@ -89,7 +92,10 @@ class Choices:
             yield level, ends, spent, k
 
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
-        """Return success, (S, E), and costs, (S, E, C), of every episode under a rule."""
+        """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
+
+        The rule is as in `backwards`: it returns the set to ask in each decision.
+        """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
         return _values_of(ends, k)[:, root], _values_of(spent, k)[:, root]

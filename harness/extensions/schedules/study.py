@@ -71,7 +71,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Play:
-    """Hold the outcome of one setting of a schedule for S channel seeds and E episodes."""
+    """Hold the outcome of one setting of a schedule for S channel seeds and E episodes.
+
+    `success` is (S, E), and `costs` (S, E, C) has `COSTS`: messages, air time, latency, energy and
+    so on.
+    """
 
     candidate: Candidate
     success: Floats  # which episodes succeed, (S, E)
@@ -131,7 +135,12 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 
 @dataclass(frozen=True)
 class Chosen:
-    """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle."""
+    """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle.
+
+    It has success, its difference to the paper's schedule and to random asking, the share of the
+    gap to the oracle that it closes, messages as a share of the paper's, and success averaged over
+    budgets.
+    """
 
     play: Play  # the setting, with success and costs of every episode
     success: Estimate  # mean success by the success rule
@@ -151,7 +160,11 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Compared:
-    """Hold all schedules that were compared on one run."""
+    """Hold all schedules that were compared on one run, with the outcome of every setting.
+
+    `tune` has the same settings on tune layouts, on which settings are chosen; `oracle` is the
+    bound of an ego that knows how each episode ends.
+    """
 
     name: str  # the run's model, prompt and answer mode
     point: OperatingPoint  # the operating point
