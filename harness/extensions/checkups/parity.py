@@ -58,7 +58,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Hold the outputs of one engine for the same prompts."""
+    """Hold the outputs of one engine for n prompts: tokens, log-probabilities, texts and read-outs.
+
+    `logits` is (n, V) for a vocabulary of V, `readouts` (n, A) for A actions.
+    """
 
     tokens: list[list[int]]  # token ids of the text of each prompt, of those for JSON first
     logits: Floats  # log-probabilities of the whole vocabulary after each json prompt, (n, V)

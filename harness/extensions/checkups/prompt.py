@@ -28,7 +28,7 @@ CHUNK = 8  # requests that are asked together
 
 
 class Answers(Struct, frozen=True):
-    """Describe the answers of one role (ego or helper) to the fixed questions."""
+    """Count qualities and faults of one role's answers (ego or helper) to the fixed questions."""
 
     role: Role  # the role
     n: int  # number of questions

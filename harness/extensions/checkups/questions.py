@@ -37,7 +37,7 @@ _NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
 
 
 class Question(msgspec.Struct, frozen=True):
-    """Hold a decision point of a tune layout, about which a model is asked to try it out."""
+    """Hold one fixed question to try a model: what the ego and a helper see in one scene."""
 
     layout_seed: int  # seed of the layout
     step: int  # number of the decision point in its episode

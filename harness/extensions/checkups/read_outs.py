@@ -31,7 +31,10 @@ COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scene
 
 
 class Moved(Struct, frozen=True):
-    """Hold how the answers to pairs of questions followed the one fact in which they differ."""
+    """Hold how answers to pairs of questions followed the one fact in which both differ.
+
+    In `moved` of `n` pairs the expected action became clearly likelier with the fact.
+    """
 
     fact: str  # the kind of fact
     n: int  # number of pairs with two answers that can be parsed
@@ -49,7 +52,11 @@ class Moved(Struct, frozen=True):
 
 
 class Findings(Struct, frozen=True):
-    """Hold what fixed questions showed of a model's read-outs, for one prompt and answer mode."""
+    """Hold what fixed questions showed of a model's read-outs, for one prompt and answer mode.
+
+    A read-out takes the probabilities of actions from those of one letter each. The findings say
+    how far it follows the letter in place of the action, and whether facts in the scene move it.
+    """
 
     prompt: str  # the prompt version that they were asked with
     prompt_sha256: str  # digest of its files
