@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class ListsObjects(Call):
-    """Ask the ego's model again with a scene graph that also has what helpers list."""
+    """Ask the ego's model again, with a scene graph that also has the helpers' lists of objects."""
 
     name = "objects"
     in_graph = True

@@ -101,7 +101,7 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 
 
 def headline(result: Result) -> list[str]:
-    """Return sentences on which content gains over intents and where, and what each costs."""
+    """Return sentences on each content of messages: its gain over intents, and its cost."""
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
     for content in result.sent:

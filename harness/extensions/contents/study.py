@@ -57,7 +57,10 @@ Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and th
 
 
 class Panel(NamedTuple):
-    """Describe one axis of the study in one condition; without an axis, the condition as it is."""
+    """Describe what is varied in one condition: one setting (axis) over grid points.
+
+    Without an axis, it is the condition as it is, one grid point.
+    """
 
     name: str  # such as `6g:encoding=etsi over loss`
     axis: str  # the setting that is varied; empty without one
@@ -66,7 +69,11 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """Hold the runs of one model, and what its messages cannot hold."""
+    """Hold the runs of one model by family of scenes (scenario), and contents it cannot play.
+
+    A content says what messages hold, such as `intent`, `objects` or `both`; `left_out` has the
+    reason for each that the model's agents cannot play.
+    """
 
     name: str  # model, prompts and answer mode
     runs: Mapping[str, ReplayedRun]  # by family of scenes
@@ -80,7 +87,10 @@ class Model:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Hold the metrics of a model's runs with one content at one grid point."""
+    """Hold the metrics of a model's runs with one content of messages at one grid point.
+
+    `families` has, by scenario and metric, an array (S, E) of channel seeds and episodes.
+    """
 
     families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
     success_rules: Mapping[str, Success]  # of each family; the metric is the same in all
@@ -149,14 +159,14 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """Hold the outcomes of one model with every content at every grid point."""
+    """Hold the outcomes of one model with every content of messages at every grid point."""
 
     model: Model  # the model and its runs
     panels: Sequence[Panel]  # the axes and conditions that were played
     outcomes: Mapping[Place, Outcome]  # by operating point and number of vehicles
 
     def at(self, setting: Setting, content: str) -> Outcome:
-        """Return the outcome with a content at a grid point."""
+        """Return the outcome with a content of messages, such as `objects`, at a grid point."""
         return self.outcomes[place(setting, content)]
 
     @property
@@ -171,7 +181,7 @@ class Result:
 
     @property
     def others(self) -> list[str]:
-        """Return the contents that are compared with intents: all others that it plays."""
+        """Return the contents of messages that are compared with `intent`: all others."""
         return [content for content in self.model.contents if content != INTENT]
 
     @property
@@ -194,9 +204,10 @@ class Result:
         return dict(zip(places, corrected(p_values), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
-        """Return the p-value of no difference in success between a content and intents.
+        """Return the p-value of no difference in success between a content of messages and intents.
 
-        It is corrected by Holm's method over all of the model; None for intents.
+        It is corrected by Holm's method over all contents and grid points of the model; None for
+        intents.
         """
         return self._p.get(place(setting, content))
 
@@ -207,7 +218,7 @@ class Result:
 
     @property
     def words(self) -> str:
-        """Return the headline metric's name for people."""
+        """Return the headline metric's name for people, such as `balanced success`."""
         return IN_WORDS[self.headline_metric]
 
     @property
@@ -223,7 +234,10 @@ class Result:
 
 
 def holding(point: OperatingPoint, content: str) -> OperatingPoint:
-    """Return an operating point with this content; with `nothing`, the ego never asks."""
+    """Return an operating point with this content of messages.
+
+    With `nothing`, it is one at which the ego never asks.
+    """
     if content == NOTHING:
         return point.changed(content=INTENT, schedule=NEVER, threshold=None)
     return point.changed(content=content)
@@ -363,7 +377,7 @@ def run_contents(
     out: Path,
     progress: Progress,
 ) -> list[Result]:
-    """Play every content at every grid point with every model's runs.
+    """Play every content of messages at every grid point with every model's runs.
 
     Raises:
         UserError: the folder `out` holds another study.

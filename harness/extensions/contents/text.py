@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class SaysWords(Call):
-    """Ask the ego's model again with each helper's words in a line, and nothing else of it."""
+    """Ask the ego's model again, with each helper's words in a line, but without intents."""
 
     name = "text"
     in_words = True
