@@ -25,7 +25,10 @@ from harness.runs.suite import SuiteRun, plays
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one entry of a benchmark's board, with its rank and scores."""
+    """Hold one entry of a benchmark's board: its rank, its success by condition, and its gain.
+
+    The rank is None for an entry that sees more than a vehicle can.
+    """
 
     entry: Rescored  # the file of results, computed again
     # one more than the number of ranked entries that are clearly better; None of one that sees what

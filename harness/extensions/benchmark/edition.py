@@ -46,7 +46,11 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe a version of the benchmark that never changes: all that a score on it depends on."""
+    """Describe a version of the benchmark that never changes: all that a score on it depends on.
+
+    It pins datasets and prompts by digest, operating points, channel seeds, latency, ties and
+    metrics.
+    """
 
     name: str  # name of its file, without .toml
     digest: str  # hex SHA-256 of its file's tables

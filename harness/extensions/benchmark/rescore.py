@@ -24,7 +24,10 @@ from harness.runs.suite import SuiteRun
 
 @dataclass(frozen=True)
 class Rescored:
-    """Hold a results file whose figures were computed again here from its answers."""
+    """Hold a results file whose figures were computed again here from its answers.
+
+    `differences` has, by dataset, the names of the figures that differ from those in the file.
+    """
 
     contents: Contents  # the file's own `results.json`
     edition: Edition  # the edition that the file names
