@@ -58,7 +58,7 @@ SHAPES = (
 
 
 class Service:
-    """Answer HTTP requests for decisions of one model."""
+    """Answer HTTP requests for decisions of one model; `app` returns its web application."""
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class Asked:
-    """Hold one question of a client's request, with its options."""
+    """Hold one question of a client's request, with its options as the client writes them."""
 
     name: str | None  # name of the question in the client's request, if it has one
     question: Question  # state, instructions, and each option's meaning
@@ -54,7 +54,7 @@ class Enquiry:
 
 @dataclass(frozen=True)
 class Answered:
-    """Hold the answer to one question of a client."""
+    """Hold the answer to one question: a probability for each option, None if the model refused."""
 
     asked: Asked
     # probability of each option, as the model states it; None where the model refused
