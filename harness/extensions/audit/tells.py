@@ -41,7 +41,11 @@ Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 
 @dataclass(frozen=True)
 class Audit:
-    """Hold how well the hidden danger of a scenario can be predicted from what the ego sees."""
+    """Hold how well the hidden danger of a scenario can be predicted from what the ego sees.
+
+    `auc` has an AUC for each question (is there a danger, does it come from this sector); `told_by`
+    has the numbers of the scene graph that gave it away.
+    """
 
     scenario: str  # name of the scenario
     layouts: int  # number of layouts
