@@ -23,7 +23,7 @@ from harness.runs.records import Score
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one run in a history, with its value of the metric."""
+    """Hold one run in a history: its name, its start, and its value of the metric."""
 
     name: str  # its folder, relative to the folder of all runs
     date: datetime  # when it began
@@ -33,7 +33,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Group:
-    """Hold the runs of the same scenes, whose values may be compared."""
+    """Hold the runs of the same scenes, by date, and the metric and condition of their values."""
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
     # condition of the values: the given one, or the last of those that most of the runs have;
