@@ -51,7 +51,8 @@ TIES = "first"  # no two actions that these intents lead to are alike
 class Parameters:
     """Hold the parameters of the calibrated proxy, fitted by `harness/extensions/paper/fit.py`.
 
-    None of them depends on a panel or a grid point of the paper.
+    They are shares of episodes, entropies in nats and a time in seconds; none depends on a panel or
+    a grid point of the paper.
     """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
