@@ -14,8 +14,9 @@ _TABLES = ("channels", "networks", "schedules", "kept")  # of which a condition 
 
 
 def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
-    """Return a run's settings by dotted names, without those that have no value;
-    conditions by name.
+    """Return a run's settings as flat values by dotted name; those without a value are left out.
+
+    Lists are JSON texts; of conditions only the names are kept.
     """
     conditions = [point["name"] for point in settings["conditions"]]
     some = {name: value for name, value in settings.items() if name not in _TABLES}
@@ -33,8 +34,10 @@ def _leaves(table: Mapping[str, Any], above: str) -> Iterator[tuple[str, str | i
 
 
 def figures(done: "Evaluated") -> dict[str, float]:
-    """Return figures: `CONDITION/METRIC`,
-    with the ends of its 95 % interval and its n behind a dot.
+    """Return a run's scores by `CONDITION/METRIC`, and model costs by `cost/MODEL/CURRENCY`.
+
+    The names with `.low` and `.high` have the ends of a score's 95 % interval, `.n` its sample
+    size.
     """
     named: dict[str, float | None] = {}
     for score in (score for score in done.scores if score.interval != "seed means"):

@@ -16,7 +16,7 @@ AT_ONCE = 100  # parameters, by MLflow's limit
 
 
 class Mlflow:
-    """A hook that keeps runs in MLflow."""
+    """Record evaluations in MLflow while they run: a hook for `--tracker`."""
 
     needs = ("mlflow",)  # without which it cannot begin
 

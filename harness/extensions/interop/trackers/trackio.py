@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Trackio:
-    """A hook that keeps runs in Trackio."""
+    """Record evaluations in Trackio while they run: a hook for `--tracker`."""
 
     needs = ("trackio",)  # without which it cannot begin
 

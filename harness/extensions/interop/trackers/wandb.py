@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Wandb:
-    """A hook that keeps runs in Weights & Biases."""
+    """Record evaluations in Weights & Biases while they run: a hook for `--tracker`."""
 
     needs = ("wandb",)  # without which it cannot begin
 
