@@ -49,10 +49,10 @@ TIES = "first"  # no two actions that these intents lead to are alike
 
 @dataclass(frozen=True)
 class Parameters:
-    """Hold the parameters of the calibrated proxy, fitted by `harness/extensions/paper/fit.py`.
+    """Hold the parameters of the calibrated proxy, which draws intents in place of a model.
 
-    They are shares of episodes, entropies in nats and a time in seconds; none depends on a panel or
-    a grid point of the paper.
+    They are shares of episodes, entropies in nats and a time in seconds, computed by `fit.py` from
+    numbers of the paper; none depends on a panel or a grid point.
     """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
@@ -191,6 +191,8 @@ class CalibratedWorld:
 
 class Calibrated:
     """Play operating points with the calibrated proxy, as a source of results for studies.
+
+    The proxy stands for a model: it draws intents by parameters fitted to numbers of the paper.
 
     Attributes:
         name: what reports call it.

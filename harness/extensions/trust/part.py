@@ -72,7 +72,7 @@ class Guard(Part, frozen=True, kw_only=True):
 
     @property
     def defences(self) -> tuple[str, ...]:
-        """Return the names of the defences, in the order of `DEFENCES`."""
+        """Return the names of the defences of a fusion call in this condition, such as `quoted`."""
         return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
     def check(self) -> None:

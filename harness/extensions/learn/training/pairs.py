@@ -45,8 +45,8 @@ def write(
 
     Without `margin` they are those of `pairs`, with it those of `preferences`. Raises UserError if
     the run was driven, its dataset or prompt is not here as it was, or an answer does not match its
-    text; and, unless `report_seeds_too`, if it has report seeds or layouts that are not those of
-    their seeds.
+    text; and, unless `report_seeds_too`, if it has report seeds, or layouts that their seeds do not
+    give.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):

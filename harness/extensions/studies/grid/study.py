@@ -199,7 +199,11 @@ def run_cells(
 
 @dataclass(frozen=True)
 class Grid:
-    """Hold all runs of a full factorial design: every ego agent with every helper agent."""
+    """Hold all runs of a full factorial design: every ego agent with every helper agent.
+
+    An agent is a model with a prompt version and an answer mode; there are `rows` ego agents and
+    `columns` helper agents.
+    """
 
     cells: tuple[Cell, ...]  # row by row
     rows: int  # number of ego agents
