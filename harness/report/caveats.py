@@ -34,9 +34,7 @@ _FAILED = {
 
 
 def looked_at(run: Run) -> Iterator[str]:
-    """Yield when a run was looked at, and which of its intervals hold though it may have stopped
-    early.
-    """
+    """Yield when a run with sequential stopping was inspected, and which of its intervals hold."""
     looks = run.manifest.world.looks
     if looks is None:
         return
@@ -59,7 +57,7 @@ def looked_at(run: Run) -> Iterator[str]:
 
 
 def unread(run: Run) -> Iterator[str]:
-    """Yield whose answers could not be read, half of them or more, and what takes their place."""
+    """Yield a sentence for each role half or more of whose answers could not be parsed."""
     for role, (whose, instead) in _FAILED.items():
         score = run.score(ALL, f"failed_rate_{role}")
         if score is not None and score.value is not None and score.value >= UNREAD:
@@ -68,7 +66,7 @@ def unread(run: Run) -> Iterator[str]:
 
 
 def causes(run: Run) -> Iterator[str]:
-    """Yield how many of each role's answers could not be read, and the commonest cause of it."""
+    """Yield for each role how many answers could not be parsed, and the commonest reason."""
     meanings = {str(status): status.meaning for status in Status}
     for role, (whose, _) in _FAILED.items():
         rate = run.score(ALL, f"failed_rate_{role}")
@@ -85,13 +83,13 @@ def causes(run: Run) -> Iterator[str]:
 
 
 def unanswered(run: Run) -> Iterator[str]:
-    """Yield what the questions said that got no answer, where a run cannot do without."""
+    """Yield the engine's errors if unanswered requests leave a run without a valid result."""
     if (tallied := tally(run)).missing:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
 
 def few(run: Run) -> Iterator[str]:
-    """Yield how wide intervals may be of so few episodes."""
+    """Yield a warning with the width of a rate's interval for fewer than `FEW` episodes."""
     n = len(run.grid.episodes)
     if n < FEW:
         reach = f"{98 / n**0.5:.0f} points to either side"
@@ -99,8 +97,9 @@ def few(run: Run) -> Iterator[str]:
 
 
 def saturated(run: Run) -> Iterator[str]:
-    """Yield each half of balanced success that is 0 or 100 % under every condition,
-    as it can say nothing.
+    """Yield a sentence if success with a danger, or without, is always 0 or always 100 %.
+
+    It must be so under every condition, of two or more.
     """
     halves = zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True)
     for name, where in halves:
@@ -117,14 +116,14 @@ def saturated(run: Run) -> Iterator[str]:
 
 
 def earlier_gains(run: Run) -> Iterator[str]:
-    """Yield that gains have the intervals of older rules."""
+    """Yield a sentence if the gains have the wider intervals of an earlier harness version."""
     gains = [score for score in run.scores if score.metric in GAINS.values()]
     if any(score.interval == pinned.KIND for score in gains):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
 
 
 def sampled(run: Run) -> Iterator[str]:
-    """Yield how answers were sampled, where they were."""
+    """Yield the temperature and sampling seed if answers were sampled, not decoded greedily."""
     settings = run.manifest.settings
     if settings.temperature:
         yield (
@@ -134,7 +133,7 @@ def sampled(run: Run) -> Iterator[str]:
 
 
 def divided(run: Run) -> Iterator[str]:
-    """Yield how many of each role's answers were divided by their sum."""
+    """Yield for each role how many answers did not sum to 1 and were divided by their sum."""
     for role, (whose, _) in _FAILED.items():
         if run.manifest.sums == "divide" and (score := run.score(ALL, f"divided_rate_{role}")):
             yield (
@@ -144,7 +143,7 @@ def divided(run: Run) -> Iterator[str]:
 
 
 def flipped(run: Run) -> Iterator[str]:
-    """Yield how many of each role's read-outs change with the order of the list of actions."""
+    """Yield for each role how many read-outs change when the list of actions is reversed."""
     for role, (whose, _) in _FAILED.items():
         if score := run.score(ALL, f"flip_rate_{role}"):
             yield (
@@ -154,19 +153,19 @@ def flipped(run: Run) -> Iterator[str]:
 
 
 def lost_messages(run: Run) -> Iterator[str]:
-    """Yield what helpers' questions said that got no answer, where a run can do without."""
+    """Yield the engine's errors if helpers' answers are missing but count as lost messages."""
     if (tallied := tally(run)).words and not tallied.missing:
         yield f"{tallied}: each counts as a lost message."
 
 
 def retried(run: Run) -> Iterator[str]:
-    """Yield how many attempts failed before an answer came."""
+    """Yield how many requests to the engine failed and were repeated."""
     if retries := run.manifest.retries:
         yield f"The engine had errors: {retries} attempts were repeated."
 
 
 def controls(run: Run) -> Iterator[str]:
-    """Yield the conditions in which the ego hears what no helper would say."""
+    """Yield the conditions that are controls: their messages are replaced, to test cooperation."""
     for kind in more_parts().values():
         for control, words in kind.controls.items():
             if names := doubts.under(run.manifest.conditions, control):
@@ -174,7 +173,7 @@ def controls(run: Run) -> Iterator[str]:
 
 
 def lagging(run: Run) -> Iterator[str]:
-    """Yield the conditions under which most decisions act later than frozen scenes assume."""
+    """Yield the conditions whose decisions mostly take longer than the dataset's decision lag."""
     if off := doubts.lagging(_off_lag(run)):
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
@@ -183,7 +182,7 @@ def lagging(run: Run) -> Iterator[str]:
 
 
 def unmeasured(run: Run) -> Iterator[str]:
-    """Yield that a run, or its dataset, is older than the measures of conflicts."""
+    """Yield a sentence if the run, or its dataset, is too old to have TTC and PET."""
     if all(e.short_ttc is None for e in run.episodes):
         older = "dataset" if run.world == "frozen" else "run"
         yield (
@@ -193,7 +192,11 @@ def unmeasured(run: Run) -> Iterator[str]:
 
 
 def doubted(*runs: Run) -> set[str]:
-    """Return the conditions of these runs that a warning is about."""
+    """Return the names of the runs' conditions that have a warning.
+
+    These are controls, conditions with another lag than the dataset's, and radios outside the range
+    for which their channel model was validated.
+    """
     names = set[str]()
     for run in runs:
         manifest = run.manifest
@@ -215,7 +218,7 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
 
 
 def of_extensions(run: Run) -> Iterator[str]:
-    """Yield what extensions say of a run; one that fails says so itself."""
+    """Yield the sentences that extensions have on a run; for one that fails, its error message."""
     for name in CAVEATS:
         try:
             yield from CAVEATS.ask(name, lambda of: texts(of(run.manifest)))
@@ -224,8 +227,9 @@ def of_extensions(run: Run) -> Iterator[str]:
 
 
 def by_letter(run: Run) -> Iterator[str]:
-    """Yield whose read-outs follow the letter more than all else,
-    where they were read over cyclic orders.
+    """Yield a sentence for each role whose read-outs follow the option's letter, not its action.
+
+    It is known only of read-outs averaged over cyclic orders of the options.
     """
     for role, (whose, _) in _FAILED.items():
         share = run.score(ALL, f"letter_share_{role}")
@@ -240,9 +244,7 @@ def by_letter(run: Run) -> Iterator[str]:
 
 
 def unheard(run: Run) -> Iterator[str]:
-    """Yield the conditions under which replies arrive,
-    and every one of them too late to be heard.
-    """
+    """Yield the conditions under which messages arrive, but all after the decision window."""
     d = run.decisions
     delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
     conditions = d.codes("condition", run.conditions)
@@ -256,8 +258,9 @@ def unheard(run: Run) -> Iterator[str]:
 
 
 def lost_at_once(run: Run) -> Iterator[str]:
-    """Yield how many episodes are lost before the ego's first action,
-    so that no model could have saved them.
+    """Yield how many episodes end in a collision before the ego's first action takes effect.
+
+    These are episodes in which it is so under every condition and seed.
     """
     world = run.manifest.world
     if isinstance(world, ClosedLoop):
@@ -277,8 +280,9 @@ def lost_at_once(run: Run) -> Iterator[str]:
 
 
 def moved_system(run: Run) -> Iterator[str]:
-    """Yield whose system text stands in the first user turn,
-    since the chat template has no place for it.
+    """Yield each model whose system text was put into the first user turn.
+
+    Its chat template has no system role.
     """
     models = [agent["model"] for agent in (run.manifest.agent(0), *run.manifest.helpers)]
     for name in dict.fromkeys(str(model["name"]) for model in models if model.get("system")):
@@ -289,9 +293,7 @@ def moved_system(run: Run) -> Iterator[str]:
 
 
 def on_device(run: Run) -> Iterator[str]:
-    """Yield each agent of a run with a device profile whose times and joules are those of
-    another model.
-    """
+    """Yield each agent whose times and energy are those of another model on the device profile."""
     manifest = run.manifest
     if (device := manifest.device_profile) is None:
         return
@@ -307,16 +309,15 @@ def on_device(run: Run) -> Iterator[str]:
 
 
 def beyond_sources(run: Run) -> Iterator[str]:
-    """Yield conditions whose radio has settings that its model's source never held against
-    anything.
-    """
+    """Yield each condition with radio parameters outside its channel model's validated range."""
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"
 
 
 def no_prompt(runs: Mapping[str, Run]) -> list[str]:
-    """Return a sentence about the models that read no prompt,
-    and one about those that look at nothing either.
+    """Return up to two sentences on models that read no prompt, from the runs by display name.
+
+    One names rules that decide by the scene graph, the other drivers that look at nothing.
     """
     looking, blind = list[tuple[str, str]](), list[tuple[str, str]]()  # model and prompt version
     for run in runs.values():

@@ -63,10 +63,13 @@ PAPER = {"single-local": (145.0, 0.689), "v2x": (218.9, 0.835), "6g": (151.4, 0.
 def success_latency(
     rows: Rows, references: Mapping[str, float], window_ms: Sequence[float], label: str
 ) -> Spec:
-    """Draw success over latency, a point a run and condition, and the paper's;
-    references are lines.
+    """Return a scatter plot of success over latency in ms: a point for each run and condition.
 
-    `label` is the headline metric in words.
+    Args:
+        rows: as `panels.success` returns them, with the run's name as `run`.
+        references: success of each reference driver by its label, drawn as horizontal lines.
+        window_ms: decision windows, drawn as vertical lines.
+        label: the headline metric in words.
     """
     untitled = {"legend": {"orient": "top", "title": None}}
     several_runs = len({row["run"] for row in rows}) > 1
@@ -143,7 +146,7 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 
 
 def statuses(rows: Rows) -> Spec:
-    """Draw statuses of answers, a stacked bar a run and role."""
+    """Return a chart of parse statuses: one stacked bar for each run and role."""
     statuses: dict[str, dict[str, None]] = {verdict: {} for verdict in VERDICTS}
     for row in rows:
         # A run's file may say anything; what is no verdict is no answer.
@@ -157,8 +160,9 @@ def statuses(rows: Rows) -> Spec:
 
 
 def policies(actions: Sequence[str]) -> Spec:
-    """Return one decision's distributions around fusion; the page fills in `values`:
-    who, what, action, p.
+    """Return a bar chart of the probability distributions in one decision, before and after fusion.
+
+    It has no data: the page's script fills in rows of `who`, `what`, `action` and `p`.
     """
     scale = {"domain": list(actions), "range": list(colours.actions(actions).values())}
     return {
@@ -182,8 +186,9 @@ def policies(actions: Sequence[str]) -> Spec:
 
 
 def timeline() -> Spec:
-    """Draw when what happens in one decision; the page fills in `values`:
-    who, what, from, to; and `window`.
+    """Return a chart of the phases of one decision over time, in ms.
+
+    It has no data: the page's script fills in rows of `who`, `what`, `from` and `to`, and `window`.
     """
     spans: Spec = {
         "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
@@ -206,10 +211,10 @@ def timeline() -> Spec:
 def stacked(
     rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
 ) -> Spec:
-    """Return a bar a run and `by`, in parts of the values of a field,
-    in the order of their colours.
+    """Return a chart of stacked bars: one for each run and value of the field `by`.
 
-    Their lengths are shares, or another `amount` of the rows.
+    A bar's segments are the values of `field`, in the order and colours of `colours`; their lengths
+    are the rows' field `amount`, by default shares on a scale in percent. `what` is the axis title.
     """
     several_runs, order = len({row["run"] for row in rows}) > 1, list(colours)
     bars = []
@@ -243,7 +248,11 @@ def shares(
     diagonal: bool = False,
     rules: Sequence[float] = (),
 ) -> Spec:
-    """Draw shares over a field, a line a condition; on the `diagonal` the two agree."""
+    """Return a line chart of the rows' `share` over a numeric field, with intervals.
+
+    There is one line for each condition. `title` and `what` are the titles of the x and y axes,
+    `rules` the x of vertical lines; `diagonal` adds the line on which x and y are equal.
+    """
     x, y = x_axis(field, title), share_axis("share", what)
     condition, shape = condition_colours(rows), shapes_of(rows, "condition")
     if not diagonal:
@@ -274,7 +283,18 @@ def bars(
     rules: Sequence[float] = (),
     within: tuple[float, float] | None = None,
 ) -> Spec:
-    """Draw counts over a field in bins of one width, with a shaded budget to be `within`."""
+    """Return a histogram of the rows' `count` over a numeric field, whose bins begin at its values.
+
+    Args:
+        rows: one for each bin.
+        field: the field with the lower end of the bin.
+        title: title of the x axis.
+        what: title of the y axis.
+        width: width of every bin.
+        series: `role` or `condition`, to colour bars by that field; empty for one colour.
+        rules: x of vertical dashed lines.
+        within: both ends of a range to shade, in tokens; None for none.
+    """
     bars = [{**row, "to": row[field] + width} for row in rows]
     encoding: Spec = {
         "x": {**x_axis(field, title), "bin": {"binned": True, "step": width}},
@@ -295,12 +315,18 @@ def bars(
 
 
 def named(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row in which a text that Vega stumbles over (`TAKEN`) has a space behind it."""
+    """Return a row whose texts that are names of JavaScript objects (`TAKEN`) end with a space.
+
+    Vega would mistake them otherwise.
+    """
     return {key: f"{value} " if value in TAKEN else value for key, value in row.items()}
 
 
 def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
-    """Return layers over one table, one run of which is chosen where there are several."""
+    """Return a chart of layers that share one table of rows.
+
+    `choose` adds a selector of the run if the rows are of several; `height` is in pixels.
+    """
     runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
     data = {"name": "values", "values": list(rows)}
     chart: Spec = {**BASE, "height": height, "data": data, "layer": [*layers]}
@@ -312,7 +338,7 @@ def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) 
 
 
 def x_axis(field: str, title: str) -> Spec:
-    """Return a field along x, where its values are."""
+    """Return the Vega-Lite encoding of a numeric field on the x axis, which need not begin at 0."""
     axis = {"labelOverlap": True, "tickCount": 8}
     return {
         "field": field,
@@ -324,7 +350,7 @@ def x_axis(field: str, title: str) -> Spec:
 
 
 def share_axis(field: str, title: str) -> Spec:
-    """Return a share along y, from 0 to 100 %."""
+    """Return the Vega-Lite encoding of a field from 0 to 1 on the y axis, shown in percent."""
     return {
         "field": field,
         **NUMBER,
@@ -335,7 +361,10 @@ def share_axis(field: str, title: str) -> Spec:
 
 
 def colour(field: str, colours: Mapping[str, str]) -> Spec:
-    """Return a colour for each value of a field, whose name the legend leaves out."""
+    """Return the Vega-Lite encoding of a field by colour; the legend has no title.
+
+    `colours` maps each value of the field to its colour.
+    """
     return {
         "field": field,
         "type": "nominal",
@@ -345,14 +374,17 @@ def colour(field: str, colours: Mapping[str, str]) -> Spec:
 
 
 def condition_colours(rows: Rows) -> Spec:
-    """Return the colour of each row's condition."""
+    """Return the Vega-Lite encoding of the rows' field `condition` by colour."""
     shapes = shapes_of(rows, "condition")
     by_name = colours.conditions(shapes["scale"]["domain"])
     return {**shapes, "scale": {**shapes["scale"], "range": list(by_name.values())}}
 
 
 def shapes_of(rows: Rows, field: str) -> Spec:
-    """Return a shape where `condition_colours` has a colour; of one field, both have one legend."""
+    """Return the Vega-Lite encoding of a field by the shape of points.
+
+    Its order and legend are those of `condition_colours`, so that both share one legend.
+    """
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
     return {
         "field": field,
@@ -363,12 +395,12 @@ def shapes_of(rows: Rows, field: str) -> Spec:
 
 
 def names_axis(field: str) -> Spec:
-    """Return names along y, one a line, in the order in which they come."""
+    """Return the Vega-Lite encoding of a field of names on the y axis, in the order of the rows."""
     return {"field": field, "type": "nominal", "sort": None, "title": None}
 
 
 def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
-    """Return a filled point for each row."""
+    """Return a layer with a filled point for each row; `size` is its area in square pixels."""
     return {
         "mark": {"type": "point", "filled": True, "size": size, "opacity": 1},
         "encoding": encoding,
@@ -376,7 +408,7 @@ def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
 
 
 def tooltip(rows: Rows) -> list[Spec]:
-    """Return every field of a table in its tooltip."""
+    """Return the Vega-Lite encoding of a tooltip that shows every field of the rows."""
     fields = []
     for name, value in (rows[0] if rows else {}).items():
         field = {"field": name}
@@ -387,14 +419,15 @@ def tooltip(rows: Rows) -> list[Spec]:
 
 
 def interval(**encoding: Spec) -> Spec:
-    """Return a line from one end of an interval, along x or y, to the other,
-    which is the channel x2 or y2.
-    """
+    """Return a layer that draws a line for each row, from x to x2 or from y to y2."""
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
 
 def band(start: float, end: float, what: str, named: bool = False) -> Spec:
-    """Return a shaded range of x, named at its top or by its tooltip alone."""
+    """Return a layer that shades x from `start` to `end`; `what` is its tooltip.
+
+    `named`: whether `what` is also written at its top.
+    """
     x: Spec = {"x": {"field": "from", **NUMBER}}
     data = {"data": {"values": [{"from": start, "to": end, "what": what}]}}
     shade: Spec = {
@@ -406,7 +439,10 @@ def band(start: float, end: float, what: str, named: bool = False) -> Spec:
 
 
 def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
-    """Return vertical lines, named at their top where `what` they are is given, in ms."""
+    """Return layers with a vertical line at each x in `at`; none if there are none.
+
+    If `what` is given, a line is labelled with it and its x, in ms.
+    """
     if not at:
         return []
     values = [{field: value, "what": f"{what}, {value:g} ms"} for value in at]

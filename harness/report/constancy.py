@@ -18,7 +18,11 @@ DRIVERS = {action: driver for driver, action in ALWAYS.items()}
 
 @dataclass(frozen=True)
 class Commonest:
-    """What an ego answers most often."""
+    """Hold which likeliest action comes most often among an ego's answers (`commonest`).
+
+    It is so in `count` of `n` readable answers; `moves` is the standard deviation of its
+    probability.
+    """
 
     # the likeliest action of these answers; several where they are equally likely
     actions: Sequence[str]
@@ -39,8 +43,9 @@ class Commonest:
 
 
 def commonest(run: Run) -> Commonest | None:
-    """Return what a language model's ego answers most often;
-    None with fewer readable ones than `LEAST`.
+    """Return which likeliest action a language model's ego answers most often in a run.
+
+    None if the ego's engine is no language model or fewer than `LEAST` answers are readable.
     """
     engine = ENGINES.get(run.manifest.model["engine"])
     if engine is None or not engine.capabilities.language_model:
@@ -56,8 +61,9 @@ def commonest(run: Run) -> Commonest | None:
 
 
 def ignores_input(run: Run) -> Iterator[str]:
-    """Yield the sentence on an ego whose likeliest action is nearly always the same one
-    (`CONSTANT`).
+    """Yield a warning if the ego's answers nearly always have the same likeliest action.
+
+    It is so from a share of `CONSTANT` of the readable answers on.
     """
     common = commonest(run)
     if common and common.constant:
@@ -81,8 +87,9 @@ def _like(run: Run, common: Commonest) -> str:
 
 
 def in_a_line(run: Run) -> Iterator[str]:
-    """Yield what a language model's ego answers most often,
-    where `ignores_input` has not said it.
+    """Yield a line on what a language model's ego answers most often.
+
+    It yields none where `ignores_input` has a warning.
     """
     common = commonest(run)
     if common and not common.constant:
@@ -93,8 +100,10 @@ def in_a_line(run: Run) -> Iterator[str]:
 
 
 def tile(run: Run) -> list[dict[str, str]]:
-    """Return what a language model's ego answers most often, as a figure of a page's first
-    screen; none without a language model.
+    """Return a key figure for the page's top: how often the ego's commonest likeliest action comes.
+
+    An entry has `what`, `value`, `interval` and `n` as text; the list is empty where `commonest` is
+    None.
     """
     common = commonest(run)
     if common is None:

@@ -17,7 +17,7 @@ EXAMPLES = 3  # of each status of answers
 
 
 def size(runs: Runs) -> str:
-    """Return in words how many episodes and channel seeds the runs have, and of what dataset."""
+    """Return a phrase with the numbers of episodes and channel seeds and the dataset's name."""
     episodes = _either(len(run.grid.episodes) for run in runs.runs)
     seeds = _either(len(run.grid.seeds) for run in runs.runs)
     source = runs.runs[0].source
@@ -30,8 +30,9 @@ def _either(counts: Iterable[int]) -> str:
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
-    """Return a row for each metric of a run: its name, its meaning, and a cell for each
-    condition, None where it has no value there.
+    """Return the rows of a run's table of metrics: `name`, `meaning`, and `cells` by condition.
+
+    A cell has `value`, `interval` and `n` as text; None where the metric has no value there.
     """
     metrics = dict.fromkeys(score.metric for score in run.scores if score.condition != "all")
     rows: list[dict[str, Any]] = []
@@ -48,10 +49,10 @@ def _cell(run: Run, condition: str, metric: str) -> dict[str, str] | None:
 
 
 def probabilities(runs: Runs) -> list[dict[str, Any]]:
-    """Return a row for each run and condition with scores of its policies' probabilities.
+    """Return a row for each run and condition with scores of the fused policy's probabilities.
 
-    A row has two groups of decisions with their n: those in which some action is safe, and those
-    with one optimal action alone.
+    `groups` holds two sets of decisions, each with `n` and `scores`: those where some action is
+    safe, and those with exactly one optimal action.
     """
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
@@ -72,8 +73,9 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
 
 
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
-    """Return a row for each metric that no condition changes: its name, and a cell for each run,
-    None where the run has no value of it.
+    """Return the rows of the table of metrics on answers, which are the same under every condition.
+
+    A row is a metric's label and one cell for each run; None where the run has no value.
     """
     scores = [score for run in runs.runs for score in run.scores]
     metrics = dict.fromkeys(score.metric for score in scores if score.condition == "all")
@@ -85,8 +87,9 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
 
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
-    """Return the first `EXAMPLES` answers of each status but strict, each with the place of its
-    run.
+    """Return the first `EXAMPLES` answers of each parse status but `strict`, over all runs.
+
+    An entry has `status` and `answers`; each answer has the index of its `run`.
     """
     by_status: dict[str, list[dict[str, Any]]] = {}
     for place, run in enumerate(runs.runs):
@@ -99,7 +102,7 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:
-    """Return the pictures of the sweeps in a run's folder, each with its name and its address.
+    """Return the SVG charts of the sweeps in a run's folder: `name`, and `src` as a data URI.
 
     A link that leads out of the folder is not followed.
     """

@@ -24,11 +24,11 @@ ABSENT, UNREAD = "-", "?"
 
 
 class Decisions:
-    """Everything that runs have to say of single scenes, in order of episode, step and agent.
+    """Collect what a report shows of every single scene, ordered by episode, step and agent.
 
     Attributes:
-        ids: of the scenes that any run has.
-        index: what the list shows and filters by, for the page.
+        ids: ids of the scenes that any of the runs has.
+        index: the data by which the page lists and filters scenes, as JSON values.
     """
 
     def __init__(self, runs: Runs, prompts: Prompts = prompts_of, full: bool = False) -> None:
@@ -157,7 +157,7 @@ class Decisions:
         return {"said": "".join(letters), "sure": percents}
 
     def lacks(self) -> dict[str, str]:
-        """Return what these scenes could show and do not, in a word, and why."""
+        """Return why some scenes lack `prompts` or `pictures` on the page, by that word."""
         lacks = {}
         if unknown := self._details.without_prompts():
             lacks["prompts"] = lacking(unknown[0]) or "they are not known"
@@ -168,7 +168,7 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        """Return all scenes in parts of `AT_ONCE`, each to be packed alone."""
+        """Return all scenes in chunks of `AT_ONCE`, each to be compressed by any process."""
         starts = range(0, len(self.ids), AT_ONCE)
         return [Part(self._details, self.ids[start : start + AT_ONCE]) for start in starts]
 
@@ -197,8 +197,9 @@ def _places(runs: Sequence[Run]) -> dict[str, tuple[int | str | None, ...]]:
 
 
 def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
-    """Return decision points of closed-loop runs, played again;
-    those are missing that end elsewhere here.
+    """Return decision points of closed-loop runs by id, simulated again to know their full state.
+
+    Points that come out otherwise in this simulator are missing.
     """
     from harness.evaluate.replay import scenes_of  # loads the simulator
 
@@ -218,12 +219,11 @@ def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
 
 
 def failures(run: Run) -> dict[str, int]:
-    """Return decision points at which a driven layout begins to fail,
-    and the seed with which it does.
+    """Return where a closed-loop run's layouts begin to fail: decision points, each with a seed.
 
-    It is the last that a layout's failed episodes share with one that did not fail; where all of
-    them fail, the last of the first. With several agents it is one of each that decides in that
-    step.
+    It is the last decision point that a layout's failed episodes share with one that succeeded; if
+    all fail, the last of its first episode. With several agents, there is one for each that decides
+    then.
     """
     decisions = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])
@@ -249,11 +249,11 @@ def failures(run: Run) -> dict[str, int]:
 
 
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
-    """Choose up to n decision points, in their order; the same run always gives the same choice.
+    """Return up to n decision points to show, in order; the choice is deterministic.
 
-    Up to a quarter each are: failures; conditions that act differently with the seed that shows a
-    failure, or the first; answers that were recovered or failed. The rest is spread evenly. Where
-    one kind is scarce, the sample is larger.
+    Up to a quarter each are points in `failed` (as `failures` returns them), points where
+    conditions act differently, and points with an answer that was repaired or failed to parse. The
+    rest is evenly spaced.
     """
     decisions = run.decisions
     action, seeds = decisions.codes("action", run.actions), decisions.whole("seed")
@@ -276,15 +276,13 @@ def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
 
 
 def lost(run: Run) -> list[str]:
-    """Return the decision points of a frozen run at which success is given away,
-    under some condition and with some seed.
-    """
+    """Return the ids of a frozen run's scenes where some decision made success impossible."""
     regret = np.nan_to_num(run.decisions["regret"]) == 1.0
     scenes = run.decisions.scenes
     return [scene for scene, rows in scenes.items() if regret[rows.start : rows.stop].any()]
 
 
 def spread(items: Sequence[str], n: int) -> list[str]:
-    """Return up to n of the items, evenly spaced, the first among them."""
+    """Return up to n of the items, evenly spaced, beginning with the first."""
     n = min(n, len(items))
     return [items[k * len(items) // n] for k in range(n)]

@@ -103,10 +103,10 @@ OF_MESSAGE = ("delivered", "on_time", "arrival_ms", "weight", "trust", "attacker
 
 
 def prompts_of(run: Run) -> Sent | None:
-    """Return a function that gives the chat messages which a viewer was sent in a scene,
-    with the messages that it had heard.
+    """Return a function that renders a run's prompts again, as chat messages.
 
-    None if one of the run's prompts is neither here nor kept.
+    Its arguments are a scene, a viewer's id and the messages that the viewer had heard. None if a
+    prompt version of the run is neither installed nor stored with it.
     """
     manifest = run.manifest
     prompts: dict[str, Prompt] = {}  # by version
@@ -138,7 +138,11 @@ def prompts_of(run: Run) -> Sent | None:
 
 @dataclass(frozen=True)
 class Details:
-    """The details of scenes."""
+    """Collect what the page shows of single scenes: the world, answers, decisions and outcomes.
+
+    `replayed` has closed-loop scenes that could be simulated again, `framed` the ids of scenes
+    shown with camera pictures, `left_out` each run's ablations.
+    """
 
     runs: Runs  # the runs
     replayed: Mapping[str, Scene]  # of closed-loop runs, the scenes that could be replayed
@@ -148,7 +152,7 @@ class Details:
     left_out: Sequence[LeftOut]  # of each run
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
-        """Return the same with no more of the runs than these scenes need."""
+        """Return a copy with these scenes alone (by id), small enough to pickle."""
         scenes = set(ids)
         replayed = {name: scene for name, scene in self.replayed.items() if name in scenes}
         left_out = []
@@ -157,7 +161,7 @@ class Details:
         return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed, left_out=left_out)
 
     def blocks(self, ids: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
-        """Yield the details of scenes, `BLOCK` at a time.
+        """Yield the details of scenes as JSON values, `BLOCK` scenes at a time.
 
         Raises UserError if a run does not fit its dataset.
         """
@@ -179,12 +183,16 @@ class Details:
         return [self.prompts(run) for run in self.runs.runs]
 
     def without_prompts(self) -> list[Run]:
-        """Return the runs whose prompts are not known."""
+        """Return the runs whose prompts cannot be rendered again."""
         return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
 
     @cached_property
     def ends(self) -> list[Any]:
-        """Letters that say what each decision of each run led to, (n,) a run."""
+        """Return for each run an array (n,) with a letter for what each of its n decisions led to.
+
+        The letters are `GOOD`, `SLOW` (success with a needless delay; driven: late), `BAD` (unsafe;
+        driven: a failed episode) and `BLAMELESS` (no action could have led to success).
+        """
         return [_ends(run) for run in self.runs.runs]
 
     @cached_property
@@ -316,7 +324,7 @@ class Details:
 
 @dataclass(frozen=True)
 class Part:
-    """Some scenes whose details are packed together, here or in another process.
+    """Hold a chunk of scenes whose details one process prepares and compresses.
 
     It is pickled with no more of the runs than these scenes need.
     """
@@ -328,7 +336,7 @@ class Part:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
-        """Return the details of each block of scenes, compressed."""
+        """Return the details of each block of scenes as compressed JSON, in base64."""
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 
@@ -457,8 +465,10 @@ def _vehicle(vehicle: VehicleState, danger: str | None) -> dict[str, Any]:
 
 
 def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
-    """Return by viewer what its cameras see, as a picture of `FRAME_PX`,
-    and boxes around what its sensors list (`Frame.boxes`).
+    """Return by viewer id its rendered camera picture and the boxes of the objects in it.
+
+    `picture` is a PNG as a data URI, `size` (width, height) in pixels, `boxes` rows of an object's
+    id and its box as `Frame.boxes` gives it.
     """
     pictures = {}
     for viewer, graph in scene.graphs.items():

@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 240, 22  # of a line of a forest plot
 
 @dataclass(frozen=True)
 class Table:
-    """Text in columns, for a page and a terminal."""
+    """Hold a table of text to show on a page and in a terminal."""
 
     title: str  # what stands above it
     heads: Sequence[str]  # of the columns; the first column names the rows
@@ -34,7 +34,10 @@ class Table:
 
     @property
     def words(self) -> list[bool]:
-        """Whether each column has sentences, which begin at the left and wrap on the page."""
+        """Return for each column whether some cell is longer than `LONGEST_NUMBER`.
+
+        Such a column holds sentences: it is left-aligned and wraps.
+        """
         columns = range(len(self.heads))
         longest = [0 for _ in columns]
         for row in self.rows:
@@ -44,7 +47,7 @@ class Table:
 
     @property
     def in_terminal(self) -> tuple[list[str], list[list[str]]]:
-        """Heads and rows of the columns that a terminal has room for, as plain text."""
+        """Return heads and rows of the columns `terminal` without HTML, up to `most` rows."""
         heads = [self.heads[n] for n in self.terminal]
         rows = []
         for row in self.rows[: self.most]:
@@ -54,7 +57,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """The part of a page about one study, suite or run."""
+    """Hold the text, tables and pictures of one part of a page: about a study, a suite or a run.
+
+    `headline` is the outcome, `about` how it was made, and `numbers` the key figures, each with
+    `what`, `value`, `interval` and `n`.
+    """
 
     title: str  # what was run
     headline: Sequence[str] = ()  # the outcome in sentences
@@ -70,17 +77,17 @@ class Section:
 
 
 def document(sections: Sequence[Section]) -> str:
-    """Return the page of some sections; the title of the first is its own."""
+    """Return an HTML page with these sections; its title is that of the first."""
     return environment().get_template("sections.html.j2").render(sections=sections)
 
 
 def strong(text: str, when: bool = True) -> str:
-    """Return text that stands out on a page, where it should."""
+    """Return the text in bold for a page if `when`; otherwise unchanged."""
     return Markup("<strong>{}</strong>").format(text) if when else text
 
 
 def linked(text: str, href: str | None) -> Markup:
-    """Return text with a link to an address, if there is one."""
+    """Return the text as HTML with a link to `href`; just the text if that is None or empty."""
     return Markup('<a href="{}">{}</a>' if href else "{1}").format(href, visible(text))
 
 
@@ -89,7 +96,7 @@ def _plain(cell: str) -> str:
 
 
 def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
-    """Return the least and the greatest of values and ends; 0 and 1 of none."""
+    """Return the smallest and largest of all values and interval ends; (0, 1) if there are none."""
     numbers = list[float]()
     for each in bounded:
         ends = (known(each.value), known(each.low), known(each.high))
@@ -98,14 +105,15 @@ def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
 
 
 def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Markup:
-    """Draw a value as a square and its interval as a line,
-    with an upright line at 0 where that is between.
+    """Draw one row of a forest plot as SVG: a square at the value and a line for its interval.
+
+    A vertical line marks 0 where the scale contains it.
 
     Args:
         bounded: the value, with its interval.
         least: the left end of the scale.
         most: its right end.
-        verdict: `better` or `worse`, which have a colour.
+        verdict: `better` or `worse`, each drawn in a colour of its own; empty for neither.
     """
     y = HEIGHT / 2
 

@@ -21,7 +21,7 @@ Runs = Mapping[str, Run]  # by the name that each is shown by
 
 
 class Kind(StrEnum):
-    """What a sentence is for, in the order in which they stand."""
+    """List the kinds of sentences about a run, in the order in which they are shown."""
 
     VOID = "void"  # why the numbers are no result
     CAVEAT = "caveat"  # who decided, and how that is known
@@ -37,14 +37,17 @@ LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence about a run, or about some of several."""
+    """Hold one sentence about a run, or about some of several, with its kind."""
 
     kind: Kind
     sentence: str
 
 
 def each(source: Source[Run]) -> Source[Runs]:
-    """Return the source that says of several runs what this one says of each."""
+    """Turn a function that yields sentences about one run into one for several runs by name.
+
+    A sentence that is not true of all runs begins with the names of those it is true of.
+    """
     return partial(_merged, source)
 
 
@@ -107,15 +110,13 @@ OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
 
 
 def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
-    """Return what is said of a run, or of a suite and its runs,
-    all of it or only of these kinds.
-    """
+    """Return all sentences about a run, or about a suite and its runs; only of `kinds` if given."""
     runs = run.runs if isinstance(run, SuiteRun) else {"": run}
     return [*of_runs(runs, *kinds), *_findings(OF_ONE, run, kinds)]
 
 
 def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
-    """Return what is said of runs that stand side by side, all of it or only of these kinds."""
+    """Return the sentences about runs shown side by side, by name; only of `kinds` if given."""
     return _findings(OF_RUNS, runs, kinds)
 
 

@@ -61,10 +61,10 @@ _DARK = (
 
 @cache
 def vega() -> str:
-    """Return Vega, Vega-Lite and Vega-Embed as one script that leaves `vegaEmbed` behind.
+    """Return Vega, Vega-Lite and Vega-Embed as one JavaScript text that defines `vegaEmbed`.
 
     Raises:
-        UserError: the installed script is not the one whose digest stands here.
+        UserError: the installed bundle's SHA-256 is not `BUNDLE_SHA256`.
     """
     bundle = (files("js_lib_vega_embed") / BUNDLE).read_bytes()
     actual = sha256_bytes(bundle)
@@ -79,13 +79,16 @@ def vega() -> str:
 
 @cache
 def script() -> Markup:
-    """Return the page's own script."""
+    """Return the report page's own JavaScript, joined from the files `SCRIPTS`."""
     parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in SCRIPTS)
     return Markup(f'"use strict";\n(() => {{\n{parts}}})();\n')
 
 
 def licence() -> str:
-    """Return which libraries the page carries; their licences are in templates/licences.txt."""
+    """Return a sentence that names the bundled charting libraries with their versions.
+
+    The licences themselves are in templates/licences.txt.
+    """
     package = distribution(PACKAGE)
     # As it stands in the file: newer Pythons refuse to write this message's long header as text.
     carried = re.findall(
@@ -99,9 +102,7 @@ def licence() -> str:
 
 
 def packed(value: Any) -> Markup:
-    """Return text, or anything else as JSON, compressed,
-    in characters that mean nothing in HTML.
-    """
+    """Return text, or any other value as JSON, compressed by gzip and encoded in base64."""
     text = value
     if not isinstance(value, str):
         text = json.dumps(value, separators=(",", ":"), allow_nan=False)
@@ -109,14 +110,12 @@ def packed(value: Any) -> Markup:
 
 
 def picture(content: bytes, kind: str = "svg+xml") -> str:
-    """Return a picture as an address that a page which stands alone can show."""
+    """Return an image's bytes as a data URI; `kind` is its MIME subtype, such as png."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def on_dark_too(svg: bytes) -> bytes:
-    """Return a figure's SVG for a page, whose dark look it takes on;
-    the file stays as papers print it.
-    """
+    """Return a figure's SVG with a style sheet that adapts its colours to a browser's dark mode."""
     rules = ""
     for elements, property_name, colour in _DARK:
         rules += f"{elements} {{{property_name}: {PAGE[colour][1]} !important}} "
@@ -125,9 +124,7 @@ def on_dark_too(svg: bytes) -> bytes:
 
 
 def policy(*scripts: str) -> str:
-    """Return the content security policy of a page that runs these scripts and nothing else,
-    and requests nothing.
-    """
+    """Return a Content-Security-Policy that allows these inline scripts alone, and no request."""
     allowed = " ".join(f"'sha256-{digest(script)}'" for script in scripts)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
@@ -136,5 +133,5 @@ def policy(*scripts: str) -> str:
 
 
 def digest(script: str) -> str:
-    """Return the digest by which a policy lets a script run."""
+    """Return a script's SHA-256 in base64, as a Content-Security-Policy names it."""
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

@@ -28,7 +28,11 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 @dataclass(frozen=True)
 class Behind:
-    """A run against the best one, over the episodes that both have."""
+    """Hold how far one run is behind the best one, over the episodes that both have.
+
+    `change` is its success minus that of the best; the p-value is of no difference, corrected by
+    Holm's method.
+    """
 
     # of its success minus the best one's, by the headline metric, with a 95 % interval over these
     change: Estimate
@@ -45,7 +49,11 @@ Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and ho
 
 @dataclass(frozen=True)
 class Line:
-    """One run under one condition."""
+    """Hold the results of one run under one condition: a row of the report's main table.
+
+    `mark` says whether it is the best run, not told from it, or worse; `lead` is the headline
+    metric and `tokens` the median numbers of prompt and answer tokens.
+    """
 
     name: str  # of the run
     model: str  # of its card
@@ -61,13 +69,16 @@ class Line:
 
     @property
     def success(self) -> Score | None:
-        """The headline metric's score; None where the run has none."""
+        """Return the headline metric's score; None where the run has none."""
         return self.scores[self.lead]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Success under one condition, prompts across and models down."""
+    """Hold success under one condition as a table, prompts across and models down.
+
+    A row is a model and, for each prompt, the results of the runs with both.
+    """
 
     condition: str  # operating point
     # heads of the columns: version, and the answer mode where runs differ in it
@@ -90,7 +101,7 @@ METRICS = (
 
 
 def lines(runs: Runs) -> list[Line]:
-    """Return every run under each of its conditions, by condition and then in the runs' order."""
+    """Return a row for each run and condition, by condition, then in the runs' order."""
     lengths = [_tokens(run) for run in runs.runs]
     headline_metric = lead_of(*runs.runs)
     all_marks = _marks(runs, headline_metric)
@@ -131,9 +142,7 @@ def _marks(runs: Runs, headline_metric: str) -> dict[str, list[Mark]]:
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:
-    """Return the lines as a table for each condition,
-    with the models and prompts that were run under it.
-    """
+    """Return a table of models by prompts for each condition of these rows."""
     modes = {line.answer for line in results}
     cells_of: dict[str, dict[tuple[str, str], list[Line]]] = {}  # by condition, model and prompt
     for line in results:
@@ -176,11 +185,15 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
 def marked(
     conditions: Sequence[Sequence[Successes]], dangerous: Container[int] = ()
 ) -> list[list[Mark]]:
-    """Return the mark of each run under each condition, and how it stands to the best one there.
+    """Return for each condition the marks of all runs: best, not told from the best, or worse.
+
+    A mark comes with the comparison with the best run, or None for the best itself; p-values are
+    corrected by Holm's method for all pairs of runs.
 
     Args:
-        conditions: of each, the successes of every run; empty for one that was not made under it.
-        dangerous: the episodes with a danger, where balanced success is the headline metric.
+        conditions: for each condition the success (0 or 1) of each run, by (episode, seed); empty
+            for a run that was not made under it.
+        dangerous: numbers of the episodes with a danger, if balanced success is compared.
     """
     results = [_behind_best(successes, dangerous) for successes in conditions]
     p_values = [each.p_value for _, behind in results for each in behind.values()]
@@ -240,7 +253,7 @@ def _behind(rule: Success, a: Floats, b: Floats) -> Behind:
 
 
 def uneven(runs: Runs) -> str | None:
-    """Say which episodes and seeds each run has, where they differ; None where they do not."""
+    """Return a sentence on the runs' numbers of episodes and seeds; None if all are the same."""
     if len({(run.grid.episodes, run.grid.seeds) for run in runs.runs}) < 2:
         return None
     each = "; ".join(
@@ -254,8 +267,9 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's headline metric under each condition,
-    as its name, value, interval and n in words.
+    """Return the best run's headline metric under each condition, as text.
+
+    An entry has `what`, `value`, `interval` and `n`.
     """
     rows = []
     for line in results:
@@ -274,7 +288,7 @@ def _rank(best: Line, results: Sequence[Line]) -> str:
 
 
 def shared(results: Sequence[Line]) -> set[str]:
-    """Return the conditions in which some runs cannot be told from the one with the most."""
+    """Return the conditions under which some run cannot be told from the best one."""
     return {line.condition for line in results if line.mark == CLOSE}
 
 
@@ -283,9 +297,7 @@ def _close(condition: str, results: Sequence[Line]) -> list[str]:
 
 
 def headline(results: Sequence[Line]) -> str:
-    """Name the best of several runs under each condition,
-    or those that cannot be told apart there.
-    """
+    """Return a sentence on the best run under each condition, or the runs that tie for it."""
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
         lines = [line for line in results if line.condition == condition]

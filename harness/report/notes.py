@@ -15,11 +15,11 @@ Shown = Run | SuiteRun
 
 
 def pace(run: Shown) -> Iterator[str]:
-    """Yield what prefill and decode take of answers that were asked alone,
-    a role after the other, as lines.
+    """Yield lines on how long prefill and decode take, by role, measured at batch size 1.
 
-    TTFT is the time to first token, TPOT that of each token after it. They are of the run's own
-    answers; where it knows none of these, of those that its latency was measured with.
+    TTFT is the time to first token, TPOT the time for each further token, as medians and 95th
+    percentiles in ms. They are of the run's own answers, else of those its latency was measured
+    with.
     """
     manifest = run.manifest
     own = {role: took for role, took in manifest.answer_times.items() if took.first_token}
@@ -46,12 +46,12 @@ def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
 
 
 def latency(run: Shown) -> Iterator[str]:
-    """Yield where the inference time comes from, and how long it is."""
+    """Yield the line on the assumed inference times and where they come from."""
     yield f"latency: {latency_source(run.manifest.latency)}"
 
 
 def latency_source(latency: Latency) -> str:
-    """Return where the inference time comes from, and how long it is."""
+    """Return the inference times of ego, helpers and fusion, in ms, and where they come from."""
     source = {
         "measured": "measured on the machine of the run, before it",
         "card": "stated by the model card, not measured here",
@@ -74,7 +74,10 @@ def latency_source(latency: Latency) -> str:
 
 
 def energy(run: Shown) -> Iterator[str]:
-    """Yield what a decision takes in each condition; nothing without a device profile."""
+    """Yield a line for each condition on the energy of a decision: in all, of helpers, of radios.
+
+    It yields nothing without a device profile, which states joules a token.
+    """
     for name in run.conditions:
         total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
         radio = run.score(name, "radio_mj")
@@ -87,7 +90,10 @@ def energy(run: Shown) -> Iterator[str]:
 
 
 def answer_times(run: Shown) -> Iterator[str]:
-    """Yield how long a role's own answers took."""
+    """Yield a line for each role on how long its answers took when the run was made, in ms.
+
+    These times are not those that latency is computed from.
+    """
     for role, took in run.manifest.answer_times.items():
         median_ms = f"{1000 * took.median_s:.1f} ms"
         spread_ms = f"5-95 %: {1000 * took.p5_s:.1f} to {1000 * took.p95_s:.1f}"
@@ -96,7 +102,7 @@ def answer_times(run: Shown) -> Iterator[str]:
 
 
 def cost(run: Shown) -> Iterator[str]:
-    """Yield what the questions to a model cost."""
+    """Yield a line for each model on what its answers cost, in the currency of its price list."""
     for model, cost in (run.manifest.cost or {}).items():
         left_out = f", {cost.uncounted} of which are not in it" if cost.uncounted else ""
         yield (
@@ -106,13 +112,16 @@ def cost(run: Shown) -> Iterator[str]:
 
 
 def cached(run: Shown) -> Iterator[str]:
-    """Yield how many answers the model was not asked for."""
+    """Yield a line on how many answers came from the completion cache, if any did."""
     if n := run.manifest.cached_answers:
         yield f"{n} answers came from the cache (--no-cache asks the model again)"
 
 
 def readings(run: Shown) -> Iterator[str]:
-    """Yield how the answers of each role were read; shares of a suite are means over families."""
+    """Yield lines on how each role's answers were parsed: shares by verdict, repairs and read-outs.
+
+    For a suite, shares are means over families.
+    """
     means = ", as means over families" if isinstance(run, SuiteRun) else ""
     for role in roles():
         for line in _of_role(run, role):

@@ -50,24 +50,25 @@ def write_report(
     workers: Workers = 1,
     full: bool = False,
 ) -> Path:
-    """Write a report about one run, or about several on the same scenes.
+    """Write the HTML report of one run, or of several on the same scenes.
 
     Args:
-        runs: what to report.
-        out: file to replace.
-        prompts: gives of a run what gives the chat messages that a viewer was sent in a scene, with
-            what it had heard; None where they are unknown. By default the run's own prompt version,
-            if it is here.
-        progress: called with the number of scenes just packed.
-        workers: who packs the scenes of a report of many; `prompts` can be pickled then.
-        full: whether it also has the prompts that rules do not read, and the camera pictures of
-            every decision, not only those of models that see.
+        runs: the runs to report.
+        out: the file to replace.
+        prompts: maps a run to a function that returns the chat messages for a scene, a viewer and
+            the messages that it had heard, or to None if they are unknown; by default the run's own
+            prompt version, if it is installed.
+        progress: called with the number of scenes just written.
+        workers: processes that prepare the scenes of a large report; if any, `prompts` must pickle.
+        full: whether to include prompts of engines that read none, and the camera pictures of every
+            decision instead of only those of models with vision.
 
     Returns:
         The file written.
 
     Raises:
-        UserError: a run has a scene that its dataset has not, or `out` cannot be written.
+        UserError: a scene of a run is not in its dataset, `out` cannot be written, or the page
+            there shows something that the new one would lack.
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
@@ -78,12 +79,13 @@ def write_report(
 
 
 def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
-    """Raise UserError if a page that lacks something would replace one that has it.
+    """Raise UserError if a page that lacks prompts or pictures would replace one that has them.
 
     Args:
         out: the file to replace.
-        lacks: what the new page lacks, in a word, and why. A page states these words itself.
-        option: names another file.
+        lacks: why the new page lacks each of its missing kinds, such as `prompts`, by kind. A page
+            names the kinds it lacks in its head.
+        option: the command-line option that names the file, for the error.
     """
     if not lacks or not out.is_file():
         return
@@ -99,7 +101,10 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
 
 
 def save(pieces: Iterable[str], out: Path, option: str) -> None:
-    """Write the pieces of a page where an option says. Raises UserError if it cannot be written."""
+    """Write a page's pieces to a file, which is replaced only once it is whole.
+
+    Raises UserError, with the name of the command-line option, if the file cannot be written.
+    """
     try:
         with replacing(out) as part, part.open("w", encoding="utf-8", newline="") as file:
             file.writelines(pieces)
@@ -116,7 +121,7 @@ def render(
     progress: Callable[[int], None] = lambda done: None,
     full: bool = False,
 ) -> str:
-    """Return the page, as `write_report` writes it."""
+    """Return the HTML text of the report that `write_report` writes, with the same arguments."""
     return "".join(_pieces(runs, Decisions(runs, prompts, full), progress, 1))
 
 

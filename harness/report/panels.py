@@ -33,7 +33,7 @@ BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart of the page."""
+    """Hold one chart of the report page: a Vega-Lite specification with its title and caption."""
 
     id: str  # its name in the page, and of the files it is saved as
     part: Part  # of the page
@@ -43,7 +43,7 @@ class Panel:
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
-    """Yield the charts of which there is anything to draw."""
+    """Yield the charts of the runs; a chart without any data is left out."""
 
     def joined(table_of: Callable[[Run], Table]) -> Table:
         rows = []
@@ -192,7 +192,10 @@ def _references(runs: Runs, metric: str) -> dict[str, Score]:
 
 
 def success(run: Run, metric: str) -> Table:
-    """Return the headline metric and latency of each condition of which both are known."""
+    """Return a row for each condition with success and latency: values, interval ends (in ms), n.
+
+    A condition is left out if one of the two is unknown.
+    """
     rows = []
     for condition in run.conditions:
         latency, rate = run.score(condition, LATENCY), run.score(condition, metric)
@@ -214,7 +217,7 @@ def success(run: Run, metric: str) -> Table:
 
 
 def statuses(run: Run) -> Table:
-    """Return how many answers of each role have which status."""
+    """Return a row for each role and parse status: count of answers and share of the role's."""
     order = {str(status): n for n, status in enumerate(Status)}
     count = Counter[tuple[str, int, str, str]]()  # by role, the status's place, status and verdict
     total = Counter[str]()  # by role
@@ -231,8 +234,10 @@ def statuses(run: Run) -> Table:
 
 
 def reliability(run: Run) -> Table:
-    """Return how often the likeliest action was the one optimal action,
-    by its probability after fusion.
+    """Return a reliability diagram's rows: for each condition and bin of the policy's confidence.
+
+    A row says how often the likeliest action was the only optimal one. Conditions with fewer than
+    `LEAST` decisions that have exactly one optimal action are left out.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -257,7 +262,7 @@ def reliability(run: Run) -> Table:
 
 
 def errors(run: Run) -> Table:
-    """Return how often a decision was unsafe, by the entropy of the ego's own intent."""
+    """Return the share of unsafe decisions by condition and bin of the ego's entropy, in nats."""
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
     return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
@@ -287,7 +292,7 @@ def _shares(
 
 
 def entropies(run: Run) -> Table:
-    """Return how uncertain the ego's own answers are."""
+    """Return a histogram of the entropy of the ego's own answers, in nats; empty if none parsed."""
     intents = [answer.intent for answer in run.answers if answer.role == "ego" and answer.intent]
     if not intents:
         return []
@@ -297,7 +302,7 @@ def entropies(run: Run) -> Table:
 
 
 def tokens(run: Run) -> Table:
-    """Count the tokens of prompts by role, where the engine counts them."""
+    """Return a histogram of prompt lengths in tokens for each role whose engine counts them."""
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
         if answer.prompt_tokens is not None:
@@ -309,7 +314,7 @@ def tokens(run: Run) -> Table:
 
 
 def replies(run: Run) -> Table:
-    """Count the replies that were scheduled, by how they ended."""
+    """Return the counts and shares of requested replies by condition: on time, late, lost."""
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
     by_reply = {
@@ -331,8 +336,9 @@ def replies(run: Run) -> Table:
 
 
 def energies(run: Run) -> Table:
-    """Return the joules of a decision, by who takes them, with the total's interval;
-    no condition of which one of them is not known.
+    """Return the mean joules of a decision by condition: ego's inference, helpers' and radios.
+
+    Every row has the total with its interval; conditions with an unknown part are left out.
     """
     rows = []
     for condition in run.conditions:
@@ -356,7 +362,10 @@ def energies(run: Run) -> Table:
 
 
 def arrivals(run: Run) -> Table:
-    """Return when replies that are not lost arrive, in ms from the start of the decision."""
+    """Return for each condition a histogram of replies' arrival, in ms from the decision's start.
+
+    Lost replies are not in it.
+    """
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
     rows = []

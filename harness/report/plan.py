@@ -26,7 +26,7 @@ RESAMPLES = 999
 
 @dataclass(frozen=True)
 class Cost:
-    """What the answers of some layouts take; None where the pilots do not say."""
+    """Hold the requests, tokens and minutes that some layouts take; None where unknown."""
 
     requests: float
     tokens: float | None  # of prompts and answers
@@ -34,7 +34,7 @@ class Cost:
     minutes: float | None
 
     def times(self, layouts: float) -> "Cost":
-        """Return the cost of so many layouts, where this is that of one."""
+        """Return the cost of this many layouts, where `self` is that of one."""
         tokens = self.tokens and self.tokens * layouts
         minutes = self.minutes and self.minutes * layouts
         return Cost(self.requests * layouts, tokens, minutes)
@@ -42,7 +42,10 @@ class Cost:
 
 @dataclass(frozen=True)
 class Planned:
-    """What a difference needs under one condition."""
+    """Hold the sample size for one condition: the layouts needed to find a difference.
+
+    `finds` is the smallest difference that the asked number of layouts finds, NaN if none.
+    """
 
     condition: str  # its name; empty for a stated rate
     layouts: Estimate  # how many find it; the interval is over other pilots of as many layouts
@@ -53,7 +56,10 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Layouts for a difference, a row a condition."""
+    """Hold the result of a power analysis of success, one row for each condition.
+
+    `layouts` is the number for which the smallest difference found is stated.
+    """
 
     difference: str  # whose of what, in words
     basis: str  # what must hold for it, in words
@@ -64,7 +70,15 @@ class Plan:
 def from_rate(
     rate: float, correlation: float, detect: float, power: float, layouts: int | None
 ) -> Plan:
-    """Plan by two successes near a rate whose outcomes correlate over layouts; one channel seed."""
+    """Return the power analysis of a difference between two runs with success near an assumed rate.
+
+    Args:
+        rate: success of both, from 0 to 1.
+        correlation: between the two runs' outcomes over layouts, with one channel seed.
+        detect: the difference to find, from 0 to 1.
+        power: the probability to find it.
+        layouts: also compute the difference that so many layouts find; None for not.
+    """
     variance = 2 * rate * (1 - rate) * (1 - correlation)
     spread = Spread(np.ones(1), np.array([variance]))
     needed = float(spread.episodes(detect, power))
@@ -75,8 +89,11 @@ def from_rate(
 
 
 def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: int | None) -> Plan:
-    """Plan by what one run shows of each condition's gain over the baseline,
-    or two of their difference.
+    """Return the power analysis by the variance in pilot runs, one row for each condition.
+
+    Of one pilot it is for the gain over `BASELINE`, of two for their difference. `detect` and
+    `power` are as in `from_rate`; without `layouts`, it is also computed what the pilots' own
+    number finds.
 
     Raises UserError for runs that cannot be compared, one without the baseline or with no other
     condition, or pilots of fewer than two layouts of a kind.
@@ -167,7 +184,7 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
-    """Return a plan as plain values: differences from 0 to 1, what is not known as None."""
+    """Return a plan as plain values for JSON: differences from 0 to 1, unknown numbers as None."""
     conditions = []
     for row in plan.rows:
         cost = row.cost

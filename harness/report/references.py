@@ -19,7 +19,12 @@ BESIDE = (OPEN_LOOP, CONSTANT, UNIFORM)  # rows beside a model's on the terminal
 
 
 def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
-    """Return the success of each reference in a dataset's episodes, also balanced, by metric."""
+    """Return the success of each reference driver, computed from a dataset's decision trees.
+
+    A reference needs no model. The result maps its name to scores by metric: success rate and,
+    where dangers are known, balanced success (mean over layouts with and without a danger) and its
+    halves.
+    """
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
         values = {SUCCESS: success, **by_danger(success, dataset.dangerous)}
@@ -33,7 +38,10 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
 
 
 def driven(runs: Iterable[Run], metric: str) -> dict[str, Score]:
-    """Return a metric of each reference that some of these runs are of."""
+    """Return a metric's score of each run whose engine is a reference driver, by the driver's name.
+
+    Runs of other engines, and runs without a value, are left out.
+    """
     scores = {}
     for run in runs:
         engine = ENGINES.get(str(run.manifest.model.get("engine")))
@@ -43,13 +51,16 @@ def driven(runs: Iterable[Run], metric: str) -> dict[str, Score]:
 
 
 def label(name: str, scenario: Scenario) -> str:
-    """Return a reference's name for people; that of `constant` says which action it takes."""
+    """Return a reference driver's display name; that of `constant` includes the action it takes."""
     action = constant(scenario) if name == CONSTANT else None
     return f"{name} {action}" if action else name
 
 
 def meaning(name: str, exact: bool = True) -> str:
-    """Say what one of `BESIDE` does; `exact` if its figure is of the trees, and not of a run."""
+    """Return a sentence on what a reference driver of `BESIDE` does, which looks at nothing.
+
+    `exact`: whether its success was computed from decision trees, and not estimated from a run.
+    """
     exactly = "by the trees; a run of it draws"
     return {
         OPEN_LOOP: "open-loop: always the same sequence of actions, the best in tune layouts",
@@ -60,7 +71,10 @@ def meaning(name: str, exact: bool = True) -> str:
 
 
 def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) -> str:
-    """Say how well each reference does, the best first, and what those that look at nothing do."""
+    """Return a caption's sentences on the references: each one's success, best first, and meaning.
+
+    Empty without references. `exact` is as in `meaning`.
+    """
     if not references:
         return ""
     rates = []

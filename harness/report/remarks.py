@@ -26,17 +26,19 @@ LeftOut = Mapping[str, Sequence[Mapping[str, Any]]]
 
 @runtime_checkable
 class Remarks(Protocol):
-    """An extension's remarks on decision points."""
+    """Describe what an extension offers as remarks on single decision points of a run's page."""
 
     def sentences(self, runs: Runs) -> Iterable[Markup]:
-        """Return what stands above the list;
-        `<a data-scene=… data-run=…>` leads to a decision point.
+        """Return sentences to show above the page's list of decision points.
+
+        In them `<a data-scene=… data-run=…>` is a link to a decision point.
         """
         ...
 
     def left_out(self, run: Run) -> LeftOut:
-        """Return what is drawn beside the answers of decision points:
-        what they became without one thing.
+        """Return how answers and decisions change without one object or message, by decision point.
+
+        The keys of an entry are those of `LeftOut`.
         """
         ...
 
@@ -45,10 +47,10 @@ REMARKS: Plugins[Remarks] = Plugins("swarmdrive.remarks", Remarks, {})
 
 
 def sentences(runs: Runs) -> list[Markup]:
-    """Return what extensions say above the list.
-    Of one that fails, a sentence says so in its place.
+    """Return the sentences of all extensions that stand above the page's list of decision points.
 
-    Raises UserError if a file of a run is broken.
+    An extension that fails gets a sentence with its error. Raises UserError if a file of a run is
+    broken.
     """
 
     def escaped(remarks: Remarks) -> list[Markup]:
@@ -66,9 +68,9 @@ def sentences(runs: Runs) -> list[Markup]:
 
 
 def left_out(run: Run) -> LeftOut:
-    """Return what extensions have beside a run's answers; of one that fails, nothing.
+    """Return what all extensions know of answers without one object or message, by decision point.
 
-    Raises UserError if a file of the run is broken.
+    An extension that fails adds nothing. Raises UserError if a file of the run is broken.
     """
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:

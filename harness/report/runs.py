@@ -18,7 +18,10 @@ from harness.world.scenario import Scenario
 
 @dataclass(frozen=True)
 class Runs:
-    """Finished runs on the same scenes, all frozen or all closed-loop."""
+    """Hold the finished runs that one report shows: on the same scenes, in the same world.
+
+    `dataset` is None for closed-loop runs.
+    """
 
     runs: tuple[Run, ...]  # in the order given
     names: tuple[str, ...]  # model, prompt and, where two would be equal, more
@@ -26,45 +29,45 @@ class Runs:
 
     @property
     def live(self) -> bool:
-        """Whether they are closed-loop runs."""
+        """Return whether the runs are closed-loop runs, which have no dataset."""
         return self.dataset is None
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Meta-actions, in the order of every distribution."""
+        """Return the names of the meta-actions, in the order of every probability distribution."""
         return self.runs[0].actions
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of their episodes, with its parameters of then."""
+        """Return the scenario of the runs' episodes, with the parameters it had then."""
         if self.dataset is not None:
             return self.dataset.scenario
         return self.runs[0].manifest.scenario
 
     def of_scenes(self, ids: Collection[str]) -> "Runs":
-        """Return the runs' part in some scenes, with the trees of their layouts alone."""
+        """Return a copy with these scenes alone (by id) and their layouts' decision trees."""
         runs = tuple(run.of_scenes(ids) for run in self.runs)
         layouts = {number for run in runs for number in run.grid.episodes}
         return replace(self, runs=runs, dataset=self.dataset and self.dataset.of_episodes(layouts))
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of all operating points."""
+        """Return the names of all conditions (operating points) of the runs, each once."""
         return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
 
 
 @uncollected()
 def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs:
-    """Read runs to be reported together.
+    """Read runs that one report shows together.
 
     Args:
-        paths: their folders.
-        dataset: one that was read already, which is read again where it is not that of the runs; or
-            the folder that theirs is in.
+        paths: the runs' folders.
+        dataset: the runs' dataset, already loaded (the right one is read if its digest differs), or
+            the folder to find it in; None to look where it was.
 
     Raises:
-        UserError: a folder is no run or contradicts itself,
-            its dataset is gone or has changed, or two are not of the same scenes.
+        UserError: a folder is no run or contradicts itself, its dataset is missing or has changed,
+            two runs have different scenes, or a folder is given for closed-loop runs.
     """
     runs = [read(path) for path in dict.fromkeys(paths)]
     if not isinstance(dataset, Dataset):  # else they were just made

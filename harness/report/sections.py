@@ -19,9 +19,10 @@ SECTIONS: Plugins[Callable[[Run], Section | None]] = Plugins("swarmdrive.section
 
 
 def sections(runs: Runs) -> list[tuple[str, Markup]]:
-    """Return what extensions say of the runs: the title and the content of each section.
+    """Return title and HTML of each page section that extensions write for these runs.
 
-    One that fails says so in its place: the rest of the page does not depend on it.
+    An extension that fails gets a section with its error message instead; the rest of the page is
+    unaffected.
     """
     written = [_written(name, run) for name in SECTIONS for run in runs.runs]
     return [section for section in written if section is not None]

@@ -34,7 +34,11 @@ MEAN = "mean over families"
 
 @dataclass(frozen=True)
 class Cell:
-    """One family under one condition."""
+    """Hold the result of one family of scenes (one scenario's dataset) under one condition.
+
+    `gain` is over the condition without V2V; `verdict` is `better` or `worse` if that is
+    significant.
+    """
 
     success: Score | None  # success rate, balanced where dangers are known
     gain: Score | None  # over `BASELINE`, paired; None where there is none
@@ -44,7 +48,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Line:
-    """One family, or the mean over families."""
+    """Hold one row of the suite's table: the results of one family, or the mean over families.
+
+    `drivers` has the success of reference drivers by name, `cells` the result by condition.
+    """
 
     name: str  # the family's
     run: Run | None  # its run; None for the mean
@@ -54,11 +61,12 @@ class Line:
 
 
 def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> list[Line]:
-    """Return a line for each family, then one for their mean.
+    """Return a row for each family of a suite, then one for their mean.
 
     Args:
-        suite: what was run.
-        datasets: by family, of a suite that was just made; of others they are read.
+        suite: the suite's finished run.
+        datasets: each family's dataset by its name, already loaded and trusted; None to read them
+            and check the suite.
 
     Raises UserError if a suite, or a run of it, contradicts itself.
     """
@@ -135,22 +143,24 @@ def _cells(
 
 
 def seeds_of(run: Run) -> str:
-    """Return what the layout seeds of a run's episodes are for."""
+    """Return the purpose of the run's layout seeds, such as tuning or report, by their range."""
     seeds = [episode.layout_seed for episode in run.episodes]
     return " and ".join(purposes(min(seeds), max(seeds) - min(seeds) + 1))
 
 
 def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
-    """Write the page of one suite's run, or of several.
-    Raises UserError if `out` cannot be written.
+    """Write the HTML page of the runs of one or several suites, each with its `lines`.
+
+    Returns the file. Raises UserError if `out` cannot be written.
     """
     save([render(suites, beside(out))], out, "--out")
     return out
 
 
 def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> str:
-    """Return the page of one suite's run, or of several;
-    `place` gives the link to the page of a family's run.
+    """Return the HTML page of the runs of one or several suites, each with its `lines`.
+
+    `place` returns the link to the page of a family's run, or None.
     """
     return document([_section(suite, rows, place) for suite, rows in suites])
 

@@ -19,8 +19,9 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @cache
 def environment(*more: Path) -> Environment:
-    """Return the report's templates, and those of other folders:
-    everything is escaped and made `visible`.
+    """Return the Jinja environment with the report's templates and those of the folders `more`.
+
+    Values are escaped as HTML and pass through `visible`. It is made once for each set of folders.
     """
     templates = Environment(
         loader=FileSystemLoader([*more, TEMPLATES]),
@@ -45,8 +46,10 @@ def environment(*more: Path) -> Environment:
 
 
 def visible(value: Any) -> Any:
-    """Return a text with every character that shows nothing, or turns the line around, spelt out;
-    None as a dash, and any other value as it is.
+    """Return a value as a template shows it, so that nothing in it is invisible.
+
+    In a text, invisible and bidirectional control characters are written as ⟨U+XXXX⟩; None and
+    undefined become a dash, booleans yes or no. `Markup` and any other value are unchanged.
     """
     if value is None or isinstance(value, Undefined):
         return "–"

@@ -28,7 +28,7 @@ SHOWN_FROM = 40
 
 
 def shown(score: Score) -> dict[str, str]:
-    """Return value, interval and n of a score, for a cell of the table."""
+    """Return a score as text for a table cell: `value`, `interval` and `n`, with the unit."""
     unit = entry(score.metric).unit
     n = f"n = {score.n} {score.interval}"
     if score.n_excluded:
@@ -37,7 +37,7 @@ def shown(score: Score) -> dict[str, str]:
 
 
 def cell(score: Score | None) -> Markup:
-    """Return value and interval of a score as a cell of a page; a dash where there is none."""
+    """Return a score's value and interval as HTML for a table cell; a dash for None."""
     if score is None:
         return Markup("–")
     text = shown(score)
@@ -46,9 +46,7 @@ def cell(score: Score | None) -> Markup:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """Return the result in one short sentence:
-    the best condition, and the one without V2V beside it.
-    """
+    """Return the result in one sentence: success under the best condition and without V2V."""
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
     if not best:
@@ -84,13 +82,14 @@ def headline(run: Run | SuiteRun) -> str:
 
 
 def shown_change(change: Estimate) -> str:
-    """Write a difference of success with its interval: `+7.7 [+3.1, +12.4] points`."""
+    """Return a difference of success and its interval as text: `+7.7 [+3.1, +12.4] points`."""
     return f"{shown_estimate(change, POINTS, '+')} points"
 
 
 def judged(change: Estimate, p: float) -> str:
-    """Write a difference of success, and say that it is clear,
-    or what is excluded where it is not.
+    """Return a difference of success as text that says whether it is clear (`p` is at most 0.05).
+
+    If it is not clear, the text says how large the difference can be by its interval.
     """
     text = shown_change(change)
     if math.isnan(change.low):
@@ -100,10 +99,10 @@ def judged(change: Estimate, p: float) -> str:
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
-    """Return the best condition, and the one that it is held against:
-    the one without V2V, or the worst.
+    """Return the names of the best condition and of its baseline, by the headline metric.
 
-    Empty where there is none.
+    The baseline is the first condition without V2V, else the worst; an empty string where there is
+    none.
     """
     metric = lead_of(run)
     values = {}
@@ -121,9 +120,7 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 
 
 def figures(run: Run) -> list[dict[str, str]]:
-    """Return the few numbers of a run that are read first,
-    each with what it is and its interval.
-    """
+    """Return the key figures of a run, each as text: `what` it is, `value`, `interval` and `n`."""
     best, base = compared(run)
     metric = lead_of(run)
     scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
@@ -143,15 +140,15 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
-    """Say how many times as many layouts the plain figure needs, less than 1 where it is better."""
+    """Return a phrase on what covariate adjustment gains: as good as 1.3 times the layouts."""
     return f"as good as {worth(plain, corrected):.1f} times as many layouts"
 
 
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
-    """Return success corrected by the layouts' difficulty, and what that is as good as.
+    """Return success adjusted for the layouts' difficulty, and a phrase on how much that gains.
 
-    None of fewer layouts than `SHOWN_FROM`, and where the interval holds at every look,
-    which this one does not.
+    None with fewer than `SHOWN_FROM` layouts, and for a run whose intervals are valid at any
+    stopping time, since this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -160,8 +157,9 @@ def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
 
 
 def adjusted_lines(run: Run) -> Iterator[str]:
-    """Yield a line of success corrected by the layouts' difficulty in each condition,
-    and one of balanced success; none where no condition has it.
+    """Yield a line on difficulty-adjusted success, and one on balanced success, by condition.
+
+    It yields none where no condition has an adjusted score.
     """
     for metric, words in IN_WORDS.items():
         cells = []
@@ -174,8 +172,10 @@ def adjusted_lines(run: Run) -> Iterator[str]:
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Return p of each other condition's gain over `base` in the headline metric;
-    of a suite the mean gain's.
+    """Return the p-value of each other condition's gain over `base` in the headline metric.
+
+    For a suite, the gain is the mean over families. They are not corrected for multiplicity; 1
+    where the gain has no interval.
     """
     played = plays(_runs(run), lead_of(run))
     p_values = {}
@@ -187,7 +187,7 @@ def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
 
 
 def p_value(p: float) -> str:
-    """Return what stands behind `p`: `= 0.012`, or `< 0.001`, since no p-value is 0."""
+    """Return a p-value as it follows the letter p: `= 0.012`, or `< 0.001`."""
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
@@ -201,7 +201,10 @@ def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
-    """Return a nested mapping as lines of a table: dotted name and value."""
+    """Return a nested mapping flattened to rows of a table: dotted name and value.
+
+    Items of a list of mappings are numbered from 1; any other list is joined by commas.
+    """
     if isinstance(value, Mapping):
         lines = []
         for key, inner in value.items():

@@ -37,7 +37,11 @@ LOST_BY = ("B", "A", None)
 
 @dataclass(frozen=True)
 class DecisionFlip:
-    """A decision point at which the runs act otherwise."""
+    """Hold a scene in which runs A and B take different actions, with the seeds where they do.
+
+    `lost_by` is the run whose action alone made success impossible; None for neither, both or
+    unknown.
+    """
 
     scene: str  # its id
     episode: int  # its episode's number
@@ -50,7 +54,7 @@ class DecisionFlip:
 
 @dataclass(frozen=True)
 class Difference:
-    """One metric in one condition, in its own unit (shares from 0 to 1)."""
+    """Hold how one metric differs in one condition, in the metric's unit (shares 0 to 1)."""
 
     metric: str  # its name
     # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
@@ -65,13 +69,16 @@ class Difference:
 
     @property
     def primary(self) -> bool:
-        """Whether the metric is one of those that answer for the comparison."""
+        """Return whether the metric is a primary one, corrected for multiple testing."""
         return entry(self.metric).primary
 
 
 @dataclass(frozen=True)
 class Flip:
-    """An episode that succeeds in one run and not in the other."""
+    """Hold an episode that succeeds in one run and fails in the other, and in which seeds.
+
+    `a` and `b` are its outcomes in the two runs: `success`, or the kind of failure.
+    """
 
     episode: int  # its number
     seeds: tuple[int, ...]  # in which it does
@@ -81,7 +88,11 @@ class Flip:
 
 @dataclass(frozen=True)
 class InCondition:
-    """What changed in one condition."""
+    """Hold what differs between two runs in one condition: metrics, episodes and decisions.
+
+    `gained` are episodes that fail in A and succeed in B, `lost` the reverse; `decisions` counts
+    those in both runs, and `flips` are those of them with another action.
+    """
 
     condition: str  # its name
     differences: tuple[Difference, ...]  # metrics that both runs know
@@ -93,7 +104,7 @@ class InCondition:
 
 @dataclass(frozen=True)
 class AnswersFlipped:
-    """Answers to the same requests that were read with another verdict."""
+    """Hold the ids of requests whose answers changed from parse verdict `a` to verdict `b`."""
 
     role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # verdict in A: `strict`, `recovered` or `failed`
@@ -103,7 +114,7 @@ class AnswersFlipped:
 
 @dataclass(frozen=True)
 class AnswerChanged:
-    """Two answers to the same question that say, or were read as, something else."""
+    """Hold two answers to the same prompt and picture that differ in text or parse verdict."""
 
     request: str  # its id
     role: str  # of who answered, as in `AnswersFlipped`
@@ -114,10 +125,10 @@ class AnswerChanged:
 
 @dataclass(frozen=True)
 class AnswersHeld:
-    """The answers of both runs to the same questions, compared.
+    """Hold the comparison of both runs' answers to the same questions.
 
-    The same question is the same messages and the same picture. Under another prompt no question is
-    the same, and a fusion call is another question as soon as one message in it is another.
+    A question is the same if its chat messages and picture are: `same` counts these, `other` the
+    rest, which are not compared. Under another prompt none is the same.
     """
 
     same: int  # how many questions were the same
@@ -126,13 +137,13 @@ class AnswersHeld:
 
     @property
     def verdicts(self) -> int:
-        """How many answers to the same question were read with another verdict."""
+        """Return how many answers to the same question have another parse verdict."""
         return sum(len(set(answer.verdicts)) > 1 for answer in self.changed)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from run A to run B."""
+    """Hold everything that differs between run A and run B, as `compare` finds it."""
 
     pair: Pair  # the two runs
     # that differ: name, A's value, B's, or None
@@ -146,7 +157,7 @@ class Comparison:
 
 
 def compare(pair: Pair) -> Comparison:
-    """Return what changed from A to B: settings, prompts, metrics, episodes and answers."""
+    """Return what differs from run A to B: settings, prompts, metrics, episodes and answers."""
     conditions = [_in_condition(pair, name) for name in pair.conditions]
     answers = _answers_of_both(pair, conditions)
     return Comparison(

@@ -27,7 +27,10 @@ ENDS = ("low", "high")
 
 @dataclass(frozen=True)
 class Gate:
-    """A gate. It fails where the difference B - A, or an end of its interval, is so."""
+    """Hold one test of --fail-if: a comparison fails if B - A satisfies it in some condition.
+
+    `end` chooses the difference itself or an end of its interval, which is compared with `number`.
+    """
 
     text: str  # as it was typed
     condition: str | None  # the only one it looks at; None for all
@@ -39,9 +42,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a gate: the conditions in which it failed,
-    each with the value that failed it.
-    """
+    """Hold the result of a gate: where it failed, as pairs of condition and failing value."""
 
     gate: str
     failed: tuple[tuple[str, float], ...]
@@ -53,17 +54,18 @@ def gate(
     place: str = "CONDITION",
     example: str = "6g:success_rate < -0.01",
 ) -> Gate:
-    """Return a gate from `success_rate < -0.01`,
-    `6g:success_rate < -0.01` or `success_rate.high < 0`.
+    """Parse the text of a gate and return it.
+
+    Examples are `success_rate < -0.01`, `6g:success_rate < -0.01` and `success_rate.high < 0`.
 
     Args:
-        text: as it was typed.
-        names: the metrics there are; without any, those that runs are compared in.
-        place: what stands before the colon, and
-        example: of a gate, both for the error.
+        text: the gate as typed.
+        names: allowed metrics; if empty, those in which runs are compared.
+        place: for the error message, what stands before the colon.
+        example: for the error message, a valid gate.
 
     Raises:
-        UserError: it cannot be read, or names no metric that there is.
+        UserError: the text is no gate, or its metric is unknown.
     """
     match = _GATE.fullmatch(text)
     try:
@@ -92,10 +94,10 @@ def gate(
 
 
 def judge(gate: Gate, comparison: Comparison) -> Verdict:
-    """Hold a gate against a comparison.
+    """Return in which conditions of a comparison a gate fails.
 
     Raises:
-        UserError: its condition is not compared, or the difference is not known there.
+        UserError: the gate's condition is not compared, or the difference is unknown there.
     """
     names = comparison.pair.conditions
     if gate.condition is not None and gate.condition not in names:

@@ -26,8 +26,10 @@ Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 
 
 def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
-    """Return the page; `most` episodes and requests are listed of each kind,
-    with links to the runs' pages.
+    """Return the HTML page of a comparison with its gates' verdicts.
+
+    `most` is how many episodes and requests a list shows; `place` returns the link to a run's page,
+    or None.
     """
     pair = comparison.pair
     sides = {"A": pair.a, "B": pair.b}
@@ -69,10 +71,10 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
 
 
 def beside(out: Path) -> Place:
-    """Return links from a file to the pages in the runs' folders, where there are any.
+    """Return a function that gives the link from the file `out` to a run's report.html, or None.
 
-    A link names no folder of the machine:
-    both lie below the current folder, or the page below the file.
+    It links only where the relative path names no folder outside: both files are below the current
+    folder, or the report is below that of `out`.
     """
     here, folder = Path.cwd(), out.resolve().parent
 

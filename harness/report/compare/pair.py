@@ -46,7 +46,7 @@ SETTINGS = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "ide
 
 
 def where(run: Run) -> str:
-    """Return a run's scenes, for people."""
+    """Return a short description of a run's scenes: dataset and digest, or world and first seed."""
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return f"{world.name} {world.sha256[:12]}"
@@ -55,7 +55,11 @@ def where(run: Run) -> str:
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two runs."""
+    """Hold one of the two compared runs with its settings and its metrics as arrays.
+
+    `values` has each metric for C conditions, S channel seeds and E episodes, (C, S, E); NaN where
+    unknown.
+    """
 
     run: Run  # as it was read
     # those that may make a difference, by dotted name; None is left out
@@ -64,18 +68,18 @@ class Side:
 
     @cached_property
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
-        """How each episode ended, by condition, seed and number."""
+        """Return each episode's record by (condition, seed, episode number)."""
         return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
     @property
     def prompts(self) -> list[dict[str, Any]]:
-        """The prompts of the ego and of the first helper, as the manifest states them."""
+        """Return the manifest's records of the prompts of the ego and of the first helper."""
         return [self.run.manifest.agent(place)["prompt"] for place in (0, 1)]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two runs that can be compared."""
+    """Hold two runs that can be compared, and the conditions, seeds and episodes they share."""
 
     a: Side  # the one that is the base
     b: Side  # the one that is compared with it
@@ -84,7 +88,7 @@ class Pair:
     episodes: tuple[int, ...]  # numbers of the episodes that both have, ascending
 
     def values(self, side: Side, metric: str, condition: str) -> Floats:
-        """Return a metric of the episodes that both have, (E, S)."""
+        """Return a run's metric in the shared episodes and seeds, (E, S); NaN where unknown."""
         grid = side.run.grid
         seeds = [grid.seeds.index(seed) for seed in self.seeds]
         episodes = [grid.episodes.index(episode) for episode in self.episodes]
@@ -93,8 +97,9 @@ class Pair:
 
     @cached_property
     def pool(self) -> Pool | None:
-        """The layouts that both might have come to, and how hard they are;
-        None where there are no more.
+        """Return all layouts that both runs' episodes were sampled from, with their difficulty.
+
+        None if there are no more of them than the shared episodes, or if the runs disagree on them.
         """
         a = {layout.episode: layout for layout in self.a.run.layouts}
         b = {layout.episode: layout for layout in self.b.run.layouts}
@@ -105,8 +110,9 @@ class Pair:
         return Pool.of(layouts, self.episodes) if len(layouts) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
-        """Return the decisions in `episodes` with exactly one optimal action,
-        by their place there.
+        """Return the shared decisions with exactly one optimal action, for calibration metrics.
+
+        `Judged.episode` holds each decision's index in `self.episodes`.
         """
         rows, place = self._rows(side, condition)
         policy = side.run.decisions.of_actions("fused")[rows]
@@ -114,8 +120,9 @@ class Pair:
         return Judged.of(policy, safe == 1.0, place)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
-        """Return for each seed the latencies of its decisions, in ms,
-        with the places of their episodes in `episodes`.
+        """Return the latencies of the shared decisions for each seed, as a pair of arrays (n,).
+
+        The arrays are a decision's index in `episodes` and its latency, ms.
         """
         rows, place = self._rows(side, condition)
         seed = side.run.decisions["seed"][rows]
@@ -135,11 +142,11 @@ class Pair:
 
 @uncollected()
 def pair(a: Path, b: Path) -> Pair:
-    """Read two runs.
+    """Read two run folders and pair them.
 
     Raises:
-        UserError: a folder is no finished run or contradicts itself, or the two have not the same
-            scenes and seeds, or no condition or episode in common.
+        UserError: a folder is no finished run or contradicts itself, or the two runs differ in
+            kind, scenes or seeds, or have no condition or episode in common.
     """
     first, second = read(a), read(b)
     for run in (first, second):

@@ -35,10 +35,10 @@ WHOLE = 10**6  # lists are cut by number, never in the middle of an id
 def terminal(
     comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
 ) -> str:
-    """Write lines of at most `WIDTH` columns;
-    `most` episodes, requests and so on are listed of each kind.
+    """Return a comparison and its gates' verdicts as text of at most `WIDTH` columns.
 
-    Unless `whole`, only those metrics are listed that come first.
+    `most` is how many episodes and requests a list shows; `whole` also shows all exploratory
+    metrics.
     """
     lines = []
     for text in _lines(comparison, verdicts, most, whole):
@@ -114,10 +114,9 @@ def _row(d: Difference) -> str:
 def markdown(
     comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
 ) -> str:
-    """Return the comparison in GitHub's Markdown, in which a run's text is code:
-    no link, no picture, no mention.
+    """Return a comparison in GitHub's Markdown; its arguments are those of `terminal`.
 
-    Its arguments are those of `terminal`.
+    Every text of a run is formatted as code, so that it cannot become a link, picture or mention.
     """
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
@@ -174,7 +173,7 @@ def _table(condition: InCondition, whole: bool) -> list[str]:
 
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
-    """Return the gates as test cases, for what shows JUnit's XML."""
+    """Return the gates' verdicts as test cases in JUnit's XML."""
     pair = comparison.pair
     runs = f"{printable(words.who(pair.b))} against {printable(words.who(pair.a))}"
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
@@ -182,15 +181,16 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
 
 
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
-    """Return the gates as test cases where they cannot be judged,
-    since a model could not be asked.
+    """Return the gates as test cases with an error, in JUnit's XML.
+
+    It is for a comparison that is impossible because a model did not answer; `reason` says so.
     """
     cases = [Case("harness compare", gate, error=reason) for gate in gates]
     return test_suite("harness compare", cases)
 
 
 def code(text: str) -> str:
-    """Return a text as Markdown's code, whatever backticks it has."""
+    """Return a text as an inline code span in Markdown, with a fence longer than its backticks."""
     text = printable(text, WHOLE)
     longest = max((len(ticks) for ticks in re.findall("`+", text)), default=0)
     fence = "`" * (1 + longest)
@@ -199,8 +199,9 @@ def code(text: str) -> str:
 
 
 def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> dict[str, Any]:
-    """Return the comparison as plain values: metrics in their own units, null where there is no
-    number; `most` episodes, requests and so on are listed of each kind.
+    """Return a comparison as plain values for JSON: metrics in their units, unknown numbers null.
+
+    `most` is how many episodes and requests a list shows.
     """
     pair, prompts = comparison.pair, comparison.prompts
     return {
@@ -251,9 +252,7 @@ def _gate(verdict: Verdict) -> dict[str, Any]:
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the answers that changed, each with both verdicts and texts;
-    `most` of them, or all.
-    """
+    """Return the answers that differ, up to `most` or all, as dicts with the keys `ANSWERS`."""
     rows = []
     for answer in held.changed[:most]:
         values = (answer.request, answer.role, *answer.verdicts, answer.a, answer.b)

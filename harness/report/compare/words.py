@@ -38,10 +38,10 @@ EXCERPT = 140  # characters of an answer in a line
 
 @dataclass(frozen=True)
 class Line:
-    """A difference as text: the metric with its unit, both means, B - A, its interval and its p.
+    """Hold one row of a comparison's table as text: metric, means of A and B, B - A, interval, p.
 
-    `verdict` is `better` or `worse` where the corrected p of a primary metric is at most 0.05;
-    `hint` where that of an exploratory one is, uncorrected.
+    `verdict` is `better` or `worse` if the metric is primary and its corrected p is at most 0.05,
+    `hint` if it is exploratory and its uncorrected p is, else empty.
     """
 
     verdict: str
@@ -54,7 +54,7 @@ class Line:
 
 
 def line(d: Difference) -> Line:
-    """Write a difference, with four figures at most; shares in percent."""
+    """Return a difference as text, with four significant figures at most; shares in percent."""
     unit, change = entry(d.metric).unit, d.change
     interval = "–"
     if not math.isnan(change.low):
@@ -72,7 +72,7 @@ def line(d: Difference) -> Line:
 
 
 def verdict(d: Difference) -> str:
-    """Judge a difference that is beyond chance and large enough to be shown; any other is empty."""
+    """Return `better`, `worse` or `hint`, as in `Line`; empty if not significant or tiny."""
     better, p = entry(d.metric).better, d.p_corrected if d.primary else d.p_value
     if p is None or p > LEVEL or not _visible(d):
         return ""
@@ -89,12 +89,10 @@ def _visible(d: Difference) -> bool:
 
 
 def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
-    """Choose what is shown first: the primary metrics,
-    and the exploratory ones that changed most clearly.
+    """Return the primary metrics and the most significant exploratory ones, `SHOWN` in all at most.
 
-    Together they are `SHOWN` at most, and the number of decisions where one of them is over some
-    alone. Those of which one way is better come before all others, and before percentiles, which
-    say again how long a decision takes.
+    Exploratory metrics with a preferred direction come first, percentiles of latency last. If one
+    of them is over decisions with one optimal action alone, the number of these is added.
     """
 
     def order(d: Difference) -> tuple[bool, float]:
@@ -116,13 +114,13 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
 
 def rest(c: InCondition) -> list[Difference]:
-    """Return the differences that are not among the `first`."""
+    """Return the differences that `first` leaves out."""
     primary, striking = first(c)
     return [d for d in c.differences if d not in (*primary, *striking)]
 
 
 def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return how the headline metric changed in each condition: a sentence and its verdict."""
+    """Return for each condition a sentence on the headline metric's change, and its verdict."""
     outcomes = []
     for condition in comparison.conditions:
         differences = {d.metric: d for d in condition.differences}
@@ -143,14 +141,15 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def who(side: Side) -> str:
-    """Return the model, prompt and answer mode of a run."""
+    """Return a run's model, prompt and answer mode as text."""
     variant = side.run.manifest.variant
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
 
 def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
-    """Return `A` and `B`, each with the name of its folder, or its `whole` path, and its model,
-    prompt and answer mode.
+    """Return (`A`, text) and (`B`, text), each with the folder's name and the model.
+
+    `whole` gives the folder's path instead of its name.
     """
     rows = []
     for name, side in (("A", pair.a), ("B", pair.b)):
@@ -160,7 +159,7 @@ def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
 
 
 def paces(pair: Pair) -> list[str]:
-    """Return what prefill and decode take, with the run's letter."""
+    """Return sentences on prefill and decode times (`notes.pace`), each after its run's letter."""
     sentences = []
     for name, side in (("A", pair.a), ("B", pair.b)):
         pace = findings(side.run, Kind.PACE)
@@ -169,9 +168,7 @@ def paces(pair: Pair) -> list[str]:
 
 
 def caveats(pair: Pair) -> list[str]:
-    """Return what must be said of the runs before their numbers,
-    with the run's letter where it is of one.
-    """
+    """Return the warnings about both runs; one of a single run begins with its letter."""
     warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
     return [*(finding.sentence for finding in warnings), *_any_time(pair)]
 
@@ -195,7 +192,7 @@ def _any_time(pair: Pair) -> Iterator[str]:
 
 
 def paired(pair: Pair) -> str:
-    """Return what is paired, and what only one of the runs has."""
+    """Return a phrase on the shared episodes and seeds, and on what only one of the runs has."""
     text = f"{crossed(len(pair.episodes), len(pair.seeds))} of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
@@ -208,13 +205,13 @@ def paired(pair: Pair) -> str:
 
 
 def differing(comparison: Comparison) -> str:
-    """Return what kinds of settings the runs differ in."""
+    """Return a phrase with the kinds of settings in which the runs differ."""
     kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
 def success(c: InCondition, pair: Pair) -> str:
-    """Return how many successes were gained and lost."""
+    """Return a sentence on how many episodes × seeds changed to success, how many to failure."""
     gained = sum(len(flip.seeds) for flip in c.gained)
     lost = sum(len(flip.seeds) for flip in c.lost)
     unit = "episodes × seeds" if len(pair.seeds) > 1 else "episodes"
@@ -222,8 +219,9 @@ def success(c: InCondition, pair: Pair) -> str:
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
-    """Yield how success changed once corrected by the layouts' difficulty,
-    from `SHOWN_FROM` layouts on.
+    """Yield how success changed after adjustment for layout difficulty.
+
+    It yields nothing for fewer than `SHOWN_FROM` layouts.
     """
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
@@ -237,7 +235,7 @@ def adjusted(c: InCondition) -> Iterator[str]:
 
 
 def many(comparison: Comparison) -> str:
-    """Say how many differences were tested, how p counts that, and how many hold."""
+    """Return a sentence on multiple testing: how many differences were tested, how corrected."""
     tested = [d for c in comparison.conditions for d in c.differences if d.p_value is not None]
     if not tested:
         return "no difference has a p: too few episodes, or none of them changed"
@@ -257,9 +255,7 @@ def many(comparison: Comparison) -> str:
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Return what a condition lost and what it gained, where it did:
-    up to so many episodes of each.
-    """
+    """Return (`lost`, text) and (`gained`, text) with up to `most` episodes each, if any."""
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
@@ -274,7 +270,7 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
 
 
 def decisions(c: InCondition, pair: Pair) -> str:
-    """Return how many decisions flipped, and in how many one run alone gave success away."""
+    """Return a sentence on how many decisions differ, and how many made success impossible."""
     count = dict.fromkeys(LOST_BY, 0)
     for flip in c.flips:
         count[flip.lost_by] += len(flip.seeds)
@@ -285,8 +281,9 @@ def decisions(c: InCondition, pair: Pair) -> str:
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Return the decisions that flipped and gave success away in one run alone:
-    up to so many of each run.
+    """Return the differing decisions that made success impossible in one run alone.
+
+    An item is a phrase that names the run and a text with up to `most` decisions.
     """
     rows = []
     for run in ("B", "A"):
@@ -298,7 +295,7 @@ def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 
 def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
-    """Return a decision point and what both did there; seeds where it is not all of them."""
+    """Return a scene's id with both runs' actions, and the seeds if it is not all of them."""
     return f"{flip.scene} {flip.a} → {flip.b}{_seeds(flip.seeds, pair)}"
 
 
@@ -307,8 +304,9 @@ def _seeds(seeds: Sequence[int], pair: Pair) -> str:
 
 
 def prompts(comparison: Comparison, most: int = HUNKS) -> list[str]:
-    """Return what differs between the texts, up to so many changes;
-    none where the prompts are the same.
+    """Return lines on how the prompts' texts and settings differ, with up to `most` changes.
+
+    Empty if the prompts are the same.
     """
     change = comparison.prompts
     if change is None or isinstance(change, str):
@@ -350,7 +348,7 @@ def _where_all_are(pair: Pair) -> str:
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
-    """Return how many answers of a role changed their verdict, and up to so many of them."""
+    """Return for each change of parse verdict a phrase with its count and a list of requests."""
     rows = []
     for flipped in comparison.answers:
         n, of = len(flipped.requests), comparison.answers_in_both[flipped.role]
@@ -360,7 +358,7 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
 
 
 def answers_held(held: AnswersHeld) -> str:
-    """Return how many answers to the same questions changed, and what could not be compared."""
+    """Return a phrase on how many answers to the same questions changed."""
     if not (held.same or held.other):
         return "the runs have no question in common"
     if not held.same:
@@ -377,7 +375,7 @@ def answers_held(held: AnswersHeld) -> str:
 
 
 def first_changed(changed: AnswerChanged) -> list[str]:
-    """Return an answer that changed, and the text of both from a little before they part."""
+    """Return lines on a changed answer: its request and both texts from where they differ."""
     start = max(_alike(changed.a, changed.b) - BEFORE, 0) if changed.a != changed.b else 0
     lines = [f"first: {changed.request}, {role_word(changed.role)}"]
     answers = zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)
@@ -388,8 +386,9 @@ def first_changed(changed: AnswerChanged) -> list[str]:
 
 
 def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
-    """Return A's answer and B's: letter of the run, verdict, and the text before,
-    in and after its change.
+    """Return a row for A and for B: letter, verdict, and the answer's text in three parts.
+
+    The parts are the text before, in and after the passage that differs.
     """
     a, b = changed.a, changed.b
     start = _alike(a, b)
@@ -413,7 +412,7 @@ def _listed(some: Sequence[str], n: int, most: int) -> str:
 
 
 def settings(comparison: Comparison) -> list[str]:
-    """Return each setting in which the runs differ, with both values."""
+    """Return a text for each setting that differs, with its value in A and B."""
 
     def shown(value: str | None) -> str:
         return "none" if value is None else printable(value, 60)
@@ -422,7 +421,10 @@ def settings(comparison: Comparison) -> list[str]:
 
 
 def judged(verdict: Verdict, sign: str = "+") -> str:
-    """Say whether a gate held; `sign` is the format's, of values that are no differences `-`."""
+    """Return a sentence on whether a gate passed or failed, and where.
+
+    `sign` is the sign option of the format of values: `+` for differences, `-` for plain values.
+    """
     gate = printable(verdict.gate)
     if not verdict.failed:
         return f"passed: {gate}"

@@ -35,7 +35,7 @@ HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
 
 
 def roads(scenario: Scenario) -> Iterator[Artist]:
-    """Yield roads with their lane marks."""
+    """Yield the artists of a scenario's roads: surface, lane marks and stop lines."""
     surface = ground_of(scenario)
     yield PathPatch(
         _closed(surface.outlines), facecolor=LIGHT["road"], edgecolor=LIGHT["kerb"], linewidth=0.8
@@ -45,23 +45,21 @@ def roads(scenario: Scenario) -> Iterator[Artist]:
 
 
 def shade(state: WorldState, eye: VehicleState) -> Artist:
-    """Return all that walls and vehicles hide from one."""
+    """Return the artist of the area that walls and other vehicles hide from the vehicle `eye`."""
     return PathPatch(
         _closed(shadows(state, eye, FAR_M)), facecolor=LIGHT["shade"], edgecolor="none", alpha=0.22
     )
 
 
 def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
-    """Yield buildings; of those that overlap the outline of the whole."""
+    """Yield the artists of buildings; overlapping ones have one common outline."""
     outlines = _closed([north_up(building.corners()) for building in buildings])
     yield PathPatch(outlines, facecolor="none", edgecolor=LIGHT["wall"], linewidth=1.6)
     yield PathPatch(outlines, facecolor=LIGHT["building"], edgecolor="none")
 
 
 def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
-    """Return a vehicle as one of `LOOKS`:
-    red after a crash, and of a hidden one only a dashed line.
-    """
+    """Return a vehicle's artist in the style `LOOKS[look]`: red if crashed, dashed if hidden."""
     style = dict(LOOKS[look])
     if hidden:
         edge = ROLES["danger"] if look == "danger" else style["edgecolor"]
@@ -72,7 +70,10 @@ def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
 
 
 def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) -> Artist:
-    """Return lines from a viewer to those of whom it sees that are still there."""
+    """Return the artist of lines from a viewer to the vehicles whose ids are in `seen`.
+
+    `look` is passed to `LineCollection`; vehicles no longer there are left out.
+    """
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
     there = [place for name, place in at.items() if name in seen and viewer in at]
     return LineCollection([np.array([at[viewer], place]) for place in there], **look)
@@ -81,8 +82,9 @@ def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) ->
 def named(
     buildings: Iterable[Building], view: View, tall_m: float
 ) -> Iterator[tuple[str, float, float]]:
-    """Yield the name of each building with room for one,
-    and the north-west corner of what is in view of it, m to the east and north.
+    """Yield name, x and y of each building's label, where the building is larger than `tall_m`.
+
+    x and y are the north-west corner of its part in view, m to the east and to the north.
     """
     for building in buildings:
         corners = north_up(building.corners())
@@ -92,7 +94,7 @@ def named(
 
 
 def scale_m(view: View) -> int:
-    """Return the length of the bar that tells a picture's scale."""
+    """Return the length of a picture's scale bar, m."""
     return 20 if view.width_m > 100 else 10
 
 

@@ -52,9 +52,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each operating point:
-    the paper's have their own, a change of one has another.
-    """
+    """Return a colour for each condition: the paper's operating points keep their own."""
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
         free = [
@@ -67,14 +65,14 @@ def conditions(names: Iterable[str]) -> dict[str, str]:
 
 
 def actions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each action, in the scenario's order, from slow to fast."""
+    """Return a colour for each action; the names are in order from slow to fast."""
     every = list(names)
     last = max(len(every) - 1, 1)
     return {name: _SLOW_TO_FAST[round(4 * n / last)] for n, name in enumerate(every)}
 
 
 def variables() -> str:
-    """Return the palette as properties of CSS: `--paper`, `--ego-fill` and so on."""
+    """Return the palette as CSS custom properties, such as `--paper` and `--ego-fill`."""
     fills = [f"--{name}-fill: {colour};" for name, colour in (OUTCOMES | ROLES).items()]
     pairs = [
         f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in (PAGE | SCENE).items()

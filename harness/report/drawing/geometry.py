@@ -24,14 +24,14 @@ NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
-    """Return points (..., 2) m of `harness.world.road`'s frame with y to the north."""
+    """Return points (..., 2), m, of the frame of `harness.world.road` with y to the north."""
     return points * [1.0, -1.0]
 
 
 def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict], Floats]:
-    """Return the conflicts of a viewer's graph, and where they are, (n, 2) m to the east and north.
+    """Return the conflicts in a viewer's scene graph and their places (n, 2), m east and north.
 
-    Not of who is ahead or behind: there the other vehicle itself is the place.
+    Conflicts with vehicles ahead or behind are left out, since these have no fixed place.
     """
     eye = state.vehicle(graph.viewer)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
@@ -42,23 +42,21 @@ def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict
 
 
 def ground_of(scenario: Scenario) -> Ground:
-    """Return what is drawn of a scenario's road, to beyond the edge."""
+    """Return the road surface to draw, up to `BEYOND_M` outside the largest view."""
     return scenario.road().ground_within(VIEW_M + BEYOND_M)
 
 
 def shape_of(scenario: Scenario) -> float:
-    """Return height by width of a picture of a scenario's road:
-    one from west to east needs no square.
-    """
+    """Return height by width of a scenario's picture: 1, or less for a west-east road."""
     outlines = scenario.road().ground_within(VIEW_M).outlines
     return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
 
 
 def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
-    """Return what lies behind walls and vehicles as seen from the middle of one:
-    quadrangles (n, 4, 2) up to far_m.
+    """Return the areas hidden behind buildings and vehicles from the middle of the vehicle `eye`.
 
-    All go round the same way, so that together they are one shape by the nonzero rule.
+    They are quadrangles (n, 4, 2), m east and north, that end `far_m` from the eye. All have the
+    same orientation, so that the nonzero fill rule unites them.
     """
     shapes = [b.corners() for b in state.buildings]
     shapes += [v.corners() for v in state.vehicles if v.id != eye.id]
@@ -75,7 +73,7 @@ def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class View:
-    """A rectangle, m to the east and to the north."""
+    """Hold the rectangle of the world that a picture shows, m to the east and to the north."""
 
     west_m: float
     south_m: float
@@ -84,17 +82,17 @@ class View:
 
     @property
     def edges(self) -> Floats:
-        """Its south-west and its north-east corner (2, 2)."""
+        """Return the south-west and the north-east corner, (2, 2), m."""
         start = np.array([self.west_m, self.south_m])
         return np.array([start, start + np.array([self.width_m, self.height_m])])
 
     @property
     def scale(self) -> float:
-        """How much is seen of the world, of all of it 1."""
+        """Return the view's width as a fraction of the largest view's, 2 `VIEW_M`."""
         return self.width_m / (2 * VIEW_M)
 
     def holds(self, points: Floats, margin_m: float = 0.0) -> bool:
-        """Return whether points (..., 2) are in it, and so far from its edge."""
+        """Return whether all points (..., 2), m, are in the view, and `margin_m` from its edge."""
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))
 
@@ -106,15 +104,16 @@ def spots(
     who: Collection[str | None],
     crossed: tuple[list[Conflict], Floats] | None = None,
 ) -> Floats:
-    """Return what a picture holds, (n, 2) m to the east and north, the ego first.
+    """Return the points that a picture must show, (n, 2), m east and north.
+
+    The first is the ego; points farther than `NEAR_M` from it are left out.
 
     Args:
-        state: who is where.
-        zone_m: where paths cross, in the frame of `harness.world.road`.
-        graph: of the vehicle whose sight is shown, for the conflicts that it sees;
-            None for no more of them.
-        who: ids of whom else it holds: the danger and the helpers that were asked.
-        crossed: the `conflict_points` of the graph, where they are known.
+        state: the vehicles' positions.
+        zone_m: the point where paths cross, in the frame of `harness.world.road`.
+        graph: scene graph of the viewer, whose conflicts are added; None for none.
+        who: ids of other vehicles to show: the dangerous one and helpers; None is ignored.
+        crossed: the result of `conflict_points` for the graph, if known.
     """
     conflicts, crossings = crossed or (
         conflict_points(state, graph) if graph else ([], np.empty((0, 2)))
@@ -128,10 +127,9 @@ def spots(
 
 
 def view_of(held: Floats, shape: float = 1.0) -> View:
-    """Return what holds spots (n, 2) with a margin,
-    in the middle of it if the world goes on that far.
+    """Return the view around points (n, 2), m, with a margin.
 
-    Its height is `shape` times its width.
+    It is centred on them as far as the world's edge allows; its height is `shape` times its width.
     """
     (west, south), (east, north) = held.min(axis=0).tolist(), held.max(axis=0).tolist()
     width = max(LEAST_M, east - west + 2 * MARGIN_M, (north - south + 2 * MARGIN_M) / shape)

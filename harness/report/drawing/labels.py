@@ -17,7 +17,10 @@ NOWHERE = np.zeros(2)
 
 
 def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
-    """Return how many boxes (2, 2) a label of half that size would cover at each spot (n, 2)."""
+    """Return for each centre (n, 2), m, how many boxes a label there would overlap, (n,).
+
+    `half` is half the label's width and height (2,); a box is its two opposite corners (2, 2).
+    """
     if not boxes:
         return np.zeros(len(spots))
     low, high = np.swapaxes(np.array(boxes), 0, 1)
@@ -27,14 +30,17 @@ def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
 
 
 def cut(spots: Floats, half: Floats, view: View) -> Floats:
-    """Return how far a label at each spot (n, 2) would stick out of the view, m."""
+    """Return how far a label at each centre (n, 2) would stick out of the view, (n,), m.
+
+    `half` is half the label's width and height, (2,).
+    """
     low, high = view.edges
     out: Floats = np.maximum(low - (spots - half), spots + half - high).max(axis=1).clip(0.0)
     return out
 
 
 def crossed(at: Floats, ends: Floats, lines: Sequence[Floats]) -> Floats:
-    """Return how many lines (2, 2) a line from (2,) to each end (n, 2) would cross."""
+    """Return how many of the lines (2, 2) a line from `at` (2,) to each end (n, 2) crosses."""
     if not lines:
         return np.zeros(len(ends))
     a, b = np.swapaxes(np.array(lines), 0, 1)
@@ -51,13 +57,13 @@ def crossed(at: Floats, ends: Floats, lines: Sequence[Floats]) -> Floats:
 
 
 class Labels:
-    """Labels of one picture, collected first and placed together.
+    """Collect the labels of one picture and place them together, so that they cover nothing.
 
     Attributes:
-        axes: where they go; its data are metres.
-        pt_per_m: scale of the picture.
+        axes: the axes to draw on; data coordinates are metres.
+        pt_per_m: points on paper for a metre.
         size_pt: font size.
-        view: labels stay within it.
+        view: the rectangle that labels stay within.
     """
 
     def __init__(self, axes: Axes, pt_per_m: float, size_pt: float, view: View) -> None:
@@ -68,17 +74,15 @@ class Labels:
         self._waiting: list[tuple[Floats, float, str, bool, str, Floats]] = []
 
     def block(self, points: Floats) -> None:
-        """Keep labels off the box around points (n, 2) m."""
+        """Forbid labels in the bounding box of points (n, 2), m."""
         self._taken.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def discourage(self, points: Floats) -> None:
-        """Keep labels off the box around points (n, 2) m unless they would have to go far."""
+        """Keep labels off the bounding box of points (n, 2), m, if there is free space nearby."""
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def free(self, boxes: Sequence[Floats]) -> Floats:
-        """Return the first of some boxes (2, 2) that covers nothing so far, else the first;
-        labels keep off it.
-        """
+        """Return the box (2, 2) that covers the least so far, the first of equals, and block it."""
         half = (boxes[0][1] - boxes[0][0]) / 2
         taken = covered(np.array([box.mean(axis=0) for box in boxes]), half, self._taken)
         self.block(boxes[int(taken.argmin())])
@@ -93,15 +97,14 @@ class Labels:
         colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
-        """Add a label for what lies at (2,) m and reaches radius_m,
-        best on the side `toward` (2,) points to.
+        """Add a label for an object at `at` (2,) with radius `radius_m`, both m.
+
+        `toward` (2,) is the preferred direction from the object to the label; zero for none.
         """
         self._waiting.append((at, radius_m, text, bold, colour, toward))
 
     def place(self) -> None:
-        """Put every label at the nearest free place,
-        with a line to what it names if that is far.
-        """
+        """Draw every label at the nearest free place; a distant one has a line to its object."""
         for at, radius_m, text, bold, colour, toward in self._waiting:
             half = self._half_size(text, bold)
             gaps = radius_m + self.view.scale * (np.array(DISTANCES_M) - 1)

@@ -42,16 +42,16 @@ styled = matplotlib.rc_context(STYLE)  # decorator: what is drawn inside has the
 
 @styled
 def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -> None:
-    """Write a figure; the same figure gives the same bytes.
+    """Write a figure to a file or stream; the same figure gives the same bytes.
 
     Args:
-        figure: what was drawn under `styled`.
-        out: file to replace, or a binary stream.
-        format: `svg` and `pdf` keep text as text; `png`.
+        figure: a figure drawn in a function decorated by `styled`.
+        out: the file to replace, or a binary stream.
+        format: `svg`, `pdf` (both keep text as text) or `png`.
         dpi: pixels an inch of a PNG.
 
     Raises:
-        UserError: unknown format.
+        UserError: the format is unknown.
     """
     if format not in FORMATS:
         raise unknown("picture format", format, FORMATS)
@@ -79,9 +79,9 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
 
 
 def lay_out(figure: Figure) -> None:
-    """Lay a figure out once, and not again for every format: it is half of the work.
+    """Run a figure's layout engine once and switch it off, since it takes half of the drawing time.
 
-    A figure that something sticks out of, such as a long name in its legend, grows.
+    A figure grows if something, such as a long legend entry, sticks out of it.
     """
     layout = figure.get_layout_engine()
     if layout is None:

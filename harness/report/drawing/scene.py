@@ -46,12 +46,12 @@ NAMES = {"ego": "ego", "helper": "helper", "danger": "dangerous vehicle", "other
 
 @styled
 def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None = None) -> None:
-    """Draw a scene and what one of its viewers sees.
+    """Draw a scene from above and what one of its viewers sees.
 
     Args:
-        scene: the decision point.
-        out: file to replace, or a binary stream.
-        format: `svg` or `png`.
+        scene: the scene, one decision point.
+        out: the file to replace, or a binary stream.
+        format: `svg`, `pdf` or `png`.
         viewer: id of the ego or of a helper; None for the ego.
 
     Raises:
