@@ -17,7 +17,10 @@ MARKS = f"{ASKED}{REWRITTEN}/+"  # in keys, beside who answered
 
 @dataclass(frozen=True)
 class Answered:
-    """What the questions of a run came to that got an answer."""
+    """Hold a run's number of answers by role, parse failures by role and status, and ego's intents.
+
+    `ego` has the parsed distributions over A actions, (n, A).
+    """
 
     count: Counter[str]  # how many answers there are, by role
     failed: Mapping[str, Counter[str]]  # how many could not be read, by role and status
@@ -25,13 +28,12 @@ class Answered:
 
 
 class Answers:
-    """Answers in the order of their file, which are decoded each time they are read.
+    """Hold the answers of a run in the order of their file, decoded anew at each access.
 
-    So a run of a million decisions takes the memory of its file,
-    a tenth of what its answers would take.
+    So they take the memory of the file only, a tenth of what decoded answers would.
 
     Attributes:
-        by_scene: the answers of each decision point.
+        by_scene: the answers of each scene (decision point), by its id.
     """
 
     def __init__(self, lines: bytes, actions: int) -> None:
@@ -84,7 +86,7 @@ class Answers:
             yield from self._span(place)
 
     def counted(self) -> Answered:
-        """Go through the answers once, and return what they came to."""
+        """Read all answers once, and return their counts and the ego's distributions."""
         count, failed, ego = Counter[str](), dict[str, Counter[str]](), list[tuple[float, ...]]()
         for answer in self:
             if answer.error is not None:

@@ -40,7 +40,7 @@ CLOSE = 1e-6  # how near numbers stay that were only written and read again
 
 
 def refuse(run: Run | SuiteRun) -> None:
-    """Raise UserError if a table of a run or suite contradicts those that it follows from."""
+    """Raise UserError if a table of a run or suite contradicts the tables it is computed from."""
     if isinstance(run, SuiteRun):
         for member in run.runs.values():
             refuse(member)
@@ -55,9 +55,10 @@ def refuse(run: Run | SuiteRun) -> None:
 
 
 def contradictions(run: Run) -> Iterator[str]:
-    """Yield, in words, what the tables of a run say otherwise than those that they follow from.
+    """Yield a sentence for each statement of a run's tables that its other tables contradict.
 
-    A run by older rules is held against these, and may lack figures that are younger.
+    Scores are computed again by the version of the rules that the run states; a run of an older
+    version may lack figures that came later.
     """
     version = run.manifest.versions.get("figures", "1")
     if version not in map(str, range(1, FIGURES + 1)):
@@ -77,9 +78,9 @@ def contradictions(run: Run) -> Iterator[str]:
 
 
 def of_suite(suite: SuiteRun) -> Iterator[str]:
-    """Yield, in words, which means of a suite's own table are others than its runs' figures make.
+    """Yield a sentence for each mean of a suite's table that its runs' scores contradict.
 
-    Intervals are held only where all runs are by the rules of this version.
+    Intervals are compared only if all runs have figures of this version.
     """
     scenes = [run.manifest.world.pinned for run in suite.runs.values()]
     if any(scenes.count(each) > 1 for each in scenes):
@@ -116,7 +117,7 @@ def _scores(run: Run) -> Iterator[Score]:
 
 
 def current(run: Run) -> bool:
-    """Return whether a run says that its figures are by the rules of this version."""
+    """Return whether a run's manifest states that its figures have this harness's version."""
     return run.manifest.versions.get("figures", "1") == str(FIGURES)
 
 
@@ -151,9 +152,7 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
 
 
 def unchecked(run: Run) -> Iterator[str]:
-    """Yield, in sentences, which figures of a run are held against nothing,
-    and which it may lack.
-    """
+    """Yield sentences on a run's figures that cannot be checked, and on those it may lack."""
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
     held = {key for key in figures if key[1] in METRICS.own and (current(run) or key in here)}
@@ -229,9 +228,7 @@ def _of_episodes(run: Run) -> Iterator[str]:
 
 
 def differing(stated: Sequence[Episode], computed: Sequence[Episode]) -> Iterator[tuple[str, int]]:
-    """Yield the columns in which the rows of two tables of the same episodes differ,
-    and in how many.
-    """
+    """Yield the columns in which two tables of the same episodes differ, and in how many rows."""
     for name in Episode.__struct_fields__:
         pairs = zip(stated, computed, strict=True)
         wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
@@ -257,7 +254,7 @@ def _ends(run: Run) -> Sequence[bool | None]:
 
 
 def close(a: object, b: object) -> bool:
-    """Return whether two values are the same, numbers up to how they are written."""
+    """Return whether two values are equal, numbers up to the rounding of files."""
     if isinstance(a, float) and isinstance(b, float):
         return math.isclose(a, b, rel_tol=CLOSE, abs_tol=CLOSE)
     return a == b

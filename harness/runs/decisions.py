@@ -126,7 +126,10 @@ ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
-    """Return the names and types of the columns, in the order of the file."""
+    """Return the Arrow schema of decisions: names and types of the columns, in order.
+
+    `helpers` is the greatest number of messages in a decision.
+    """
     columns = list(COLUMNS.items())
     for name, kind in OF_ACTIONS.items():
         columns += [(f"{name}_{action}", kind) for action in actions]
@@ -136,18 +139,18 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
-    """Return values (n, A) as one column for each action."""
+    """Return values (n, A) as columns by name: one for each action, such as `fused_IDLE`."""
     return {f"{name}_{action}": values[:, place] for place, action in enumerate(actions)}
 
 
 def by_message(name: str, values: Any) -> dict[str, Any]:
-    """Return values (n, H) as one column for each message."""
+    """Return values (n, H) as columns by name: one for each message, such as `delivered_1`."""
     return {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Names (n,) in a compact form: `names[code]`; a negative code is no name."""
+    """Hold names (n,) in a compact form, `names[code]`; a negative code stands for no name."""
 
     codes: Ints
     names: Sequence[str]
@@ -155,7 +158,9 @@ class Labels:
 
 @dataclass(frozen=True)
 class Decisions:
-    """Decisions as columns (n,)."""
+    """Hold decisions as the columns (n,) of an Arrow table: one row for each decision point,
+    condition and seed.
+    """
 
     table: pa.Table  # the columns of `schema`
     actions: tuple[str, ...]  # the meta-actions, in the order of every distribution
@@ -165,9 +170,7 @@ class Decisions:
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
-        """Make decisions from arrays and `Labels` (n,) by name;
-        a column that is not given is unknown.
-        """
+        """Build decisions from arrays and `Labels` (n,) by column; missing columns are unknown."""
         n = len(columns["seed"])
         fields = schema(actions, helpers)
         arrays = {
@@ -178,7 +181,7 @@ class Decisions:
 
     @classmethod
     def concat(cls, parts: Sequence["Decisions"]) -> "Decisions":
-        """Concatenate decisions that have the same actions."""
+        """Concatenate tables of decisions that have the same actions."""
         actions, helpers = parts[0].actions, max(part.helpers for part in parts)
         tables = pa.concat_tables([part.table for part in parts], promote_options="default")
         return cls(
@@ -195,15 +198,15 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Return a column of whole numbers (n,)."""
+        """Return a column of whole numbers, (n,)."""
         return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
-        """Return whether a flag is known and true, (n,)."""
+        """Return a mask (n,) of the rows in which a flag is known and true."""
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
-        """Return the columns of a distribution, or of the outcome of each action, (n, A)."""
+        """Return the columns of a value that each action has, such as `fused` or `safe`, (n, A)."""
         key = f"{name} of actions"
         if key not in self._arrays:
             columns = [self[f"{name}_{action}"] for action in self.actions]
@@ -211,15 +214,17 @@ class Decisions:
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
-        """Return the columns of numbers or flags of messages, (n, H);
-        NaN where nobody was asked.
+        """Return the columns of a value that each message has, such as `on_time`, (n, H).
+
+        NaN where no helper was asked.
         """
         columns = [self[f"{name}_{place}"] for place in range(1, self.helpers + 1)]
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Return each label's index in `names`, (n,); -1 without a label.
-        Raises ValueError for any other.
+        """Return the index in `names` of each row's label, (n,); -1 where it has none.
+
+        Raises ValueError for a label that is not in `names`.
         """
         column = self.table[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}
@@ -230,12 +235,15 @@ class Decisions:
         return cast(Ints, lookup[_values(column.indices, len(labels), np.int32)])
 
     def labels(self, name: str) -> list[str | None]:
-        """Return a column of labels (n,)."""
+        """Return a column of labels as a list of n texts; None where unknown."""
         return cast("list[str | None]", self.table[name].to_pylist())
 
     @cached_property
     def scenes(self) -> dict[str, range]:
-        """The rows of each decision point, in order. Raises ValueError if they are not adjacent."""
+        """Return the range of rows of each scene (decision point), by id, in order.
+
+        Raises ValueError if the rows of a scene are not adjacent.
+        """
         if not len(self):
             return {}
         codes = self.table["scene"].combine_chunks()
@@ -258,7 +266,7 @@ class Decisions:
         return Decisions(self.table.select(names), self.actions, self.helpers)
 
     def row(self, index: int) -> Mapping[str, Any]:
-        """Return a decision by column, None where unknown; rows are fastest in order."""
+        """Return one row as values by column, None where unknown; reading in order is fastest."""
         chunk, offset = divmod(index, ROWS)
         if chunk not in self._rows:  # only the last is kept, since rows are read in order
             self._rows.clear()
@@ -277,7 +285,7 @@ class Decisions:
         return Decision(**{**plain, "fused": fused, "messages": tuple(messages)})
 
     def infinite(self) -> str | None:
-        """Return the name of a column with an infinite number, or None."""
+        """Return the name of a column that has an infinite number; None if there is none."""
         for column in self.table.schema:
             if (
                 column.type == NUMBER
@@ -309,9 +317,7 @@ class Decisions:
         )
 
     def write(self, path: Path) -> None:
-        """Write a Parquet file. Equal rows give equal bytes:
-        names are numbered in the order of the rows.
-        """
+        """Write a Parquet file; equal rows give equal bytes."""
         with replacing(path) as part:
             self._write(part)
 
@@ -326,11 +332,10 @@ class Decisions:
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
-        """Read a Parquet file.
+        """Read decisions from a Parquet file.
 
-        Raises OSError or ValueError if it is none, lacks a run's columns, or has more than `most`
-        rows or more bytes than its rows can need: a file of a few bytes may hold a thousand million
-        rows.
+        Raises OSError or ValueError if it is none, lacks a column, or has more than `most` rows or
+        more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
         """
         with arrow_file(path) as file:  # read_table would make columns of folder names
             source = pq.ParquetFile(file)
@@ -365,7 +370,7 @@ class Decisions:
         )
 
     def frame(self) -> "pd.DataFrame":
-        """Return a pandas table: names are categories, and flags may be unknown."""
+        """Return a pandas table, in which names are categories and flags may be unknown."""
         import pandas as pd
 
         return cast(
@@ -375,13 +380,16 @@ class Decisions:
 
 @dataclass(frozen=True)
 class DecisionFiles:
-    """Decisions in Parquet files, in order, which need not all fit into memory."""
+    """Hold decisions as Parquet files in order, which need not all fit into memory."""
 
     files: Sequence[Path]  # what `Decisions.write` wrote
     actions: tuple[str, ...]  # the meta-actions of all of them
 
     def write(self, path: Path) -> None:
-        """Write one Parquet file. Raises what `Decisions.read` raises."""
+        """Write the decisions of all files to one Parquet file.
+
+        Raises OSError or ValueError if a file is broken, as `Decisions.read`.
+        """
         columns = [set(pq.read_schema(arrow_file(file)).names) for file in self.files]
         helpers = max(_helpers(names) for names in columns)
         unknown = set(OPTIONAL).difference(*columns)
@@ -438,7 +446,7 @@ def _row_group(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def arrow_file(path: Path) -> pa.BufferReader:
-    """Open a file for Arrow, which gets its content in memory of its own.
+    """Return a file's content for Arrow, in memory that Arrow owns.
 
     Arrow's threads let go of a file after the call that read it. Of an object of Python, bytes as
     well, they need the interpreter for that, and abort the process if it has begun to end.

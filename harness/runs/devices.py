@@ -27,9 +27,7 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
 
 
 class Speed(Struct, frozen=True):
-    """How fast a computer answers one request with a model, and the energy of a token;
-    None if unknown.
-    """
+    """Hold how fast a computer answers one request with a model, and the energy for each token."""
 
     model: str  # the model of the row in the device profile
     prefill_tokens_per_s: Rate | None  # prompt tokens read in a second
@@ -41,7 +39,7 @@ class Speed(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """A number of a device profile, and where it comes from."""
+    """Hold a number of a device profile, whether it is measured or modelled, and its source."""
 
     value: Annotated[float, between(1e-9, 1e9)]
     status: Status
@@ -49,7 +47,7 @@ class Constant(Struct, frozen=True):
 
 
 class DeviceRow(Struct, frozen=True, kw_only=True):
-    """The rates of a device with one model; None where no source states them."""
+    """Hold the speed, energy and memory of a device with one model; None where unknown."""
 
     model: str  # the model's name; that of a card, if there is one
     # billions of weights
@@ -69,7 +67,7 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
 
 class Device(Struct, frozen=True, kw_only=True):
-    """A file of `devices/`: a computer that vehicles may have."""
+    """Hold a device profile, a file of `devices/`: an on-board computer, a row for each model."""
 
     name: str  # the file's name
     description: str  # one sentence for lists
@@ -111,7 +109,7 @@ def names() -> list[str]:
 
 
 def load(name: str) -> Device:
-    """Load a profile by name. Raises UserError if there is none, or its file has a mistake."""
+    """Return a device profile by name. Raises UserError if there is none, or its file is wrong."""
     if name not in names():
         raise unknown("device profile", name, names())
     path = resources.find("devices", f"{name}.toml")
@@ -134,10 +132,10 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 
 
 def find_row(device: Device, model: str) -> DeviceRow:
-    """Return the row of a model: its own, or the nearest one scaled if the profile allows scaling.
+    """Return a device profile's row for a model, scaled from the nearest one if there is none.
 
-    A model is the name of a row, of a card, or a size such as `3b`, in billions of weights.
-    Raises UserError if the profile has no row for it.
+    `model` is the name of a row or card, or a size such as `3b`, in billions of weights, which is
+    scaled if the profile allows it. Raises UserError if the profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:
@@ -171,8 +169,9 @@ def _scaled(device: Device, billions: float) -> DeviceRow:
 
 
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
-    """Yield the rates and joules of a row by name;
-    joules that it lacks are derived from `load_watts`.
+    """Yield name and value of a row's tokens a second and joules a token; None if unknown.
+
+    Joules that the row lacks are `load_watts` divided by the rate.
     """
     for name in RATES:
         yield name, getattr(row, name)
@@ -186,15 +185,16 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 
 
 def speed(device: Device, row: DeviceRow) -> Speed:
-    """Return the rates and joules of a row as plain numbers."""
+    """Return a row's tokens a second and joules a token as plain numbers."""
     answer_s = row.answer_ms.value / 1000 if row.answer_ms else None
     known = {name: c.value if c else None for name, c in constants(device, row)}
     return Speed(row.model, **known, answer_s=answer_s)
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the seconds of one answer: prompt and output tokens, each over its rate;
-    NaN if unknown.
+    """Return the seconds of one answer: prompt and output tokens, each divided by its rate.
+
+    A model with a fixed answer time has that; NaN if unknown.
     """
     if speed.answer_s is not None:
         return speed.answer_s
@@ -203,9 +203,7 @@ def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
 
 
 def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the joules of one answer, with those of the idle device in that time;
-    NaN if unknown.
-    """
+    """Return the joules of one answer by its tokens, with idle power included; NaN if unknown."""
     per_token = _or_nan(speed.joules_per_prompt_token), _or_nan(speed.joules_per_output_token)
     return prompt_tokens * per_token[0] + output_tokens * per_token[1]
 

@@ -23,7 +23,7 @@ REFERENCES = ("local-view", "cruise", "uniform")  # that ask no model
 
 
 class Layout(Struct, frozen=True):
-    """How well the references do in a layout: a line of `difficulty.csv`."""
+    """Hold the success of three reference policies in one layout: a line of `difficulty.csv`."""
 
     episode: int  # the episode's number
     danger: str  # where the hidden danger comes from; `none` without one
@@ -38,7 +38,11 @@ class Layout(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Pool:
-    """The layouts that those of a run, or of two, are a random part of."""
+    """Hold all N layouts that a run's E layouts are a random sample of, with their difficulty.
+
+    `known` is the success of K reference policies (N, K), the covariates of the adjustment;
+    `dangerous` is a mask (N,), and `answered` the indices of the sample (E,).
+    """
 
     known: Floats  # how well the references do in each, (N, K)
     dangerous: Bools  # whether each has a danger, (N,)
@@ -46,7 +50,7 @@ class Pool:
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], episodes: Iterable[int]) -> "Pool":
-        """Return that of some episodes, which are among the layouts."""
+        """Return the pool of all these layouts; `episodes` are the numbers of the sampled ones."""
         places = {layout.episode: place for place, layout in enumerate(layouts)}
         return cls(
             np.array([(each.local_view, each.cruise, each.uniform) for each in layouts]),
@@ -57,8 +61,10 @@ class Pool:
     def difference(
         self, success: Success, a: Floats, b: Floats, level: float = LEVEL
     ) -> Estimate | None:
-        """Return success a - b, both (S, E), paired by episode and corrected;
-        None if it cannot be.
+        """Return the difference in success a - b, both (S, E), adjusted; None if impossible.
+
+        It is paired by episode and adjusted for layout difficulty. The axes are S channel seeds and
+        E episodes.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -67,7 +73,10 @@ class Pool:
         return self._corrected(success, plain, known_mean(a - b, 0), -1.0, level)
 
     def estimate(self, success: Success, values: Floats) -> Estimate | None:
-        """Return mean success, (S, E), corrected; None if it cannot be."""
+        """Return the mean success of values (S, E), adjusted for difficulty; None if impossible.
+
+        The axes are S channel seeds and E episodes.
+        """
 
         def plain(part: Bools) -> Estimate:
             return over_episodes(SUCCESS, values[:, part])
@@ -103,8 +112,9 @@ class Pool:
 def adjusted_scores(
     grid: Grid, episodes: Sequence[Episode], layouts: Sequence[Layout]
 ) -> Iterator[Score]:
-    """Yield the scores of success, and of gains in it, corrected;
-    the episodes are in the grid's order.
+    """Yield the scores of success and of its gains that are adjusted for layout difficulty.
+
+    `episodes` are in the order of the grid: by condition, seed and episode.
     """
     success, values = by_condition(grid, episodes)
     pool = Pool.of(layouts, grid.episodes)

@@ -20,32 +20,34 @@ Channel = tuple[Mapping[str, Any], Mapping[str, Sequence[float]]]  # its paramet
 def doubted(
     conditions: Conditions, channels: Mapping[str, Channel], off_lag: Mapping[str, float | None]
 ) -> set[str]:
-    """Return the conditions that a warning is about:
-    controls, another lag, a radio beyond its source.
+    """Return the conditions with a warning: controls, another decision lag, unvalidated radios.
+
+    `channels` holds parameters and validated limits by profile, `off_lag` by condition the share of
+    decisions that take longer or shorter than the dataset's decision lag.
     """
     names = {name for control in control_settings().values() for name in under(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
 
 
 def under(conditions: Conditions, control: str) -> list[str]:
-    """Return the conditions with a control, such as `messages=blind`:
-    the ego hears what no helper would say.
+    """Return the names of the conditions with this control, such as `messages=blind`.
+
+    A control replaces what helpers say, to show whether a gain comes from cooperation.
     """
     setting, _, value = control.partition("=")
     return [c["name"] for c in conditions if c.get(setting) == value]
 
 
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
-    """Return the conditions most of whose decisions act in another frame than the dataset
-    assumes.
+    """Return the conditions half or more of whose decisions miss the dataset's decision lag.
+
+    `off_lag` is by condition the share of decisions that would act in another frame.
     """
     return [name for name, share in off_lag.items() if (share or 0.0) >= MOST_OFF_LAG]
 
 
 def beyond(conditions: Conditions, channels: Mapping[str, Channel]) -> Iterator[tuple[str, str]]:
-    """Yield conditions whose radio has settings that its model's source never held against
-    anything.
-    """
+    """Yield each condition with a radio outside its channel model's validated range, and why."""
     for condition in conditions:
         if channel := channels.get(condition.get("profile") or ""):
             parameters, limits = channel

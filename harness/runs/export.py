@@ -24,10 +24,9 @@ AT_ONCE = 10_000  # decisions in a piece
 
 
 def decisions_csv(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as CSV: one a line, with the columns of `decisions.parquet`;
-    unknown is empty.
+    """Write decisions as CSV with the columns of `decisions.parquet`; unknown values are empty.
 
-    A text that a spreadsheet would take for a formula has an apostrophe before it.
+    A text that a spreadsheet would take for a formula gets an apostrophe before it.
     """
     plain = pa.schema(
         (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
@@ -51,9 +50,7 @@ def _neutral(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as JSON Lines: one a line, with the columns of `decisions.parquet`;
-    unknown is null.
-    """
+    """Write decisions as JSON Lines, with the columns of `decisions.parquet`; unknown is null."""
     encoder = msgspec.json.Encoder()
     with replacing(path) as part, part.open("wb") as file:
         for piece in decisions.table.to_batches(AT_ONCE):
@@ -62,10 +59,10 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 
 
 def junit(run: Run, path: Path) -> Path:
-    """Write JUnit's XML: a test case for each episode and condition, which fails if any seed fails.
+    """Write a run as JUnit's XML: a test case for each episode and condition.
 
-    An episode with a question that got no answer is an error,
-    unless it was a message that may be lost.
+    A case fails if the episode fails in any seed. It is an error if a request got no answer, unless
+    that counts as a lost message.
     """
     errors = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}
@@ -104,19 +101,16 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
 
 
 def junit_of_none(run: Path, error: str) -> str:
-    """Return JUnit's XML of a run that did not finish,
-    since its model could not be asked: one error.
-    """
+    """Return JUnit's XML with one error for a run that stopped because its model did not answer."""
     name = run.absolute().name
     return test_suite(f"harness {name}", [Case(name, "the model answers", error=error)])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
-    """Write answers as CSV: one a line, the fields of `answers.jsonl`,
-    a column an action for the intent.
+    """Write answers as CSV: the fields of `answers.jsonl`, and each action's probability.
 
-    What an engine says of an error has the names of files without their folders. A text that a
-    spreadsheet would take for a formula has an apostrophe before it.
+    Paths in errors are reduced to file names. A text that a spreadsheet would take for a formula
+    gets an apostrophe before it.
     """
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]

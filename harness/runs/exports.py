@@ -16,7 +16,10 @@ from harness.runs.folder import Run
 
 @dataclass(frozen=True)
 class Option:
-    """A further option of a format; several formats that have it hold the same object."""
+    """Describe a further command-line option of an export format.
+
+    Formats that share an option hold the same object.
+    """
 
     kind: type  # what is typed: `bool` for a switch, or `float`
     help: str
@@ -26,7 +29,7 @@ class Option:
 
 @runtime_checkable
 class Export(Protocol):
-    """What writes a run as a file of another program."""
+    """Describe an export format that an extension adds: a run as a file of another program."""
 
     help: str  # of the option
     doing: str  # what is said while it writes
@@ -34,9 +37,10 @@ class Export(Protocol):
     needs: tuple[str, ...]
 
     def write(self, run: Run, file: Path, dataset: Path | None, **options: Any) -> Path:
-        """Write a file and return it; `dataset` is the folder of the run's, if it is stated.
+        """Write a run to a file and return it.
 
-        What was typed of its further options is there by name, with `_` for `-`.
+        `dataset` is the folder of the run's dataset, if the user named one; `options` holds the
+        values of the format's further options by name, with `_` for `-`.
         """
         ...
 
@@ -47,7 +51,7 @@ def _are_options(value: Any) -> bool:
 
 
 class Exports(Plugins[Export]):
-    """Formats by name."""
+    """Hold the export formats by name."""
 
     stated: ClassVar = {
         "help": of_type(str),
@@ -61,6 +65,6 @@ EXPORTS = Exports("swarmdrive.exports", Export, {})
 
 
 def options_of(format: Export) -> Mapping[str, Option]:
-    """Return the further options of a format by name."""
+    """Return the further command-line options of an export format by name; empty if it has none."""
     options: Mapping[str, Option] = getattr(format, "options", MappingProxyType({}))
     return options

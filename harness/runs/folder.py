@@ -52,14 +52,17 @@ _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run; each table is read on first use, and raises UserError if it is broken."""
+    """Hold a finished run's folder and manifest, and read its tables on first use.
+
+    A table that is missing or broken raises UserError.
+    """
 
     path: Path  # the run's folder
     manifest: Manifest  # the content of `run.json`
 
     @property
     def world(self) -> World:
-        """Whether the world is frozen or closed-loop."""
+        """Return the run's kind of world: `frozen` or `closed-loop`."""
         return "frozen" if isinstance(self.manifest.world, FrozenScenes) else "closed-loop"
 
     @property
@@ -72,7 +75,7 @@ class Run:
 
     @property
     def source(self) -> str:
-        """The dataset or scenario of the episodes, in words for people."""
+        """Return the name of the dataset or the scenario of the episodes, for people."""
         world = self.manifest.world
         return (
             world.name
@@ -86,7 +89,7 @@ class Run:
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
-        """The rows of `episodes.csv`: one for each condition, seed and episode."""
+        """Return the rows of `episodes.csv`: one for each condition, seed and episode."""
         return self._placed[1]
 
     @property
@@ -99,7 +102,7 @@ class Run:
 
     @cached_property
     def decisions(self) -> Decisions:
-        """The rows of `decisions.parquet`; each belongs to an episode of the run."""
+        """Return the rows of `decisions.parquet`, checked to belong to the run's episodes."""
         return self.read_file("decisions.parquet", self._decisions)
 
     @cached_property
@@ -110,7 +113,7 @@ class Run:
 
     @cached_property
     def answered(self) -> Answered:
-        """What the answers came to, of one pass through them."""
+        """Return counts of the answers and the ego's distributions, from one pass through them."""
         return self.answers.counted()
 
     @cached_property
@@ -126,8 +129,9 @@ class Run:
         return {layout: place for place, layout in enumerate(self.grid.episodes)}
 
     def of_scenes(self, ids: Collection[str]) -> "Run":
-        """Return the run with only its decisions and answers in some scenes,
-        and the episodes of these.
+        """Return a copy with the decisions and answers in these scenes, and their episodes.
+
+        `ids` are the scenes' ids.
         """
         rows = [row for scene in ids for row in self.decisions.scenes.get(scene, ())]
         decisions = self.decisions.take(rows)
@@ -147,9 +151,7 @@ class Run:
         return part
 
     def agent(self, answer: Answer) -> dict[str, Any]:
-        """Return the agent of an answer:
-        its model, prompt, answer mode and thinking (`Manifest.agent`).
-        """
+        """Return the agent that gave an answer, as `Manifest.agent`: model, prompt and so on."""
         place = self._viewer_place(answer)
         if place not in self._agents:
             self._agents[place] = self.manifest.agent(place)
@@ -160,8 +162,9 @@ class Run:
         return {}
 
     def undeclared_delay(self, answer: Answer) -> str | None:
-        """Return, in words, an answer's seconds beyond its card's latency if the card declares none
-        such; None if it does.
+        """Return a phrase on an answer's extra seconds if its model card declares no such delay.
+
+        None if there are none, or the card declares them.
         """
         failures = self.agent(answer)["model"].get("failures")
         tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
@@ -173,14 +176,16 @@ class Run:
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
 
     def speed(self, answer: Answer) -> Speed:
-        """Return how fast the model of an answer reads and writes tokens on the run's device;
-        only a run with a device profile has that.
+        """Return the token rates of an answer's model on the run's device profile.
+
+        The run must have one.
         """
         return self.manifest.latency.speed(self._viewer_place(answer))
 
     def seconds(self, answer: Answer) -> float | None:
-        """Return the seconds that an answer of its agent takes, a repair turn included;
-        None if unknown.
+        """Return the seconds that an answer takes by the run's latency, a repair turn included.
+
+        None if the latency comes from a device profile.
         """
         usual_s = self.manifest.latency.seconds(self._viewer_place(answer))
         return None if usual_s is None else usual_s * answer.turns + answer.slow_s
@@ -201,7 +206,10 @@ class Run:
 
     @cached_property
     def layouts(self) -> tuple[Layout, ...]:
-        """The rows of `difficulty.csv`; none where the run came to all of its dataset's layouts."""
+        """Return the rows of `difficulty.csv`: all layouts that the run's are sampled from.
+
+        It is empty for a run with all layouts of its dataset, or in closed loop.
+        """
         exists = self.world == "frozen" and (self.path / DIFFICULTY).is_file()
         return self.read_file(DIFFICULTY, self._layouts) if exists else ()
 
@@ -215,10 +223,9 @@ class Run:
         return layouts
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's score in one condition;
-        of several intervals, one that holds at every look.
+        """Return a metric's score in one condition; None if it has no value there.
 
-        Else it is the one over episodes.
+        Of several intervals, it is the anytime-valid one, else the one over episodes.
         """
         of_metric = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
         candidates = [score for score in of_metric if score.value is not None]
@@ -262,8 +269,9 @@ class Run:
         return decisions
 
     def read_file(self, name: str, reader: Callable[[Path], T]) -> T:
-        """Return what a file of the run's folder holds.
-        Raises UserError if the reader calls it broken.
+        """Return what `reader` makes of a file in the run's folder.
+
+        Raises UserError if the file is missing or broken.
         """
         try:
             return whole(self.path / name, reader)
@@ -282,7 +290,7 @@ class Run:
 
 
 def read(path: Path) -> Run:
-    """Read a run's folder.
+    """Read the manifest of a run's folder and return the run.
 
     Raises UserError if it holds no finished run, or its manifest is broken or of another version.
     """
@@ -309,14 +317,18 @@ def _other_than_run(path: Path) -> str:
 
 
 def most_rows(episodes: Sequence[Episode]) -> int:
-    """Return how many decisions a file may hold,
-    so that one with a few too many is still read and named.
+    """Return an upper bound of the rows of `decisions.parquet` for these episodes.
+
+    It is twice what they can have, so that a file with a few too many is read and refused by name.
     """
     return 2 * MOST_DECISIONS * sum(episode.agents or 1 for episode in episodes)
 
 
 def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
-    """Return the rows of a CSV file. Raises ValueError for a column that is missing or has gaps."""
+    """Return the rows of a CSV file as records of type `kind`.
+
+    Raises ValueError for a column that is missing or has gaps.
+    """
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
     parsed = pacsv.ParseOptions(newlines_in_values=True)
@@ -352,7 +364,7 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
 
 
 def scores_of(file: Path) -> tuple[Score, ...]:
-    """Return the figures of a `summary.csv`. Raises ValueError if one is there twice."""
+    """Return the scores of a `summary.csv`. Raises ValueError if one is there twice."""
     scores = records_of(file, Score)
     if len({score.key for score in scores}) < len(scores):
         raise ValueError("a figure is there twice")

@@ -40,7 +40,7 @@ TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
 
 
 class Added(NamedTuple):
-    """What a run without a setting or a column did."""
+    """Describe a setting or column that was added to a format, and its value in older runs."""
 
     since: str  # the day that added it
     absent: Any  # its value in a run without it
@@ -193,12 +193,11 @@ SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way"
 
 
 def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of run.json, or the settings that a run began with,
-    as this version states them.
+    """Return the content of an older `run.json`, or of a run's first record, in today's form.
 
-    What is no table is left as it is, for the reader to refuse. 2026-11-27: a driven scenario is
-    named without the settings that were typed after its name, which are among its parameters.
-    2026-11-29: `kept` has the table `calibrations`, which stood beside it.
+    Values of a wrong type are left as they are, for the reader to refuse. 2026-11-27: a driven
+    scenario is named without the settings that were typed after its name, which are among its
+    parameters. 2026-11-29: `kept` has the table `calibrations`, which stood beside it.
     """
     if isinstance(calibrations := stated.get("calibrations"), dict) and "kept" not in stated:
         stated = {**stated, "kept": {"calibrations": calibrations} if calibrations else {}}
@@ -307,15 +306,15 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def versions(stated: Mapping[str, str]) -> dict[str, str]:
-    """Return the versions that a run states, with those that an older one lacks."""
+    """Return the versions that a run states, with those added that an older run lacks."""
     return _with(VERSIONS, stated)
 
 
 def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the identity of a run's models with their answer versions.
+    """Return what identifies a run's models, with the version of their answers.
 
-    2026-11-26: `answers` replaced what engines without weights said of their version.
-    All older answers are of version 1.
+    2026-11-26: `answers` replaced what engines without weights said of their version. All older
+    answers are of version 1.
     """
     kept = {
         name: value
@@ -354,7 +353,10 @@ def _condition(stated: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checked(version: object, file: object) -> None:
-    """Raise UserError for a run.json of another format than `FORMAT`."""
+    """Raise UserError if the format version that a `run.json` states is not `FORMAT`.
+
+    `file` is its path, for the error.
+    """
     if version == FORMAT:
         return
     old = READ_BY.get(version) if isinstance(version, str) else None

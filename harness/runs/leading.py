@@ -18,23 +18,22 @@ IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 
 class Scored(Protocol):
-    """A run, or a suite's."""
+    """Describe what has scores: a run or a suite's run."""
 
     @property
     def scores(self) -> "Sequence[Score]": ...
 
 
 def leading(*names: Container[str]) -> str:
-    """Return the metric by which what has metrics of these names is read,
-    or several such together.
+    """Return the headline metric: balanced success if every container of metric names has it.
+
+    Otherwise it is the plain success rate.
     """
     return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
 
 def lead_of(*runs: Scored) -> str:
-    """Return the metric by which runs are read together:
-    balanced success where all of them state it.
-    """
+    """Return the headline metric of runs: balanced success if all of them have it, else success."""
     stated = []
     for run in runs:
         stated.append({score.metric for score in run.scores if score.value is not None})
@@ -42,10 +41,14 @@ def lead_of(*runs: Scored) -> str:
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
-    """Return the condition with the most success;
-    the first of several, and empty where there is none.
+    """Return the condition with the highest success, the first of equals; empty if there is none.
 
-    A condition in doubt does not count where one with a radio is left.
+    Conditions in `doubted` (those with a warning) do not count if another with a radio is left.
+
+    Args:
+        success: success by condition.
+        radios: conditions with V2V.
+        doubted: conditions with a warning.
     """
     trusted = [name for name in success if name not in doubted]
     counted = trusted if any(name in radios for name in trusted) else success

@@ -31,7 +31,7 @@ _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 @dataclass(frozen=True)
 class Listed:
-    """One run or study."""
+    """Describe one run or study in a list."""
 
     name: str  # its folder, relative to the folder that is listed
     # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
@@ -56,7 +56,7 @@ class Listed:
 
 
 def runs(folder: Path) -> list[Listed]:
-    """Return the runs and studies in a folder, newest first. Links that lead out of it are skipped.
+    """Return the runs and studies in a folder, newest first; links out of it are skipped.
 
     Raises UserError if there is no such folder.
     """
@@ -185,7 +185,7 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
 
 
 def own_name(name: str) -> bool:
-    """Return whether a name is a plain name of a visible folder, and no path."""
+    """Return whether a name is that of a visible folder, and not a path."""
     return os.path.basename(name) == name and not name.startswith(".") and name != ""
 
 

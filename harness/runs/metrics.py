@@ -67,14 +67,19 @@ COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 
 class Columns(Protocol):
-    """The numeric columns (n,) of a table of decisions, by name; NaN where unknown."""
+    """Describe a table of decisions: numeric columns (n,) by name, NaN where unknown."""
 
     def __getitem__(self, name: str, /) -> Floats: ...
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric, 0 or more. It has one function, or is computed where the summary is."""
+    """Define one metric, with values of 0 or more, by its name, meaning, unit and function.
+
+    The function is one of `decisions`, `episodes`, `answers` and `pooled`, by what it takes; a
+    metric without any is computed where `summary.csv` is made. `halves` names the two metrics that
+    it is the mean of, with and without a danger.
+    """
 
     name: str  # its name in tables, with the unit at the end
     meaning: str  # its meaning, in words for people
@@ -114,8 +119,9 @@ class Metric:
 
     @property
     def compared(self) -> bool:
-        """Whether two runs are compared in it,
-        as in any that is known of an episode or of all decisions.
+        """Return whether two runs are compared in the metric.
+
+        It is so if it has a value for each episode or over all decisions.
         """
         ways = (
             self.decisions,
@@ -129,7 +135,7 @@ class Metric:
 
 
 class Metrics(Plugins[Metric]):
-    """Metrics by name: built-in ones, those of answers to questions of extensions, packages'."""
+    """Hold all metrics by name: built-in ones, those of extensions, and other packages'."""
 
     stated: ClassVar = {
         "meaning": of_type(str),
@@ -143,7 +149,10 @@ class Metrics(Plugins[Metric]):
 
     @cached_property
     def own(self) -> Mapping[str, Metric]:
-        """Those that are computed here, by name and in the order of rows: all but packages'."""
+        """Return the metrics that the harness defines, by name, in the order of a summary's rows.
+
+        Those that other packages add are left out.
+        """
         of_answers = {metric.name: metric for metric in _of_answers(roles())}
         before = takewhile(lambda name: name not in of_answers, self.built_in)
         return {**{name: self.built_in[name] for name in before}, **of_answers, **self.built_in}
@@ -942,9 +951,9 @@ METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric 
 
 
 def metrics_of(world: World) -> tuple[Metric, ...]:
-    """Return the metrics of decisions and of episodes that are known in a world.
+    """Return the metrics of decisions and of episodes that are known in this world.
 
-    Raises UserError if a package's metric does not work.
+    Raises UserError if a package's metric does not load.
     """
     own = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
     return tuple(metric for metric in own if metric.world in (None, world))
@@ -952,8 +961,9 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
 @lru_cache(1024)
 def entry(name: str) -> Metric:
-    """Return a metric; of a name that is not registered, as an older run may have it,
-    a plain one.
+    """Return the metric of this name; a plain one without a meaning if it is not registered.
+
+    An older run may have such a name.
     """
     try:
         return METRICS[name]
@@ -963,7 +973,7 @@ def entry(name: str) -> Metric:
 
 @dataclass(frozen=True)
 class Grid:
-    """The grid of conditions, seeds and episodes; each cell is one episode of a run."""
+    """Hold the conditions, seeds and episodes of a run; each combination is a cell, one episode."""
 
     conditions: tuple[str, ...]  # the conditions' names
     seeds: tuple[int, ...]  # seeds of the channel's draws
@@ -974,8 +984,9 @@ class Grid:
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """Return the flat index of each decision's cell, (n,).
-        Raises ValueError for one outside the grid.
+        """Return the flat index (C × S × E) of each decision's cell, (n,).
+
+        Raises ValueError for a decision outside the grid.
         """
         condition = decisions.codes("condition", self.conditions)
         seed, episode = (
@@ -985,8 +996,9 @@ class Grid:
         return np.ravel_multi_index((condition, seed, episode), self.shape)
 
     def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
-        """Return the episodes in the order of the cells.
-        Raises ValueError unless each is there once.
+        """Return the episodes in the order of the cells: by condition, seed and episode.
+
+        Raises ValueError unless each cell has exactly one.
         """
         by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
         cells = [*product(self.conditions, self.seeds, self.episodes)]
@@ -998,8 +1010,10 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Return each metric's values by episode, (C, S, E);
-    the episodes are in the order of the grid.
+    """Return each metric's values for every episode, (C, S, E), by name; NaN where unknown.
+
+    `episodes` are in the order of the grid. The axes are C conditions, S channel seeds and E
+    episodes.
     """
     places = grid.places(decisions)
 
@@ -1012,8 +1026,10 @@ def by_episode(
 
 
 def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
-    """Return a metric of how episodes ended, (C, S, E);
-    the episodes are in the order of the grid.
+    """Return a metric's values from the episodes' outcomes, (C, S, E); NaN where unknown.
+
+    `episodes` are in the order of the grid. The axes are C conditions, S channel seeds and E
+    episodes.
     """
     function = metric.episodes
     assert function
@@ -1026,8 +1042,9 @@ def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
-    """Return a metric of n episodes, (n,), from decisions;
-    `places` has the episode's index of each.
+    """Return a metric's value for each of n episodes, (n,), from decisions; NaN where unknown.
+
+    `places` is the index of each decision's episode.
     """
     function = metric.decisions
     assert function
@@ -1061,12 +1078,18 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the sum of the known values at each of n places, (n,)."""
+    """Return the sum of the known values at each index from 0 to n - 1, (n,).
+
+    `places` has the index of each value.
+    """
     return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
 
 
 def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the mean of the known values at each of n places, (n,); NaN where there is none."""
+    """Return the mean of the known values at each index, (n,); NaN where there is none.
+
+    `places` has the index of each value, from 0 to n - 1.
+    """
     known = ~np.isnan(values)
     count = np.bincount(places[known], minlength=n)
     total = sum_by_place(values[known], places[known], n)
@@ -1074,31 +1097,37 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def least_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the least of the known values at each of n places, (n,); NaN where there is none."""
+    """Return the least of the known values at each index, (n,); NaN where there is none.
+
+    `places` has the index of each value, from 0 to n - 1.
+    """
     least = np.full(n, np.nan)
     np.fmin.at(least, places, values)
     return least
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:
-    """Return the interval over seeds of a metric's values (S, E), for these episodes."""
+    """Return the mean of a metric's values (S, E) with an interval over channel seeds."""
     if entry(name).interval == "rate":
         return in_range(name, seed_rate_interval(values))
     return in_range(name, seed_interval(known_mean(values, axis=1)))
 
 
 def over_episodes(name: str, values: Floats) -> Estimate:
-    """Return the interval over episodes of a metric's values (S, E)."""
+    """Return the mean of a metric's values (S, E) with a 95 % interval over episodes.
+
+    The axes are S channel seeds and E episodes.
+    """
     means = known_mean(values, axis=0)
     rate = entry(name).interval == "rate"
     return rate_interval(means) if rate else in_range(name, episode_interval(means))
 
 
 def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float = LEVEL) -> Estimate:
-    """Return the interval over episodes of the difference a - b of a metric.
+    """Return the difference a - b of a metric with its interval over episodes.
 
-    `pairs` are a and b, (E, S) each: one of the metric's own values,
-    or one of each of its halves, in which the episodes of the other are NaN.
+    `pairs` has a and b, (E, S) each: one pair, or of balanced success one for each half, in which
+    the episodes of the other half are NaN. The axes are S channel seeds and E episodes.
     """
     if entry(name).interval != "rate":
         ((a, b),) = pairs
@@ -1110,10 +1139,11 @@ def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float =
 
 
 def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
-    """Return a metric's estimate, from that of each of its halves where it has them.
+    """Return a metric's estimate: for balanced success the mean of those of its two halves.
 
-    Halves have no episode in common, so that the intervals are independent. They have all seeds in
-    common: of `shared` units n is that of each half, and of others the sum.
+    `estimate` gives that of a metric by name. Halves have no episode in common, so that their
+    intervals are independent. `shared` says that they share units, such as seeds: n is then that of
+    each half, else the sum.
     """
     halves = entry(name).halves
     if not halves:
@@ -1127,16 +1157,18 @@ def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False)
 
 
 def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
-    """Return success (..., E) with a danger and without, by metric; NaN in the other episodes."""
+    """Return success (..., E) with a danger and without, by metric; NaN in other episodes.
+
+    `dangerous` is a mask (E,).
+    """
     parts = (np.where(part, success, np.nan) for part in (dangerous, ~dangerous))
     return dict(zip(entry(BALANCED).halves, parts, strict=True))
 
 
 def known_in(values: Mapping[str, Floats]) -> list[str]:
-    """Return the metrics that a run states whose values by episode are these, in their order.
+    """Return the names of the metrics that a run with these values by episode states, in order.
 
-    Those by danger are stated only if episodes are of both kinds:
-    a run whose scenes do not know their dangers has none.
+    Metrics of one half (with or without a danger) are stated only if there are episodes of both.
     """
     known = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
     both = known.issuperset(entry(BALANCED).halves)
@@ -1148,18 +1180,21 @@ def known_in(values: Mapping[str, Floats]) -> list[str]:
 
 
 def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
-    """Return the p-value of no difference, from the interval of `difference`."""
+    """Return the p-value of no difference, by the interval of `difference`; None without one."""
     return multiplicity.p_value(lambda level: difference(name, pairs, level))
 
 
 def in_range(name: str, e: Estimate) -> Estimate:
-    """Cut an interval to the range of its metric, beyond which Student's t may go."""
+    """Return an estimate with its interval cut to the metric's range, from 0 to `most`."""
     low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, entry(name).most))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 
 
 def percentiles(latency_ms: Floats) -> Floats:
-    """Return the `PERCENTILES` of the known latencies among (n,); NaN if none is known."""
+    """Return the `PERCENTILES` of latencies (n,), ms; NaN if none is known.
+
+    Unknown latencies, which are NaN, are left out.
+    """
     measured = latency_ms[~np.isnan(latency_ms)]
     return (
         np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
@@ -1167,7 +1202,7 @@ def percentiles(latency_ms: Floats) -> Floats:
 
 
 def written(score: Score) -> str:
-    """Write a score and its interval as its metric is written, without the unit."""
+    """Return a score with its interval as text, in the metric's unit but without its name."""
     return shown(score, entry(score.metric).unit)
 
 

@@ -24,11 +24,10 @@ Decided = tuple[Ints, Floats]  # the episode's index and the value of each decis
 def differences(
     a: Sequence[Decided], b: Sequence[Decided], episodes: int
 ) -> Iterator[tuple[int, float, float, Estimate]]:
-    """Yield for each of `PERCENTILES`:
-    the percent, A's value, B's value, and B - A with its interval.
+    """Yield for each of `PERCENTILES`: percent, value in A, value in B, and B - A with interval.
 
-    A run's percentile is the mean over its seeds.
-    In a seed, an episode without values in either run is left out.
+    `a` and `b` have one entry for each seed, and a percentile is the mean over seeds. In a seed, an
+    episode without values in either run is left out. `episodes` is their number.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
@@ -44,8 +43,9 @@ def differences(
 
 
 def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """Return the 95 % interval of each of `PERCENTILES` of values (n,), over episodes;
-    NaN if unbounded.
+    """Return the 95 % bootstrap interval of each of `PERCENTILES` of values (n,), by the percent.
+
+    Episodes are resampled; `episodes` names that of each value. NaN if an interval is unbounded.
     """
     names, index = np.unique(episodes, return_inverse=True)
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)

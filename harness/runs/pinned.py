@@ -15,7 +15,12 @@ KIND = "episodes"  # of its intervals
 
 
 def mean_difference(pairs: Pairs) -> Estimate:
-    """Return the mean over families of success a - b, both (S, E), paired by episode."""
+    """Return the difference in success a - b, as figures of version 1 computed it.
+
+    `pairs` holds for each family of scenes its success rule and a and b, (S, E) each. The interval
+    of each half of each family is computed apart, and these are combined. The axes are S channel
+    seeds and E episodes.
+    """
     families = []
     for success, a, b in pairs:
         halves = [rate_difference(a[:, part].T, b[:, part].T) for part in success.parts]
@@ -24,7 +29,10 @@ def mean_difference(pairs: Pairs) -> Estimate:
 
 
 def gain(run: Run, score: Score) -> Score:
-    """Return a run's gain over the condition without V2V."""
+    """Return a run's gain over the condition without V2V, computed as figures of version 1 were.
+
+    `score` says which condition and metric.
+    """
     success, values = by_condition(run.grid, run.episodes)
     counted = success if score.metric == GAINS[BALANCED] else success.plain
     estimate = mean_difference([(counted, values[score.condition], values[BASELINE])])

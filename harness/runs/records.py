@@ -24,17 +24,17 @@ Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  #
 
 
 def roles() -> tuple[Role, ...]:
-    """Return the roles of answers: the plain ones, and helpers' by the name of another question."""
+    """Return the roles of answers: ego, helper, merge (fusion call) and extensions' questions."""
     return (*PLAIN_ROLES, *filter(None, questions()))
 
 
 def is_helper(role: str) -> bool:
-    """Return whether answers in a role are messages of helpers, which may be lost."""
+    """Return whether answers of a role are helpers' messages, which the radio may lose."""
     return role not in ("ego", "merge")
 
 
 def role_word(role: str) -> str:
-    """Return what people call a role; files say `merge` of a fusion call."""
+    """Return a role's name for people: `fusion` for `merge`, any other as it is."""
     return "fusion" if role == "merge" else role
 
 
@@ -45,12 +45,12 @@ TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that ta
 
 
 def asked_key(viewer: str, question: str) -> str:
-    """Return the key of a viewer's answer to a question, by name; empty is the plain one."""
+    """Return the key of a viewer's answer within a scene; `question` is empty for the plain one."""
     return f"{viewer}{ASKED}{question}" if question else viewer
 
 
 class FirstTurn(Struct, frozen=True, kw_only=True):
-    """The answer before a repair turn: its text, how it was parsed, its tokens and its time."""
+    """Hold the failed answer before a repair turn, with its parse status, tokens and seconds."""
 
     raw: str
     status: str
@@ -62,8 +62,9 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """One answer of a model: a line of `answers.jsonl`;
-    tokens and times include those of a repair turn.
+    """Hold one answer of a model, a line of `answers.jsonl`.
+
+    Tokens and times include those of a repair turn, a second question after a failed answer.
     """
 
     scene: str  # id of the decision point
@@ -117,12 +118,13 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def turns(self) -> int:
-        """How many questions it took: 2 with a repair turn."""
+        """Return the number of questions that were asked for the answer: 2 with a repair turn."""
         return 2 if self.first else 1
 
     def may_take_longer(self, tail_s: float) -> bool:
-        """Return whether its seconds beyond the card's latency are those that a card may declare:
-        none, or in each turn the slow tail of a rule, `tail_s`.
+        """Return whether its extra seconds `slow_s` are as its model card declares them.
+
+        Allowed are none, or in each turn the declared slow tail, `tail_s`.
         """
         return self.slow_s in [turns * tail_s for turns in range(self.turns + 1)]
 
@@ -135,31 +137,29 @@ class Answer(Struct, frozen=True, kw_only=True):
         return self.first.raw if self.first else None
 
     def cell(self, column: str) -> Any:
-        """Return a field or property as tables have it: None where it is unset."""
+        """Return a field or property as a table's cell; None where it is unset."""
         if (value := getattr(self, column)) is UNSET:
             return None
         return " ".join(value) if column == "faults" else value
 
     @property
     def id(self) -> str:
-        """The id of its request: the scene and the answer's key."""
+        """Return the id of its request: the scene's id and the answer's key."""
         return f"{self.scene}/{self.key}"
 
     @property
     def key(self) -> str:
-        """The answer's name within its decision point:
-        viewer, senders heard, and whether it was blind.
-        """
+        """Return its name within its scene: viewer, senders of messages it heard, and question."""
         return asked_key("+".join((self.viewer, *self.heard)), self.question)
 
     @property
     def question(self) -> str:
-        """The name of what it answers; empty for the plain question."""
+        """Return the name of an extension's question that it answers; empty for the plain one."""
         return "" if self.role in PLAIN_ROLES else self.role
 
 
 class AnswerFacts(Struct, frozen=True):
-    """The fields of `Answer` from which a run's figures are computed.
+    """Hold the fields of `Answer` that a run's figures are computed from.
 
     Without the texts, all answers of a run fit into memory.
     """
@@ -184,12 +184,12 @@ class AnswerFacts(Struct, frozen=True):
 
     @property
     def turns(self) -> int:
-        """How many questions it took: 2 with a repair turn."""
+        """Return the number of questions that were asked for the answer: 2 with a repair turn."""
         return 2 if self.first else 1
 
 
 class Times(Struct, frozen=True, omit_defaults=True):
-    """How long some answers took, each asked alone: their number, and percentiles in seconds."""
+    """Hold how long answers took that were asked one at a time: number and percentiles, s."""
 
     n: int  # number of answers
     median_s: float  # the median
@@ -203,7 +203,10 @@ class Times(Struct, frozen=True, omit_defaults=True):
 
 
 class Latency(Struct, frozen=True, omit_defaults=True):
-    """How long inference takes; it is fixed before a run and decides who is heard in time."""
+    """Hold the seconds of inference by role, fixed before a run, or token rates to compute them.
+
+    They decide which messages arrive within the decision window.
+    """
 
     # `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer
     # follows from its own tokens on a declared computer
@@ -228,28 +231,31 @@ class Latency(Struct, frozen=True, omit_defaults=True):
             raise ValueError("latency has speeds where its source is device, and else seconds")
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
-        """Return the seconds of each helper model, which take turns;
-        empty if the source is `device`.
+        """Return the seconds of each helper model, which are assigned to helpers in turn.
+
+        It is empty if the source is a device profile.
         """
         return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
 
     def speed(self, place: int) -> Speed:
-        """Return the speed of a scene's viewer at this place, the ego at 0;
-        helpers' agents take turns.
+        """Return the token rates of the viewer with this index, where 0 is the ego.
+
+        Helper models are assigned to helpers in turn.
         """
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
     def seconds(self, place: int) -> Seconds | None:
-        """Return the seconds of an answer of who is at this place, as `speed`;
-        None if its speed says.
+        """Return the seconds of an answer of the viewer with this index, where 0 is the ego.
+
+        None if the source is a device profile, by which they depend on tokens.
         """
         helpers = self.helper_times_s()
         return helpers[(place - 1) % len(helpers)] if place and helpers else self.ego_s
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
-    """A helper's reply: whether and when it arrived, and its weight in the policy."""
+    """Hold a helper's reply to the ego: whether and when it arrived, and its weight in fusion."""
 
     sender: str  # the helper
     delivered: bool  # whether it arrived
@@ -263,7 +269,11 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
 
 
 class Decision(Struct, frozen=True, kw_only=True):
-    """One decision, a row of `decisions.parquet` as reports use it; None where unknown."""
+    """Hold one decision, a row of `decisions.parquet`, for reports; None where unknown.
+
+    `fused` is the policy after fusion; `value` is whether success was still possible before the
+    action, `safe` whether it is after it.
+    """
 
     scene: str  # id of the decision point
     episode: int  # the episode's number
@@ -293,7 +303,7 @@ class Decision(Struct, frozen=True, kw_only=True):
 
 
 class Episode(Struct, frozen=True, kw_only=True):
-    """How one layout ended under one condition and seed: a line of `episodes.csv`."""
+    """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`."""
 
     condition: str  # name of the operating point
     seed: int  # seed of the channel's draws
@@ -348,7 +358,7 @@ class Episode(Struct, frozen=True, kw_only=True):
 
 
 class Variant(Struct, frozen=True):
-    """The agents of a run, in words: the first columns of every line of its CSV files."""
+    """Name the model, prompt and answer mode of a run, as the first columns of its CSV files do."""
 
     model: str  # name of the card
     prompt: str  # the prompt version
@@ -360,12 +370,12 @@ class Variant(Struct, frozen=True):
 
     @property
     def mix(self) -> str:
-        """The helpers' agents as the end of a name; empty if the ego's agent answers for them."""
+        """Return the helpers' models as the end of a name; empty if the ego's answers for them."""
         return self.helpers and f" + {self.helpers}"
 
 
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
-    """An estimate of a metric: a line of `summary.csv`."""
+    """Hold the estimate of a metric in a condition, a line of `summary.csv`."""
 
     condition: str  # name of the operating point, or `all` for what is the same in all
     metric: str  # name of the metric, its unit at the end
@@ -380,13 +390,13 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
     @classmethod
     def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
-        """Return an estimate as a line, with None for NaN."""
+        """Return an estimate as a line of `summary.csv`, with None for NaN."""
         value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
         return cls(condition, metric, value, low, high, e.n, e.n_excluded, interval)
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What a summary has it by: condition, metric and kind of interval."""
+        """Return what is unique in a summary: condition, metric and kind of interval."""
         return self.condition, self.metric, self.interval
 
     @property
@@ -398,7 +408,10 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
 
 class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """When a run was looked at, and what was to stop it: one of a width and another run."""
+    """Hold when a run with sequential stopping was inspected, and its stopping rule.
+
+    The rule is a width of intervals, or another run from which success is to differ.
+    """
 
     layouts: int  # how many there were
     width: float | None = None  # of each condition's interval of success, as a share
@@ -411,8 +424,9 @@ class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
 class FrozenScenes(
     Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True
 ):
-    """The record of a dataset and the episodes walked:
-    all of them without `limit` and `selection`.
+    """Record the dataset of a frozen run and which of its episodes were evaluated.
+
+    These are all of them without `limit` and `selection`.
     """
 
     name: str
@@ -428,17 +442,17 @@ class FrozenScenes(
 
     @property
     def pinned(self) -> Any:
-        """What pins its scenes: the dataset's digest."""
+        """Return what two runs on the same scenes share: the dataset's digest."""
         return self.sha256
 
 
 class ClosedLoop(
     Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True
 ):
-    """The record of a closed-loop world; episode e has layout seed `first_seed` + e.
+    """Record the scenario of a closed-loop run; episode e has layout seed `first_seed` + e.
 
-    `episodes` is how many were driven. If a sample was drawn, `selection` has the number of
-    episodes that it is drawn from, `of`, and the draw.
+    `episodes` is how many were driven. If they were sampled, `selection` has the number sampled
+    from, `of`, and the seed of the draw.
     """
 
     scenario: dict[str, Any]
@@ -455,13 +469,16 @@ class ClosedLoop(
 
     @property
     def pinned(self) -> Any:
-        """What pins its scenes: the scenario's layouts, of any beacons."""
+        """Return what two runs on the same scenes share: scenario, parameters and first seed.
+
+        The settings of beacons are not part of it.
+        """
         parameters = {k: v for k, v in self.scenario["parameters"].items() if k not in DIALS}
         return self.scenario["name"], parameters, self.first_seed
 
     @property
     def title(self) -> str:
-        """The scenario for people; its name alone if this version has none with such parameters."""
+        """Return the scenario's title for people; its name if this version does not have it."""
         name: str = self.scenario["name"]
         with suppress(UserError):
             if scenarios.is_here(name):
@@ -470,9 +487,7 @@ class ClosedLoop(
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):
-    """A channel profile at the time of the run:
-    a `harness.radio.profiles.Profile` with all parameters.
-    """
+    """Record a channel profile as it was when the run was made, with all its parameters."""
 
     model: str
     description: str
@@ -495,7 +510,7 @@ _SUMMED = ("amount", "asked", "uncounted", "read_tokens", "written_tokens")  # f
 
 
 class Cost(Struct, frozen=True):
-    """What a run's questions to one model cost, by the price that its card states."""
+    """Hold what a run's requests to one model cost, by the price on its model card."""
 
     currency: str
     amount: float
@@ -506,7 +521,7 @@ class Cost(Struct, frozen=True):
 
     @classmethod
     def joined(cls, runs: "Iterable[Manifest]") -> "dict[str, Cost]":
-        """Return what several runs cost, by model; they asked it at one price."""
+        """Return the cost of several runs in sum, by model; all have the same price."""
         total: dict[str, Cost] = {}
         for model, cost in (each for run in runs for each in (run.cost or {}).items()):
             old = total.get(model)
@@ -523,7 +538,7 @@ def _is_name(name: str) -> bool:
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
-    """A run's settings and origin: `run.json`. `docs/files.md` has the meaning of each name."""
+    """Hold a run's settings and origin, `run.json`; docs/files.md has the meaning of each name."""
 
     format: str
     name: str
@@ -568,7 +583,10 @@ class Manifest(Struct, frozen=True, kw_only=True):
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario of a closed-loop run, with its parameters of then."""
+        """Return the scenario of a closed-loop run, with the parameters in the manifest.
+
+        Raises UserError if this version has no such scenario or parameters.
+        """
         assert isinstance(self.world, ClosedLoop)
         record = self.world.scenario
         try:
@@ -619,8 +637,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
         return Variant(model, version, self.answer, " + ".join(helpers))
 
     def agent(self, place: int) -> dict[str, Any]:
-        """Return the agent of a scene's viewer at this place, in the form of `helpers`;
-        the ego is at 0.
+        """Return the agent of the viewer with this index, 0 the ego, in the form of `helpers`.
+
+        Helper agents are assigned in turn; without any, the ego's agent answers for all.
         """
         if place and self.helpers:
             return self.helpers[(place - 1) % len(self.helpers)]

@@ -39,8 +39,9 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 
 
 def mass(p: Floats, optimal: Bools) -> Floats:
-    """Return the probability of the optimal actions in policies, both `(..., A)`;
-    NaN where none is.
+    """Return the probability that policies p (..., A) give to optimal actions, (...).
+
+    `optimal` is a mask (..., A); NaN where no action is optimal.
     """
     # rounding may lift it above 1
     total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)
@@ -48,8 +49,7 @@ def mass(p: Floats, optimal: Bools) -> Floats:
 
 
 def brier(p: Floats, optimal: Bools) -> Floats:
-    """Return the Brier score (Brier 1950) of two events,
-    that an optimal action is taken or another.
+    """Return the Brier score (Brier 1950) of taking any optimal action, (...), from p (..., A).
 
     With the probability m of the optimal actions it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst.
     It does not matter how m is spread over several optimal actions.
@@ -58,15 +58,17 @@ def brier(p: Floats, optimal: Bools) -> Floats:
 
 
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
-    """Return -ln of the probability of the optimal actions (Good 1952),
-    at least `LEAST_P`: 5.3 nats.
+    """Return -ln of the optimal actions' probability (Good 1952), (...), from p (..., A).
+
+    A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
     """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
 
 def right(p: Floats, optimal: Bools) -> Floats:
-    """Return the share of the likeliest actions that is optimal, `(...)`;
-    NaN where no action is.
+    """Return 1 where the likeliest action of p (..., A) is optimal, else 0, (...).
+
+    For equally likely actions it is the share that is optimal; NaN where no action is.
     """
     likeliest = p == p.max(axis=-1, keepdims=True)
     share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
@@ -75,7 +77,11 @@ def right(p: Floats, optimal: Bools) -> Floats:
 
 @dataclass(frozen=True)
 class Judged:
-    """Decisions in which exactly one action is optimal."""
+    """Hold confidence and correctness of the n decisions with exactly one optimal action.
+
+    `sure` is the probability of the likeliest action, `right` 1 if it is the optimal one (a share
+    if several are equally likely) and `episode` the index of its episode, (n,) each.
+    """
 
     sure: Floats  # the probability of the likeliest action, (n,)
     right: Floats  # the share of the likeliest actions that is optimal, (n,)
@@ -83,8 +89,9 @@ class Judged:
 
     @classmethod
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
-        """Judge policies `(n, A)`, and leave out the decisions with no optimal action or with
-        several.
+        """Return the decisions of policies p (n, A) that have exactly one optimal action.
+
+        `optimal` is a mask (n, A), `episode` (n,) the index of each decision's episode.
         """
         hits = right(p, optimal)
         known = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
@@ -92,7 +99,7 @@ class Judged:
 
     @classmethod
     def joined(cls, parts: Sequence["Judged"], sizes: Sequence[int]) -> "Judged":
-        """Join parts of so many episodes each, one after the other."""
+        """Join decisions of parts of a run; `sizes` are the numbers of episodes in the parts."""
         starts = np.cumsum([0, *sizes[:-1]])
         episode = [part.episode + start for part, start in zip(parts, starts, strict=True)]
         sure = np.concatenate([part.sure for part in parts])
@@ -100,7 +107,7 @@ class Judged:
         return cls(sure, hits, np.concatenate(episode))
 
     def bins(self) -> Ints:
-        """Return the bin of each decision, (n,)."""
+        """Return the confidence bin of each decision, (n,), as `calibration_error` has them."""
         levels, level = np.unique(-self.sure, return_inverse=True)
         return np.asarray(_bins(np.bincount(level, minlength=len(levels))[None])[0][level])
 
@@ -109,22 +116,25 @@ Figure = Callable[[Floats, Floats, Floats], Floats]
 
 
 def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
-    """Return the number of decisions, (R,). `calibration_error` says what the arguments are."""
+    """Return the number of decisions in each resample, (R,).
+
+    The arguments are those of `calibration_error`.
+    """
     return np.asarray(count.sum(axis=1))
 
 
 def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the expected calibration error of the likeliest action (Naeini and others 2015), (R,).
 
-    `BINS` bins of equal mass (Nguyen and O'Connor 2015); decisions that are equally sure are in one
-    bin. The error is the mean over decisions of the distance between a bin's share of right
-    policies and how sure they are on average. It is above 0 even for calibrated policies, the more
-    the fewer decisions there are.
+    `BINS` bins of equal mass (Nguyen and O'Connor 2015); equally confident decisions share a bin.
+    The error is the mean over decisions of a bin's distance between accuracy and mean confidence.
+    It is above 0 even for calibrated policies, the more the fewer decisions there are.
 
     Args:
-        count: how many decisions are at each level of how sure they are, from the surest, (R, L).
+        count: number of decisions at each of L levels of confidence, descending, for each of R
+            bootstrap resamples, (R, L).
         hits: how many of these are right, (R, L).
-        sure: how sure all of these are together, (R, L).
+        sure: the sum of their confidence, (R, L).
     """
     place = _bins(count) + BINS * np.arange(len(count))[:, None]
     gaps = np.bincount(place.ravel(), weights=(hits - sure).ravel(), minlength=BINS * len(count))
@@ -132,11 +142,11 @@ def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 
 def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
-    """Return the greatest share of decisions of which at most `RISK` are not right, (R,).
+    """Return the greatest share of decisions, most confident first, with an error of `RISK`, (R,).
 
-    The surest decisions are acted on first, and those that are equally sure together (selective
-    classification: El-Yaniv and Wiener 2010). The bound is chosen on the decisions that it is
-    stated of. `calibration_error` says what the arguments are.
+    It is selective classification (El-Yaniv and Wiener 2010) with a threshold that is chosen on the
+    same decisions; equally confident ones are taken together. The arguments are those of
+    `calibration_error`.
     """
     acted, correct = count.cumsum(axis=1), hits.cumsum(axis=1)
     within = acted - correct <= RISK * acted + 1e-9
@@ -144,10 +154,10 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
-    """Return a figure of decisions in so many episodes, with its interval over these.
+    """Return a figure of judged decisions, such as `coverage`, with its bootstrap interval.
 
-    Of fewer than `LEAST` decisions, or `LEAST_EPISODES` episodes with any,
-    only their number is known.
+    `episodes` is the number of all episodes. The figure is unknown, unless it is the number of
+    decisions, with fewer than `LEAST` of these or from fewer than `LEAST_EPISODES` episodes.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -155,10 +165,10 @@ def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
 def estimates(
     judged: Judged, figures: Sequence[Figure], episodes: int, older: bool = False
 ) -> list[Estimate]:
-    """Return some figures of the same decisions, as `estimate` does each; they share the resamples.
+    """Return several figures of the same decisions, as `estimate` does; they share resamples.
 
-    By the `older` rules, version 1 of the figures, any number of episodes is enough, and a figure
-    whose resamples are all alike has an interval of no width, which rounding may have left out.
+    `older` selects the rules of version 1: any number of episodes is enough, and a figure whose
+    resamples are all alike has an interval of no width.
     """
     known = [figure for figure in figures if _known(figure, judged, older)]
     values = []
@@ -171,10 +181,10 @@ def estimates(
 def difference(
     a: Judged, b: Judged, figure: Figure, episodes: int
 ) -> tuple[float, float, Estimate]:
-    """Return a figure of A's and of B's decisions, and B's less A's, paired by episode.
+    """Return a figure of A, that of B, and B - A with its interval, paired by episode.
 
-    Episodes in which either has no decision are left out.
-    Nothing is known if one is left with fewer than `LEAST`, except of their number.
+    Episodes in which either has no decision are left out. All are NaN if one is left with too few
+    decisions, as in `estimate`.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))

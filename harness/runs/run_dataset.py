@@ -16,12 +16,11 @@ DEEPEST = 8  # folders of a dataset's stated path that are looked for above a ru
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the dataset of a run on frozen scenes, wherever it lies now,
-    if it has the run's digest.
+    """Return the dataset of a run on frozen scenes, found by its digest.
 
-    It is looked for where the run states, at that path seen from each folder above the run's, and
-    by its name; nowhere else if the user names its folder, `given`. Raises UserError if it is not
-    found, has another digest, or is damaged.
+    It is searched at the path in the run's manifest, at that path below each folder above the run,
+    and by its name; if the user names a folder, `given`, only there. Raises UserError if it is not
+    found, has another digest or is damaged.
     """
     stated = run.manifest.world
     assert isinstance(stated, FrozenScenes)
@@ -76,9 +75,9 @@ def _holds(path: Path) -> bool:
 
 
 def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:
-    """Raise UserError if a run has a decision or an answer in a scene that is not in its dataset.
+    """Raise UserError if a decision or answer of a run is of a scene that is not in its dataset.
 
-    With `some`, only decisions in these scenes are checked, and answers where there is no decision.
+    With `some`, of the decisions only those in these scenes are checked.
     """
     decided = run.decisions.scenes
     scenes_by_file: dict[str, Iterable[str]] = {

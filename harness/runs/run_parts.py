@@ -28,9 +28,10 @@ def part_files(
     answers: Iterable[Answer],
     viewers: Mapping[str, Sequence[str]],
 ) -> dict[str, bytes]:
-    """Return the files of a part of a run, by name; the answers may be in any order.
+    """Return the content of the files of a part of a run (some of its episodes), by file name.
 
-    `viewers` has the ids of each decision point's viewers, the ego first.
+    The answers may be in any order. `viewers` maps a scene's id to the ids of the vehicles that may
+    answer there, the ego first.
     """
     return {
         "decisions.parquet": decisions.encoded(),
@@ -40,7 +41,7 @@ def part_files(
 
 
 def write_part(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write a part of a run to its own folder, which exists only once it is complete."""
+    """Write the files of a part of a run to the folder `out`, which appears only when complete."""
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)
     for name, data in files.items():
@@ -51,7 +52,10 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
 def read_part(
     part: Path, actions: Sequence[str]
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
-    """Read a part that `write_part` wrote. Raises UserError if it is broken."""
+    """Return the decisions, episodes and answers (without texts) of a folder from `write_part`.
+
+    Raises UserError if it is broken.
+    """
     return whole(
         part,
         lambda part: (
@@ -62,12 +66,18 @@ def read_part(
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:
-    """Read a part's answers, without their texts. Raises UserError if it is broken."""
+    """Return the answers of a part of a run, without their texts.
+
+    Raises UserError if the file is broken.
+    """
     return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
 
 
 def ends_of(part: Path) -> tuple[Episode, ...]:
-    """Read how a part's episodes ended. Raises UserError if it is broken."""
+    """Return the episodes of a part of a run, each with its outcome.
+
+    Raises UserError if the file is broken.
+    """
     return whole(part, lambda part: records_of(part / "episodes.csv", Episode))
 
 
@@ -77,16 +87,16 @@ def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[E
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
-    """Return the decisions of a run's parts."""
+    """Return the decisions of all parts of a run, as files that are read one at a time."""
     return DecisionFiles([part / "decisions.parquet" for part in parts], tuple(actions))
 
 
 def answers_in(part: Path) -> int:
-    """Return the number of answers in a part."""
+    """Return the number of answers in a part's folder."""
     return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
-    """Yield the content of a run's `answers.jsonl` from its parts, one part at a time."""
+    """Yield the content of each part's `answers.jsonl`, in order."""
     for part in parts:
         yield bytes_of(part / "answers.jsonl", "rows")

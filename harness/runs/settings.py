@@ -44,19 +44,22 @@ def option(
     same: str = ITSELF,
     compared: bool = True,
 ) -> Meta:
-    """Describe a setting: its help, its panel (by default the first), the world that alone has it.
+    """Describe a setting of `Settings` as metadata of its field.
 
-    One that is `listed` is a text of several names with commas, and may be typed once for each.
-    `same` says what of it must be the same when a stopped run resumes. `compared` says whether a
-    comparison of two runs tells it, if it must be the same: not what other facts of a run tell, nor
-    what changes no decision.
+    Args:
+        text: the help of its command-line option.
+        panel: the heading that the help stands below; empty for the first.
+        only: the world that alone has the setting, `frozen` or `closed-loop`; empty for both.
+        listed: whether it is a text of names with commas, and its option may be repeated.
+        same: what of it must be equal when a stopped run resumes: `ITSELF`, `OPENED` or `NOTHING`.
+        compared: whether a comparison of two runs reports it.
     """
     said = {"help": text, "panel": panel, "only": only, "listed": listed}
     return Meta(extra={**said, "same": same, "compared": compared})
 
 
 class HelperSettings(Struct, frozen=True, kw_only=True):
-    """Who answers for the helpers, and how, where that is not the ego's model, prompt and mode."""
+    """Hold the settings of the helpers' agents, where they differ from the ego's."""
 
     model: Annotated[
         str | None,
@@ -99,7 +102,7 @@ UntilDecided = Annotated[
 
 
 class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="frozen"):
-    """The frozen episodes that are evaluated."""
+    """Hold the settings of a frozen run's episodes: the dataset, and which of it to use."""
 
     dataset: Annotated[
         str,
@@ -134,7 +137,7 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
 
 
 class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="closed-loop"):
-    """The episodes that are driven in closed loop."""
+    """Hold the settings of a closed-loop run's episodes: the scenario and its layouts."""
 
     scenario: Annotated[
         str | None,
@@ -171,9 +174,9 @@ class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="cl
 
 
 class Settings(Struct, frozen=True, kw_only=True):
-    """All that decides an evaluation, as plain values; a run's `run.toml` is this record.
+    """Hold all settings of an evaluation as plain values, as a run's `run.toml` does.
 
-    What is not checked here is checked where it is used: `resolve.spec` makes live objects of it.
+    They are checked where they are used: `resolve.spec` opens what they name.
     """
 
     model: Annotated[
@@ -390,7 +393,11 @@ class Settings(Struct, frozen=True, kw_only=True):
 
 
 class Option(NamedTuple):
-    """An option of a command, made of a field of the settings."""
+    """Describe a command-line option, made from a field of the settings.
+
+    `path` is its place in `run.toml`, `name` that of the parameter, `kind` its Python type, and
+    `panel` the heading of its help.
+    """
 
     path: tuple[str, ...]  # the names of the table and the key in `run.toml`
     name: str  # as a parameter: helper_model
@@ -408,7 +415,7 @@ class Option(NamedTuple):
 
     @property
     def off(self) -> str:
-        """Return what is typed to turn it off, if it is a flag."""
+        """Return the text that turns the option off, if it is a flag."""
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
@@ -419,7 +426,7 @@ class Option(NamedTuple):
         return settings
 
     def words(self, value: Any) -> list[str]:
-        """Return the words that are typed for a value; none for None."""
+        """Return the command-line arguments that give the option this value; none for None."""
         if isinstance(value, bool):
             return [self.flag if value else self.off]
         values = value if isinstance(value, tuple) else () if value is None else (value,)
@@ -427,9 +434,7 @@ class Option(NamedTuple):
 
 
 def options(world: type[Struct]) -> list[Option]:
-    """Return the options of the command that walks a world, in the order of the fields;
-    extensions' last.
-    """
+    """Return the options of this world's command, in the order of fields; extensions' last."""
     declared = core_options(world)
     for name, setting in of_extensions().items():
         path, shape = (EXTENSIONS, name), (setting.kind, setting.default, setting.help)
@@ -438,14 +443,15 @@ def options(world: type[Struct]) -> list[Option]:
 
 
 def core_options(world: type[Struct]) -> list[Option]:
-    """Return the options of the core alone."""
+    """Return the options of the command for this world, without those of extensions."""
     tables: dict[str, type[Struct]] = {"helpers": HelperSettings, "world": world}
     return [*_options(Settings, str(world.__struct_config__.tag), tables)]
 
 
 def of_extensions() -> dict[str, Setting]:
-    """Return the settings that extensions add, by name;
-    one of the core's names is left out, with a line.
+    """Return the settings that extensions add, by name.
+
+    One with a name of the core's settings is left out.
     """
     joined = extensions.joined(HELP, "settings")
     return {name: setting for name, setting in joined.items() if name not in HELP}
@@ -476,7 +482,7 @@ def _kind(plain: Any) -> Any:
 
 
 def kind_of(settings: Settings) -> str:
-    """Return the kind of the world: `frozen` or `closed-loop`."""
+    """Return the kind of world of settings: `frozen` or `closed-loop`."""
     return str(settings.world.__struct_config__.tag)
 
 
@@ -503,7 +509,10 @@ COMPARED = dict.fromkeys(
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Return settings with some values changed, each by the name of its option."""
+    """Return settings with some values replaced; `given` is by the name of the option.
+
+    Raises UserError for a value of a wrong type.
+    """
     tables: dict[str, Any] = to_builtins(settings)
     for each in options(type(settings.world)):
         if each.name in given:
@@ -513,16 +522,14 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
 
 
 def deciding(settings: Settings) -> Settings:
-    """Return settings without those that may differ in one run;
-    whoever goes on with it says them.
-    """
+    """Return settings with defaults for those that may differ when a stopped run resumes."""
     declared = options(type(settings.world))
     free = {option.name: option.default for option in declared if option.same == NOTHING}
     return structs.replace(settings, **free)
 
 
 def words(settings: Settings) -> tuple[str, ...]:
-    """Return the words of a command with these settings, without `--out`; defaults are left out."""
+    """Return the command line of these settings, without defaults and without `--out`."""
     typed: list[str] = []
     for option in options(type(settings.world)):
         value = option.of(settings)
@@ -532,9 +539,9 @@ def words(settings: Settings) -> tuple[str, ...]:
 
 
 def difference(before: Settings, now: Settings) -> tuple[str, str]:
-    """Return the options that differ, as they are typed before and now; empty between two commands.
+    """Return the options that differ, as they are typed before and now, as two texts.
 
-    Those that may differ in one run are left out.
+    Those that may differ when a run resumes are left out; both are empty for different commands.
     """
     if type(before.world) is not type(now.world):
         return "", ""
@@ -548,7 +555,10 @@ def difference(before: Settings, now: Settings) -> tuple[str, str]:
 
 
 def of_words(typed: Sequence[str]) -> Settings:
-    """Return the settings of a command. Raises UserError if it is none that `words` writes."""
+    """Return the settings of a command line.
+
+    Raises UserError if it is none that `words` writes.
+    """
     try:
         kind = next(kind for kind, command in COMMANDS.items() if command == typed[1])
         flags = {flag: each for each in options(WORLDS[kind]) for flag in (each.flag, each.off)}
@@ -568,9 +578,7 @@ def of_words(typed: Sequence[str]) -> Settings:
 
 
 def text_of(settings: Settings) -> str:
-    """Return the text of `run.toml`:
-    every setting that has a value, also where it is the default.
-    """
+    """Return the text of a `run.toml` with every setting that has a value, defaults included."""
     beside = [word for own in _only_typed(settings).values() for word in own]
     again = _again(settings, Path(FILE), beside)
     lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
@@ -622,11 +630,11 @@ def _toml(value: Any) -> str:
 
 
 def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
-    """Return the settings of a file, or of a run's folder, with what the user typed beside it.
+    """Return the settings of a `run.toml`, or of a run's folder, with typed options `given` on top.
 
-    A file may come from a stranger: it names no model to open and no server to ask. Cards, prompts,
-    devices and datasets are looked up by name; a replay only reads another run's answers. Raises
-    UserError if it cannot be read, is of another command, or names what only a user may.
+    A file may come from a stranger, so it may name cards, prompts, devices, datasets and runs to
+    replay, but no other model to open and no server to ask. Raises UserError if it cannot be read,
+    is of another command, or names what only a user may.
     """
     file = file / FILE if file.is_dir() else file
     where = f"settings {printable(file)}"
@@ -735,7 +743,10 @@ def _is_card(model: str) -> bool:
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds of `0:5`, which are 0 to 4, or of `3,7,9`."""
+    """Return the seeds of a text such as `0:5`, which is 0 to 4, or `3,7,9`.
+
+    Raises UserError for any other text, or more than `MOST_SEEDS` seeds.
+    """
     start, colon, stop = text.partition(":")
     try:
         # A range is counted before it is made: 0:99999999999 would not fit into memory.

@@ -22,10 +22,9 @@ PROMPTS = "prompts"
 
 
 def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
-    """Write files, by their path within `sources`, to a run's folder in one step.
+    """Write the files that a run was made of to the folder `sources` in the run's folder `out`.
 
-    They are first written to its folder of unfinished work,
-    with which goes what a killed process left there.
+    `files` is by path within it. They replace what is there at once, by way of the folder `work`.
     """
     if read(out) == files:
         return
@@ -41,17 +40,16 @@ def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
 
 
 def read(out: Path) -> dict[str, bytes]:
-    """Return what `write` wrote to a folder, by path; links are left out."""
+    """Return the content of the files in a run folder's `sources`, by path; links are left out."""
     kept = out / SOURCES
     files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
     return {file.relative_to(kept).as_posix(): bytes_of(file, "text") for file in files}
 
 
 def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
-    """Return a prompt that a run states by `version` and `sha256`, installed or kept by the run.
+    """Return a prompt version with the digest that a run states: the installed one or its own copy.
 
-    None if neither has this digest. What a stranger's run keeps is rendered in the sandbox like any
-    prompt.
+    `stated` has the keys `version` and `sha256`. None if neither has this digest.
     """
     version, sha256 = stated["version"], stated["sha256"]
     if prompt := versions.as_it_was(version, sha256):
@@ -65,8 +63,9 @@ def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
 
 
 def lacking(run: Run) -> str | None:
-    """Return, in words, a prompt of the run that is neither here nor kept;
-    None if there is none.
+    """Return a sentence that names a prompt of the run which cannot be found; None if all are here.
+
+    A prompt is found if it is installed with the right digest, or stored in the run's folder.
     """
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         if prompt_of(run, agent["prompt"]) is None:

@@ -31,72 +31,91 @@ Setting = TypeVar("Setting")
 
 @dataclass(frozen=True)
 class Success:
-    """How success of episodes E counts."""
+    """Define how success of E episodes is averaged: plainly, or balanced over danger and none.
+
+    Balanced success is the mean of the rates with and without a danger.
+    """
 
     dangerous: Bools  # which of them have a danger, (E,)
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], lead: str) -> "Success":
-        """Return that of some episodes, one row of each, in runs that are read by `lead`."""
+        """Return the rule for these episodes, one record of each, with this headline metric."""
         return cls(
             np.array([lead == BALANCED and episode.danger != "none" for episode in episodes])
         )
 
     @property
     def metric(self) -> str:
-        """What leads."""
+        """Return the metric's name: balanced success if there are episodes of both kinds."""
         return BALANCED if 0 < self.dangerous.sum() < len(self.dangerous) else SUCCESS
 
     @property
     def words(self) -> str:
-        """The same for people."""
+        """Return the metric's name for people."""
         return IN_WORDS[self.metric]
 
     @property
     def plain(self) -> "Success":
-        """The same episodes, read by plain success."""
+        """Return the rule that averages the same episodes plainly."""
         return Success(np.zeros_like(self.dangerous))
 
     @property
     def ways(self) -> "tuple[Success, ...]":
-        """Plain success, and balanced success where that leads."""
+        """Return the plain rule, and then the balanced one if this is balanced."""
         return (self.plain, self) if self.metric == BALANCED else (self,)
 
     def mean(self, success: Floats) -> float:
-        """Return the mean of success, (S, E)."""
+        """Return mean success of values (S, E), plain or balanced as this rule says.
+
+        The axes are S channel seeds and E episodes.
+        """
         return float(
             np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts])
         )
 
     def estimate(self, success: Floats) -> Estimate:
-        """Return the same with its interval over episodes."""
+        """Return mean success of values (S, E) with its 95 % interval over episodes.
+
+        The axes are S channel seeds and E episodes.
+        """
         return self._mean(lambda part: over_episodes(SUCCESS, success[:, part]))
 
     def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
-        """Return success a - b, both (S, E), paired by episode."""
+        """Return the difference in success a - b, both (S, E), paired by episode, with interval.
+
+        The axes are S channel seeds and E episodes.
+        """
         return mean_difference([(self, a, b)], level)
 
     def any_time(self, success: Floats) -> Estimate:
-        """Return mean success, (S, E), with an interval over episodes that holds at every look."""
+        """Return mean success of values (S, E) with an anytime-valid interval over episodes.
+
+        It holds at every inspection of a run that is stopped early. The axes are S channel seeds
+        and E episodes.
+        """
         return any_time([known_mean(success, 0)[part] for part in self.parts])
 
     def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
-        """Return success a - b, both (S, E), paired by episode,
-        with an interval that holds at every look.
+        """Return success a - b, both (S, E), paired by episode, with an anytime-valid interval.
+
+        The axes are S channel seeds and E episodes.
         """
         return any_time_difference([known_mean(a - b, 0)[part] for part in self.parts])
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
-        """Return the p-value of no such difference; None without an interval."""
+        """Return the p-value of no difference between a and b, (S, E); None without an interval.
+
+        The axes are S channel seeds and E episodes.
+        """
         return p_of_mean([(self, a, b)])
 
     def most(self, successes: Mapping[str, Floats]) -> list[str]:
-        """Return the name with the most success, (S, E) each,
-        and then those that cannot be told from it.
+        """Return the name with the highest success, then those not significantly below it.
 
-        These are the names whose difference from it, paired by episode, has a p above `LEVEL`, by
-        Holm's method for all pairs, since the first was picked for being the best; or that have no
-        p.
+        `successes` has values (S, E) by name. These are names whose paired difference from the best
+        has a p above `LEVEL`, by Holm's method for all pairs since the best was picked, or that
+        have no p. The axes are S channel seeds and E episodes.
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
@@ -107,16 +126,19 @@ class Success:
         return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
-        """Return how much success b - a, both (S, E), varies where episodes count so often,
-        (..., E).
+        """Return the variance of success b - a, both (S, E), over episodes.
+
+        `counts` (..., E) says how often each episode counts in a bootstrap resample. The axes are S
+        channel seeds and E episodes.
         """
         differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
         return Spread(np.array([part.mean() for part in parts]), np.stack(variances, axis=-1))
 
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
-        """Return how often each episode counts, as in `statistics.resampled`,
-        (1 + times, E), by halves.
+        """Return how often each episode counts in bootstrap resamples, (1 + times, E).
+
+        The first row is the sample itself. Episodes with and without a danger are resampled apart.
         """
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
         for part in self.parts:
@@ -124,13 +146,16 @@ class Success:
         return counts
 
     def weights(self, counts: Ints) -> Floats:
-        """Return the weight of each episode in the mean where they count so often, (..., E)."""
+        """Return each episode's weight in the mean, (..., E), if it counts `counts` times."""
         shares = sum(part / (len(self.parts) * part.sum()) for part in self.parts)
         return np.asarray(counts * shares)
 
     @property
     def parts(self) -> list[Bools]:
-        """Which episodes are averaged first, (E,) each; the mean is of these means."""
+        """Return the masks (E,) of the groups that are averaged first: all, or both halves.
+
+        The mean by this rule is the mean of the groups' means.
+        """
         halves = [self.dangerous, ~self.dangerous]
         return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]
 
@@ -143,15 +168,20 @@ class Success:
 def by_condition(
     grid: Grid, episodes: Sequence[Episode], lead: str = BALANCED
 ) -> tuple[Success, dict[str, Floats]]:
-    """Return how success of a run's episodes counts, and success (S, E) by condition;
-    in the grid's order.
+    """Return the success rule of a run's episodes, and their success (S, E) by condition.
+
+    `episodes` are in the order of the grid; `lead` is the headline metric. The axes are S channel
+    seeds and E episodes.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], lead), values
 
 
 def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
-    """Yield the scores of success, and of gains in it, whose intervals hold at every look."""
+    """Yield the scores of success and its gains that have anytime-valid intervals.
+
+    `episodes` are in the order of the grid: by condition, seed and episode.
+    """
     success, values = by_condition(grid, episodes)
     for by in success.ways:
         for name, of_condition in values.items():
@@ -162,7 +192,7 @@ def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
 
 
 def is_gain(score: Score, conditions: Container[str]) -> bool:
-    """Return whether a row is a gain over `BASELINE` that can be computed: a file may state any."""
+    """Return whether a score is a paired gain over `BASELINE` between two of these conditions."""
     known = score.condition in conditions and BASELINE in conditions
     return known and score.interval == PAIRED and score.metric in GAINS.values()
 
@@ -173,27 +203,37 @@ Pairs = Sequence[tuple[Success, Floats, Floats]]
 
 @dataclass(frozen=True)
 class Plays(Generic[Setting]):
-    """Success of the same episodes under several settings, in one family of scenes or more."""
+    """Hold the success of the same episodes under several settings, by family of scenes.
+
+    A setting is what is compared, such as a condition's name.
+    """
 
     # of each family: how success counts, and success by setting, (S, E)
     families: Sequence[tuple[Success, Mapping[Setting, Floats]]]
 
     @property
     def plain(self) -> "Plays[Setting]":
-        """The same, read by plain success."""
+        """Return a copy in which every family's success is averaged plainly, not balanced."""
         return Plays([(rule.plain, success) for rule, success in self.families])
 
     def pairs(self, setting: Setting, base: Setting) -> Pairs:
-        """Return success under a setting and under the one that it is held against, by family."""
+        """Return for each family its success rule and success (S, E) of `setting` and of `base`.
+
+        The axes are S channel seeds and E episodes.
+        """
         return [(rule, success[setting], success[base]) for rule, success in self.families]
 
     def difference(self, setting: Setting, base: Setting) -> Estimate:
-        """Return the mean over families of the difference in success, paired by episode."""
+        """Return the mean over families of success of `setting` minus `base`, paired by episode."""
         return mean_difference(self.pairs(setting, base))
 
 
 def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
-    """Return the mean over families of success a - b, both (S, E), paired by episode."""
+    """Return the mean over families of success a - b, both (S, E), paired by episode.
+
+    The interval treats all families' episodes together. The axes are S channel seeds and E
+    episodes.
+    """
     parts = []
     for success, a, b in pairs:
         differences = known_mean(a - b, 0)
@@ -202,17 +242,17 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
 
 
 def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
-    """Return the same where there is a danger, or where there is none."""
+    """Return the mean over families of success a - b in episodes with a danger, or without."""
     parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
     return paired_difference(parts)
 
 
 def p_of_mean(pairs: Pairs) -> float | None:
-    """Return the p-value of no such difference; None without an interval."""
+    """Return the p-value of no mean difference over families; None without an interval."""
     return multiplicity.p_value(lambda level: mean_difference(pairs, level))
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:
-    """Return what is averaged over families: balanced only where it is in all of them."""
+    """Return rules that all average in one way: balanced only if every given rule is."""
     balanced = all(success.metric == BALANCED for success in successes)
     return [success if balanced else success.plain for success in successes]

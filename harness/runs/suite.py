@@ -26,8 +26,9 @@ SUMMARY = "summary.csv"  # the means over families
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of `suite.json`: the suite, and each family's run folder,
-    in the order of tables.
+    """Hold the content of `suite.json`: the suite's name, and the folder of each family's run.
+
+    A family is the scenes of one scenario; `families` maps its name to a folder's name.
     """
 
     format: str
@@ -42,7 +43,10 @@ class Contents(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class SuiteRun:
-    """Finished runs of one model, one for each family, under the same conditions and seeds."""
+    """Hold the finished runs of one model on all families of a suite (one scenario each).
+
+    They have the same conditions and seeds.
+    """
 
     path: Path  # the folder that holds the runs' folders
     name: str  # the suite's name
@@ -51,8 +55,9 @@ class SuiteRun:
 
     @property
     def manifest(self) -> Manifest:
-        """The first run's manifest with the counts of all runs, without times,
-        which differ by run.
+        """Return the first run's manifest with counts and cost summed over all runs.
+
+        Measured answer times are left out, since they differ by run.
         """
         manifests = [run.manifest for run in self.runs.values()]
         counts = ("cached_answers", "engine_errors", "retries")
@@ -75,19 +80,22 @@ class SuiteRun:
 
     @property
     def variant(self) -> Variant:
-        """The agents, in words, with the prompts of all families."""
+        """Return model, prompts (of all families) and answer mode, as names for tables."""
         prompts = dict.fromkeys(run.manifest.variant.prompt for run in self.runs.values())
         first = self.manifest.variant
         return Variant(first.model, " and ".join(prompts), first.answer)
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """The mean over families of each score with an interval over episodes or answers."""
+        """Return the means over families of all scores with intervals over episodes or answers."""
         return tuple(self._means())
 
     @cached_property
     def stated(self) -> tuple[Score, ...]:
-        """The same as the folder's own table says. Raises UserError if it is missing or broken."""
+        """Return the scores that the folder's `summary.csv` states, which `scores` computes.
+
+        Raises UserError if the file is missing or broken.
+        """
         return folder.whole(self.path / SUMMARY, folder.scores_of)
 
     def _means(self) -> Iterator[Score]:
@@ -113,18 +121,21 @@ class SuiteRun:
         return Score.of(score.condition, score.metric, gain, PAIRED)
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's mean over families; None if a family has no value."""
+        """Return a metric's mean over families in a condition; None if a family has no value."""
         of_metric = (s for s in self.scores if (s.condition, s.metric) == (condition, metric))
         return next((s for s in of_metric if s.value is not None), None)
 
 
 def plays(runs: Iterable[Run], lead: str) -> Plays[str]:
-    """Return success by condition of runs of one family each, which are read by `lead`."""
+    """Return the success of runs of one family each by condition, to compare conditions.
+
+    `lead` is the headline metric, plain or balanced success.
+    """
     return Plays([by_condition(run.grid, run.episodes, lead) for run in runs])
 
 
 def mean(scores: Sequence[Score]) -> Score:
-    """Return the mean of one metric's scores over families."""
+    """Return the mean of one metric's scores of several families, with its interval."""
     first = scores[0]
     return Score.of(
         first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval
@@ -132,7 +143,10 @@ def mean(scores: Sequence[Score]) -> Score:
 
 
 def contents_of(path: Path) -> Contents:
-    """Read the contents of a suite's folder. Raises UserError if it is none."""
+    """Return the content of a suite folder's `suite.json`.
+
+    Raises UserError if there is none, or it is broken or of another version.
+    """
     contents = folder.whole(
         path / SUITE, lambda file: msgspec.json.decode(text_of(file, "record"), type=Contents)
     )
@@ -142,10 +156,10 @@ def contents_of(path: Path) -> Contents:
 
 
 def read(path: Path) -> SuiteRun:
-    """Read a suite's folder.
+    """Read a suite's folder and return its runs.
 
-    Raises UserError if it holds no suite,
-    or a run of it is not finished or has another model, other conditions or seeds.
+    Raises UserError if it holds no suite, or a run is not finished or has another model, other
+    conditions or other seeds than the first.
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}
@@ -165,7 +179,7 @@ def _shared_settings(run: Run) -> Any:
 
 
 def write(suite: SuiteRun) -> None:
-    """Write the means, then `suite.json`, which makes the folder a suite's."""
+    """Write a suite's `summary.csv`, the means over families, and then its `suite.json`."""
     write_whole(suite.path / SUMMARY, csv_text(Score, suite.scores, suite.variant))
     families = {family: run.path.name for family, run in suite.runs.items()}
     contents = Contents(

@@ -50,7 +50,11 @@ from harness.runs.reliability import Judged, estimates
 
 @dataclass(frozen=True)
 class Figures:
-    """What the scores of some episodes of a run are computed from."""
+    """Hold all that a run's scores are computed from, for some of its episodes.
+
+    `values` has each metric's values by episode, (C, S, E), for C conditions, S channel seeds and E
+    episodes.
+    """
 
     grid: Grid  # the episodes
     values: Mapping[str, Floats]  # each metric's values by episode, (C, S, E)
@@ -68,7 +72,7 @@ class Figures:
         episodes: Sequence[Episode],
         answers: Iterable[Answer | AnswerFacts],
     ) -> "Figures":
-        """Compute the figures; `episodes` are in the order of the grid."""
+        """Compute the figures of a run; `episodes` are in the order of the grid."""
         cells, latency_ms = grid.places(decisions), decisions["latency_ms"]
         places = cells // len(grid.episodes)
         order = np.argsort(places, kind="stable")
@@ -87,7 +91,7 @@ class Figures:
 
     @classmethod
     def joined(cls, parts: Sequence["Figures"]) -> "Figures":
-        """Join the figures of parts of a run, which differ in their episodes."""
+        """Join the figures of parts of a run, which have different episodes."""
         episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
         values = {}
         for name in parts[0].values:
@@ -104,9 +108,7 @@ class Figures:
         )
 
     def scores(self, older: bool = False) -> list[Score]:
-        """Return the scores, those of judged decisions by the `older` rules of
-        `reliability.estimates`.
-        """
+        """Return the scores of all metrics; with `older`, calibration by the rules of version 1."""
         names = known_in(self.values)
         return [
             *of_conditions(self.grid.conditions, self.values, names),
@@ -122,8 +124,9 @@ class Figures:
 def of_conditions(
     conditions: Sequence[str], values: Mapping[str, Floats], names: Sequence[str]
 ) -> Iterator[Score]:
-    """Yield these metrics' scores in each condition, over seeds and over episodes,
-    from values (C, S, E).
+    """Yield the scores of the metrics `names` in each condition, from their values (C, S, E).
+
+    Each has a score with an interval over seeds, and one with an interval over episodes.
     """
     for index, condition in enumerate(conditions):
 
@@ -139,9 +142,9 @@ def of_conditions(
 
 
 def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
-    """Yield each condition's latency percentiles, means over seeds.
+    """Yield the scores of each condition's latency percentiles, in ms, as means over seeds.
 
-    `latency_ms` has the decisions' latencies for each condition and seed, in the order of the grid.
+    `latency_ms` has an array (n,) for each condition and seed, in the order of the grid.
     """
     names = {m.percentile: m.name for m in METRICS.values() if m.percentile}
     all_percentiles = np.array([percentiles(latencies) for latencies in latency_ms])
@@ -154,8 +157,9 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
 
 
 def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
-    """Return each condition's decisions with exactly one optimal action;
-    `cells` (n,) are `Grid.places`.
+    """Return for each condition its decisions with exactly one optimal action.
+
+    `cells` (n,) is the index of each decision's episode in the grid (`Grid.places`).
     """
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)
@@ -219,8 +223,9 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
-    """Return the episodes in the order of the grid,
-    with the columns that follow from their decisions.
+    """Return the episodes in the order of the grid, with the columns computed from decisions.
+
+    These are counts and means such as messages, latency in ms and deadline misses.
     """
     ordered, places = grid.ordered(episodes), grid.places(decisions)
     n = len(ordered)

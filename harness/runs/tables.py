@@ -42,7 +42,7 @@ PLACE = ["scene", "episode", "step", "danger"]
 
 @dataclass(frozen=True)
 class Tables:
-    """A finished run, frozen or closed-loop, as tables.
+    """Hold a finished run, frozen or closed-loop, as pandas tables.
 
     Each table is read on first use, and raises UserError if its file is missing or broken.
     """
@@ -53,20 +53,19 @@ class Tables:
 
     @cached_property
     def summary(self) -> "pd.DataFrame":
-        """One row for each condition, metric and interval: summary.csv."""
+        """Return `summary.csv`: one row for each condition, metric and kind of interval."""
         return self._csv("summary.csv")
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """One row for each episode, condition and seed: episodes.csv."""
+        """Return `episodes.csv`: one row for each episode, condition and seed."""
         return self._csv("episodes.csv")
 
     @cached_property
     def agents(self) -> "pd.DataFrame":
-        """One row for each agent of an episode: `journeys` of episodes.csv;
-        none where only the ego decides.
+        """Return one row for each deciding vehicle of an episode: `journeys` of `episodes.csv`.
 
-        `gave_way` says whether it is the one that lost most.
+        It is empty where only the ego decides. `gave_way` says whether it lost the most time.
         """
         import pandas as pd
 
@@ -85,14 +84,12 @@ class Tables:
 
     @cached_property
     def decisions(self) -> "pd.DataFrame":
-        """One row for each decision point, condition and seed: decisions.parquet."""
+        """Return `decisions.parquet`: one row for each decision point, condition and seed."""
         return self.source.decisions.frame()
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """One row for each answer: answers.jsonl,
-        with the episode and step of its decision point.
-        """
+        """Return `answers.jsonl`: one row for each answer, with its scene's episode and step."""
         import numpy as np
         import pandas as pd
 
@@ -138,8 +135,9 @@ class Tables:
 
 
 def tables_of(run: Path, kind: type[T]) -> T:
-    """Load a run from its folder. Raises UserError if it holds no finished run,
-    or one of another version.
+    """Load a run from its folder as tables of the class `kind`.
+
+    Raises UserError if it holds no finished run, or one of another format version.
     """
     source = read(run)
     return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)

@@ -21,12 +21,12 @@ _WHO: dict[Role, str] = {
 
 
 class Tally:
-    """How many questions were asked in each role, and how many of them got which error.
+    """Count a run's requests by role, and those that got an error instead of an answer.
 
     Attributes:
-        asked: questions by role.
-        unanswered: questions without an answer by role.
-        words: how often each error came, as its server or engine says it.
+        asked: number of requests by role.
+        unanswered: number of requests without an answer by role.
+        words: number of times that each error message came.
     """
 
     def __init__(self, answers: Iterable[Answer | AnswerFacts] = ()) -> None:
@@ -44,7 +44,11 @@ class Tally:
 
     @property
     def missing(self) -> frozenset[Role]:
-        """The roles whose questions without an answer are more than lost messages."""
+        """Return the roles with too many unanswered requests, so that a run has no valid result.
+
+        Any is too many for the ego and for fusion calls; of helpers' a share of `MOST_LOST`, since
+        one of theirs counts as a lost message.
+        """
         lost = sum(n for role, n in self.unanswered.items() if is_helper(role))
         asked = sum(n for role, n in self.asked.items() if is_helper(role))
         too_many = lost and lost >= MOST_LOST * asked
@@ -63,7 +67,7 @@ class Tally:
         return f"{'; '.join(words)}: no answer to {self.counts()}"
 
     def counts(self) -> str:
-        """Return how many questions got no answer, by role; empty if all did."""
+        """Return a phrase on how many requests got no answer, by role; empty if all got one."""
         roles = dict.fromkeys((*_WHO, *sorted(self.unanswered)))
         return ", ".join(
             f"{self.unanswered[role]} of {self.asked[role]} questions to "
@@ -74,22 +78,24 @@ class Tally:
 
 
 def tally(run: Run) -> Tally:
-    """Count a finished run's questions;
-    none where its manifest has no errors, and no answer is read.
+    """Return the counts of a finished run's requests and errors.
+
+    They are empty, and the answers unread, if the manifest states no errors.
     """
     return Tally(run.answers if run.manifest.engine_errors else ())
 
 
 def lacking(run: Run) -> Iterator[Answer]:
-    """Yield the questions without an answer that a finished run cannot do without."""
+    """Yield the unanswered requests that leave a finished run without a valid result."""
     missing = tally(run).missing
     if missing:
         yield from (a for a in run.answers if a.error is not None and a.role in missing)
 
 
 def why(path: Path) -> str | None:
-    """Return why the results of a run are none, be it finished or not:
-    its model could not be asked.
+    """Return why a run's folder has no valid result because its model did not answer; else None.
+
+    The run may be finished or not.
     """
     if (path / "run.json").is_file():
         counts = tally(read(path))

@@ -18,7 +18,11 @@ from harness.core.work import LOCK
 
 @dataclass(frozen=True)
 class Extent:
-    """What an unfinished run has done."""
+    """Hold how far an unfinished run is, as `extent` reads it.
+
+    `going` is whether a process works on it, `done` the finished episodes of `due`, which is None
+    for a shard.
+    """
 
     going: bool  # whether a process works on it now
     done: int  # episodes that are at their end in all conditions and seeds
@@ -28,10 +32,10 @@ class Extent:
 
 
 def extent(run: Path) -> Extent:
-    """Return how far an unfinished run is. What is broken, or a link, counts as not done.
+    """Return how far an unfinished run in a folder is; broken files and links count as not done.
 
-    An episode counts once its part of the run is written, which has many;
-    so the answers for the parts that are not written are counted, too.
+    Episodes count once their part of the run, which has many, is written; `answers` counts those
+    stored for parts that are not.
     """
     work = run / WORK
     names = _names(work)

@@ -39,9 +39,16 @@ def write(
     scores: Sequence[Score],
     layouts: Sequence[Layout] = (),
 ) -> None:
-    """Write a run's files, the manifest last.
+    """Write a run's files into the folder `out`, the manifest last.
 
-    The decisions are already rounded; the lines of `answers.jsonl` come some at a time.
+    Args:
+        out: the run's folder.
+        manifest: for `run.json`.
+        decisions: for `decisions.parquet`, already rounded.
+        episodes: for `episodes.csv`.
+        answers: pieces of the content of `answers.jsonl`.
+        scores: for `summary.csv`.
+        layouts: for `difficulty.csv`, which is not written without any.
     """
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
@@ -57,18 +64,18 @@ def write(
 
 
 def lines(answers: Sequence[Answer]) -> bytes:
-    """Return answers as lines of `answers.jsonl`."""
+    """Return answers encoded as lines of JSON, as `answers.jsonl` has them."""
     return _ENCODER.encode_lines(answers)
 
 
 def ordered(
     answers: Iterable[Answer], decisions: Decisions, viewers: Mapping[str, Sequence[str]] = NOBODY
 ) -> list[Answer]:
-    """Sort answers by decision point, and there:
-    the ego's, the helpers', by another question the helpers', fusion calls'.
+    """Return answers in the order of `answers.jsonl`: by scene, in the order of the decisions.
 
-    Those of one kind are in the order of the decision point's `viewers`, where these are known.
-    Answers for a decision point without a decision, or by nobody among its viewers, are left out.
+    In a scene come the ego's, the helpers' to the plain question, their answers to other questions,
+    then fusion calls, each in the order of `viewers` (vehicle ids by scene). Answers of a scene
+    without a decision, or by another vehicle, are left out.
     """
 
     def place(answer: Answer) -> tuple[Any, ...]:
@@ -81,8 +88,9 @@ def ordered(
 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
-    """Return records as CSV: the columns of the variant, then a column for each field;
-    None is empty.
+    """Return records as CSV: the columns of `variant`, then one for each field; None is empty.
+
+    Columns of `formats.SPARSE` are left out if no record has a value.
     """
     text, records = io.StringIO(), list(records)
     writer = csv.writer(text, lineterminator="\n")
