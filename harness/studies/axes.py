@@ -35,7 +35,10 @@ Value = float | str
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that varies."""
+    """Describe one thing that a sweep can vary: a setting of operating points, or vehicles.
+
+    A value times `scale` is the setting `field`, which is None for the number of vehicles.
+    """
 
     name: str  # what `--over` calls it
     label: str  # what an axis of a figure says, with its unit
@@ -47,12 +50,14 @@ class Axis:
 
     @property
     def values(self) -> str:
-        """The grid if none is given; empty if one must be."""
+        """Return the text of the default grid; empty if the user must give one."""
         return ",".join(self.named()) if self.named else self.usual
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
-        """Return the operating point with this setting.
-        Raises UserError where it is not allowed.
+        """Return the operating point with this axis at a value, which is in the axis's unit.
+
+        For the number of vehicles it is unchanged. Raises UserError for a value that is not
+        allowed.
         """
         if self.field is None:
             return point
@@ -90,7 +95,10 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Return an axis by its name, or by that of any setting in its own unit. Raises UserError."""
+    """Return the axis of this name, or one for any setting of that name in its own unit.
+
+    Raises UserError if there is no such setting.
+    """
     if name in AXES:
         return AXES[name]
     usual = {name: POINTS["6g"].setting(name)} if name in typed_settings() else _usual()
@@ -104,11 +112,12 @@ def axis_of(name: str) -> Axis:
 
 
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
-    """Return values of an axis: a list `0,10,20`, ranges `from:to[:step]` with both ends,
-    or both mixed.
+    """Return the values of an axis that a text states, or its default grid for None.
+
+    The text is a list such as `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
 
     Raises:
-        UserError: it is none, or too long.
+        UserError: the text cannot be read, or there are more than `MOST_POINTS` values.
     """
     if text is not None and not text.strip():
         raise UserError(f"--grid: no values for {axis.name}; give some, or leave it out")
@@ -139,8 +148,9 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 
 def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
-    """Return the usual values of an axis, of words those that the point allows.
-    Raises UserError for none.
+    """Return the default values of an axis, without words that the operating point does not allow.
+
+    Raises UserError if the axis has no default grid.
     """
     return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
 
@@ -192,7 +202,7 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Setting:
-    """One grid point of a panel."""
+    """Hold one grid point of a sweep: an operating point, the vehicle count and what was varied."""
 
     condition: str  # name of the operating point that it is a change of
     point: OperatingPoint  # the operating point
@@ -203,7 +213,10 @@ class Setting:
 
     @property
     def place(self) -> dict[str, Value | None]:
-        """The columns that name it in a table; one more for each of several axes."""
+        """Return the columns that identify it in a table: `condition`, `variable` and `value`.
+
+        If several axes are crossed, there is one more column for each of them.
+        """
         place = {"condition": self.condition, "variable": self.variable}
         if not isinstance(self.value, tuple):
             return {**place, "value": self.value}
@@ -213,8 +226,9 @@ class Setting:
 
 
 def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
-    """Return every combination of the values of several axes.
-    Raises UserError if there are too many.
+    """Return all combinations of the values of several axes, one tuple for each grid point.
+
+    Raises UserError if there are more than `MOST_POINTS`.
     """
     values = list(product(*grids))
     if len(values) > MOST_POINTS:
@@ -226,7 +240,7 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the grid points, complete, for a manifest."""
+    """Return the grid points of all panels with every setting, as plain values for a manifest."""
     rows: dict[str, list[dict[str, Any]]] = {}
     for name, settings in panels.items():
         rows[name] = []

@@ -17,8 +17,11 @@ COMPARED = ("frozen", "closed", "difference", "agreement")
 
 
 def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
-    """Return the estimates of `COMPARED` from the success of the same episodes in both worlds,
-    (S, E) each.
+    """Return estimates from the success of the same episodes in both worlds, (S, E) each.
+
+    They are success in frozen scenes and in closed loop, their difference, and the share of
+    episodes that end alike, by the names in `COMPARED`. The axes are S channel seeds and E
+    episodes.
     """
     return {
         "frozen": over_episodes(SUCCESS, frozen),
@@ -31,8 +34,10 @@ def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
 def rank(
     dataset: Dataset, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, dict[str, Estimate]]:
-    """Return each reference driver's `COMPARED` over a dataset's episodes,
-    every one of which it drives.
+    """Drive a dataset's episodes with each reference driver, and compare with its frozen success.
+
+    It returns the estimates of `compared` by driver. `progress` is called with the number of
+    episodes just driven.
     """
     from harness.world.reference import drive_apart
 

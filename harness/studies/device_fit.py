@@ -21,7 +21,11 @@ READOUT, WRITTEN, DECISION = "readout", "written", "decision"
 
 @dataclass(frozen=True)
 class Fit:
-    """One answer of a model on a device, asked alone; NaN where a number of it is not known."""
+    """Hold the time and energy of a model's answer on a device at batch size 1; NaN if unknown.
+
+    For a run's answers, tokens and `seconds` are medians, `joules` is the mean, and `in_time` the
+    share within the decision window.
+    """
 
     row: DeviceRow  # the model's
     answer: str  # `readout`, which is one token, `decision`, which is none, or how it is written
@@ -36,8 +40,9 @@ class Fit:
 def fits(
     device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float
 ) -> list[Fit]:
-    """Return each row with each kind of answer,
-    of which `window_s` is the time from seeing to the answer.
+    """Return the time and energy of each kind of answer with each row (model) of a device profile.
+
+    `window_s` is the longest time from seeing to the answer that counts as in time.
     """
     results = []
     for row in rows:
@@ -48,7 +53,11 @@ def fits(
 
 @dataclass(frozen=True)
 class Answers:
-    """Token counts of the answers that are to fit a device."""
+    """Hold the token counts of n answers whose time and energy on a device are asked for.
+
+    `output` has output tokens by kind of answer; `episodes` is the episode of each, None for one
+    assumed answer.
+    """
 
     prompt: Floats  # tokens read, (n,)
     output: dict[str, Floats]  # tokens written by kind of answer, each (n,)
@@ -57,17 +66,18 @@ class Answers:
 
 
 def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
-    """Return one answer of so many tokens, read out or written."""
+    """Return the token counts of one assumed answer: as a read-out of one token, and written."""
     output = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
     return Answers(np.array([float(prompt_tokens)]), output)
 
 
 def answers_of(run: Run) -> Answers:
-    """Return the ego's answers of a run, as given,
-    and as if one letter of each prompt were read out.
+    """Return the token counts of a run's answers of the ego: as given, and as read-outs.
+
+    A read-out takes one output token.
 
     Raises:
-        UserError: nobody counted their tokens.
+        UserError: the run's ego has no answer with counted tokens.
     """
     egos = [answer for answer in run.answers if answer.role == "ego" and answer.error is None]
     counts = np.array([tokens(answer) for answer in egos], dtype=float).reshape(-1, 2)
@@ -105,8 +115,9 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A figure of a run's answers that were asked alone,
-    beside what a device profile says of it.
+    """Hold a measured time or token rate of a run beside what a device profile states for it.
+
+    `what` names it, `role` is whose answers were measured.
     """
 
     what: str  # `seconds` of an answer, or a rate by its name in a profile
@@ -116,8 +127,9 @@ class Comparison:
 
 
 def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
-    """Compare a profile with a run's own times.
-    Raises UserError if no answer of the run was asked alone.
+    """Return comparisons of a device profile's row with the times that a run measured, by role.
+
+    Only answers that were asked one at a time count. Raises UserError if there are none.
     """
     alone: dict[str, list[Answer]] = {}  # by role
     for answer in run.answers:

@@ -24,7 +24,10 @@ WINDOWS = 5  # of asking; the intervals are over them
 
 @dataclass(frozen=True)
 class Power:
-    """What one meter says."""
+    """Hold the power and energy that one meter measured while a model answered.
+
+    `answer_j` is joules an answer, `more_j` the part of it above idle power.
+    """
 
     meter: str  # its name
     idle_watts: float  # before, while nothing is asked
@@ -41,21 +44,21 @@ def measure(
     progress: Callable[[int], None],
     sleep: Callable[[float], None] = time.sleep,
 ) -> tuple[list[Power], int]:
-    """Ask alone, again and again, for some windows of time, and say what that took.
+    """Measure the energy of a model's answers, asked one at a time for several windows of time.
 
     Args:
-        backend: the model; the first answer of it, which pays for warming up, is not counted.
-        requests: asked in turn.
-        meters: one or more.
+        backend: the model; its first answer, which includes warming up, is not counted.
+        requests: the requests, asked in turn.
+        meters: one energy meter or more.
         window_s: least seconds of a window; meters are coarse, so 2 or more.
         progress: called with 1 after each window.
-        sleep: idles.
+        sleep: waits so many seconds, to measure idle power.
 
     Returns:
-        What each meter says, and how many answers there were.
+        What each meter measured, and the number of answers.
 
     Raises:
-        Unanswered: a question got no answer.
+        Unanswered: a request got no answer.
     """
     _ask(backend, requests[0])
     begun = time.perf_counter()
@@ -92,7 +95,7 @@ def measure_agent(
     device: str | None,
     progress: Callable[[int], None],
 ) -> tuple[list[Power], int]:
-    """Load an agent's model on a device, and `measure` it with questions of the default dataset."""
+    """Load an agent's model on a device and `measure` it with scenes of the default dataset."""
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))
     asked = list(requests(spec, data.scenes(data.forest.ids[:10])))

@@ -64,7 +64,11 @@ Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, 
 
 @dataclass(frozen=True)
 class WalkResult:
-    """What a walk at one operating point came to, for some seeds and episodes of each."""
+    """Hold the results of one operating point for all channel seeds S and some episodes E.
+
+    `ends` has outcomes by metric, (S, E); `columns` has values of the n decisions, and `places`
+    each decision's index in the flattened (S, E).
+    """
 
     episodes: Ints  # their numbers, (E,)
     # each of `ENDS`, and success by danger where that is known, (S, E); NaN where an episode was
@@ -76,23 +80,26 @@ class WalkResult:
 
 @runtime_checkable
 class Source(Protocol):
-    """Whose intents are coordinated: a run's, or those that an extension draws."""
+    """Describe where a study's intents (distributions over actions) come from.
+
+    It is a finished run, or what an extension draws.
+    """
 
     name: str  # what figures call it
     episodes: int  # how many a seed plays
     same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:
-        """Return what a reader needs to know of where the intents come from."""
+        """Return where the intents come from, as plain values for the study's manifest."""
         ...
 
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Yield walks at each grid point in turn, in parts of some episodes;
-        every point has the same draws.
+        """Yield for each grid point its results, in parts of some episodes.
 
-        A grid point's vehicles are the nearest ones. Its parts are taken before the next point.
+        All grid points have the same channel draws. A grid point's vehicles are the ones nearest to
+        the ego. Its parts must be consumed before the next grid point.
         """
         ...
 
@@ -101,8 +108,9 @@ SOURCES = Plugins[Source]("swarmdrive.sources", Source, {})  # those that extens
 
 
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
-    """Return what a study's metrics are computed from, by the names in `COLUMNS`:
-    a number for each decision.
+    """Return the columns of n decisions that a study's metrics need, by name, (n,) each.
+
+    The names are `COLUMNS`.
     """
     every = columns(part)
     return {name: every[name] for name in COLUMNS}
@@ -117,10 +125,17 @@ def walk_through(
     ties: str,
     read: Read = metric_columns,
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
-    """Yield what is read of each point's decisions, rounded as rows, and `places`.
+    """Yield for each operating point the columns of its decisions and the index of their episodes.
 
-    `episodes` (E,) are ascending. What is read of messages, (n, H),
-    is NaN where a step has fewer helpers.
+    Args:
+        world: where decisions come from and lead to.
+        points: the operating points.
+        ask: returns what vehicles intend in scenes.
+        seeds: channel seeds, S of them.
+        episodes: numbers of the episodes, ascending, (E,).
+        ties: which of equally likely actions is taken, `drawn` or `first`.
+        read: returns columns of some decisions, (n,), or (n, H) for messages; they are rounded, and
+            NaN where a step has fewer helpers. The index is into (S, E) in row-major order.
     """
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
@@ -154,7 +169,11 @@ def _below(arrays: Sequence[Floats]) -> Floats:
 
 @dataclass(frozen=True)
 class PanelResult:
-    """What a source came to at the grid points of a panel."""
+    """Hold the results of one source at the grid points of a panel, as pandas tables.
+
+    A panel is a named set of grid points. `summary` has a row for each grid point, metric and kind
+    of interval, `episodes` one for each grid point, seed and episode.
+    """
 
     # a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`,
     # `metric`, `mean`, `ci_low`, `ci_high`, `n`, `interval`
@@ -169,11 +188,10 @@ def play(
     seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> PanelResult:
-    """Play every grid point with every seed of the channel,
-    which is paired with itself across the points.
+    """Compute the results of a source at every grid point, with every channel seed.
 
-    `panel` is what tables call this set of grid points;
-    `progress` is called with 1 for each of them.
+    The same seed gives the same draws at all grid points. `panel` is the name of this set of grid
+    points in tables; `progress` is called with 1 after each of them.
     """
     import pandas as pd
 
@@ -235,7 +253,10 @@ def _part(walked: WalkResult, seeds: int) -> _Part:
 
 
 def by_episode(walked: WalkResult, names: Sequence[str]) -> dict[str, Floats]:
-    """Return metrics of decisions by name, each (S, E); NaN where an episode was left out."""
+    """Return metrics of decisions by name, each (S, E); NaN where an episode was left out.
+
+    The axes are S channel seeds and E episodes.
+    """
     success = walked.ends["success_rate"]
 
     def metric(name: str) -> Floats:
@@ -261,12 +282,12 @@ def _estimates(
 
 
 def over_own_episodes(name: str, values: Floats) -> Estimate:
-    """Return Student's t over seeds that have episodes of their own, of a metric's values (S, E).
+    """Return the mean of a metric's values (S, E) with Student's t over seeds.
 
-    A stratified share of E episodes is exact but for rounding to whole ones, so that seeds may
-    agree to the last episode and be wrong by the same. Half an episode, the largest standard
-    deviation that rounding up or down can have, is the least that the means of a yes or no count as
-    having.
+    It is for seeds that have different episodes. A stratified share of E episodes is exact but for
+    rounding to whole ones, so that seeds may agree to the last episode and be wrong by the same.
+    Half an episode, the largest standard deviation that rounding can have, is the least that the
+    means of a yes or no count as having.
     """
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:
@@ -279,7 +300,7 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
 
 
 def joined(parts: Sequence[PanelResult]) -> PanelResult:
-    """Return the results of several panels or sources, one below the other."""
+    """Return the tables of several panels or sources, concatenated."""
     import pandas as pd
 
     summary = pd.concat([part.summary for part in parts], ignore_index=True)

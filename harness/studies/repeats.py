@@ -45,9 +45,7 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """Return the runs of several repeats, each with the next sampling seed,
-    by the name of their folders.
-    """
+    """Return the evaluations of several repeats by folder, each with the next sampling seed."""
     first = spec.settings.sampling_seed
     return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
 
@@ -59,9 +57,10 @@ def run_repeats(
     progress: Progress,
     cache_file: Path | None,
 ) -> "Repeats":
-    """Evaluate every repeat in a folder of its own under `out`; those that are there stay.
+    """Evaluate every repeat in a folder of its own under `out`; finished ones are kept.
 
-    Completions are kept between runs in the cache file, if there is one.
+    A repeat differs from others only in the random sampling of the model's answers. `cache_file`
+    keeps completions between runs; None for no cache.
 
     Raises:
         UserError: the folder holds something else, or a model is not available.
@@ -75,8 +74,10 @@ def run_repeats(
 
 
 class Wavering(NamedTuple):
-    """A decision point at which repeats decided otherwise,
-    and how often each action was decided.
+    """Hold a decision point at which repeats take different actions.
+
+    `flips` is the share of pairs of repeats that differ, and `actions` counts how often each action
+    was taken.
     """
 
     scene: str
@@ -87,7 +88,7 @@ class Wavering(NamedTuple):
 
 @dataclass(frozen=True)
 class Repeats:
-    """Runs that differ in the draws of their answers alone."""
+    """Hold two or more runs that differ only in the random sampling of the model's answers."""
 
     path: Path  # the folder that theirs lie in
     runs: tuple[Run, ...]  # two or more
@@ -100,17 +101,17 @@ class Repeats:
 
     @property
     def k(self) -> int:
-        """How many repeats there are."""
+        """Return the number of repeats."""
         return len(self.runs)
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the operating points."""
+        """Return the names of the conditions (operating points)."""
         return self.runs[0].conditions
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """All figures, as a run's summary has its own."""
+        """Return all metrics of the repeats, with intervals over episodes, like a run's summary."""
         scores = []
         for place, condition in enumerate(self.conditions):
             for metric, estimate in self._of_condition(place):
@@ -120,7 +121,7 @@ class Repeats:
         return tuple(scores)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
-        """Return one figure; NaN where it is not known."""
+        """Return a metric's estimate in a condition; NaN where it is unknown."""
         key = (condition, metric)
         return next(s.estimate for s in self.scores if (s.condition, s.metric) == key)
 
@@ -168,9 +169,7 @@ class Repeats:
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """Return the decision points that repeats disagree on,
-        those with most pairs that do first.
-        """
+        """Return up to `most` decision points at which repeats differ, most pairs first."""
         scenes, counts, _ = self._actions
         shares = np.nan_to_num(known_mean(flips(counts), axis=-1))
         n = counts.sum(axis=-1)
@@ -184,7 +183,7 @@ class Repeats:
         return [point for point in points if point.flips > 0]
 
     def copies(self) -> Iterator[str]:
-        """Yield a sentence for repeats whose answers are the same, word for word."""
+        """Yield a sentence for each group of repeats whose answers are identical texts."""
         alike: dict[frozenset[tuple[str, str]], list[str]] = {}
         for run in self.runs:
             said = frozenset((answer.id, answer.raw) for answer in run.answers)
@@ -219,8 +218,9 @@ class Repeats:
 
 
 def flips(counts: Ints) -> Floats:
-    """Return the share of pairs of repeats that act differently, (...), of counts (..., A);
-    NaN for none.
+    """Return the share of pairs of repeats with different actions, (...); NaN without any pair.
+
+    `counts` (..., A) is the number of repeats that took each action.
     """
     n = counts.sum(axis=-1)
     pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
@@ -228,23 +228,26 @@ def flips(counts: Ints) -> Floats:
 
 
 def stable(counts: Ints) -> Floats:
-    """Return 1 where all repeats act alike, else 0, (...), of counts (..., A);
-    NaN for fewer than two.
+    """Return 1 where all repeats took the same action, else 0, (...); NaN for fewer than two.
+
+    `counts` (..., A) is the number of repeats that took each action.
     """
     n = counts.sum(axis=-1)
     return np.where(n > 1, counts.max(axis=-1) == n, np.nan)
 
 
 def all_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return the probability that j of k repeats, drawn without replacement,
-    all succeed: pass^j.
+    """Return pass^j: the probability that j of k repeats, drawn without replacement, all succeed.
+
+    `wins` is the number of successes among the k repeats; the result has its shape.
     """
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
 
 def any_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return the probability that one or more of j of k succeed:
-    any@j without bias (Chen et al. 2021).
+    """Return any@j: the probability that one or more of j of k repeats succeed.
+
+    It is the unbiased estimate of pass@k (Chen et al. 2021). `wins` is the number of successes.
     """
     return 1 - all_of(k - wins, k, j)
 
@@ -254,11 +257,11 @@ def _choose(n: Floats, j: int) -> Floats:
 
 
 def between_share(values: Floats) -> Estimate:
-    """Return the share of variance of values (E, k) between episodes:
-    ICC(1) of Shrout and Fleiss (1979).
+    """Return the share of the variance of values (E, k) that lies between episodes.
 
-    Below 0 where repeats of one episode differ more than episodes do;
-    NaN where nothing differs. The interval resamples episodes.
+    It is the intraclass correlation ICC(1) of Shrout and Fleiss (1979): below 0 where k repeats of
+    an episode differ more than episodes do, NaN where nothing differs. The interval is a bootstrap
+    over episodes.
     """
     n, k = values.shape
     unknown = Estimate(math.nan, math.nan, math.nan, n, 0)
@@ -297,7 +300,7 @@ NATS = Unit("nats", 2)
 
 
 def repeats_study(repeats: Repeats) -> Study:
-    """Declare the study of repeats."""
+    """Return the study of repeats: its tables, figures, sentences and manifest."""
     import pandas as pd
 
     first, source, k = repeats.runs[0].manifest, repeats.runs[0].source, repeats.k
@@ -426,14 +429,12 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
 
 
 def nats(e: Estimate) -> str:
-    """Return an entropy with its interval; a dash where it is not known."""
+    """Return an entropy with its interval as text; a dash where it is unknown."""
     return shown(e, NATS)
 
 
 def headline(repeats: Repeats) -> list[str]:
-    """Say how often decisions flip, how much of success is chance,
-    and what the ego states of it.
-    """
+    """Return sentences on how often decisions differ between repeats, on success and entropy."""
     return [_flip_sentence(repeats), *_variance_sentence(repeats), *_entropy_sentence(repeats)]
 
 

@@ -60,18 +60,21 @@ MORE = "more-answers.jsonl"
 
 
 class ReplayedRun:
-    """An evaluated run, with its own inference times or the `paper`'s.
+    """Replay a finished run's answers at other operating points, as a source of intents.
+
+    An intent is a vehicle's distribution over the ego's actions. Answers that the run lacks are
+    asked of its model, unless that is switched off.
 
     Attributes:
-        run: its folder.
-        name: model, prompt and answer mode.
-        vehicles: the most that any of its scenes has, the ego included.
-        seeds: the run's own.
+        run: the run.
+        name: its model, prompt and answer mode.
+        vehicles: most vehicles in any of its scenes, the ego included.
+        seeds: the run's channel seeds.
         points: the run's operating points, by name.
-        dataset: its episodes.
-        episodes: how many a seed plays.
-        same_episodes: every seed plays the run's.
-        left_out: ids of the decision points without an answer at which walks were left out.
+        dataset: the run's episodes.
+        episodes: number of episodes for a seed.
+        same_episodes: True, since every seed has the run's episodes.
+        left_out: ids of decision points without a stored answer, whose episodes were left out.
     """
 
     same_episodes = True
@@ -170,7 +173,7 @@ class ReplayedRun:
         return [forest.ids[n] for n in forest.root.tolist()]
 
     def manifest(self) -> dict[str, Any]:
-        """Return the run, the digest of its dataset, and where its times come from."""
+        """Return where the intents come from, as plain values: run, dataset digest and latency."""
         return {
             "name": self.name,
             "run": str(self.run.path),
@@ -182,11 +185,13 @@ class ReplayedRun:
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int], read: Read = metric_columns
     ) -> Iterator[Sequence[WalkResult]]:
-        """Walk all episodes, with the ego and so many of the nearest vehicles;
-        `read` has their columns.
+        """Yield for each grid point the results of all episodes, with its number of vehicles.
+
+        The vehicles are the ego and the helpers nearest to it; `read` returns the columns of
+        decisions to keep.
 
         Raises:
-            UserError: a point has the run's model fuse, and it cannot.
+            UserError: an operating point needs a fusion call, and the run's model cannot make it.
         """
         for setting in settings:
             replace(self._asker.spec, points=(setting.point,))  # which checks that they go together
@@ -214,7 +219,10 @@ class ReplayedRun:
             yield [WalkResult(world.numbers, world.ends(point), *walked[point])]
 
     def joules(self, scenes: Sequence[Scene], point: OperatingPoint) -> Floats:
-        """Return joules of each vehicle's answer, (n, 1+H); NaN where unknown."""
+        """Return the joules of each vehicle's answer in n scenes, (n, 1 + H); NaN where unknown.
+
+        Column 0 is the ego's, which is unknown if its model is in a cloud.
+        """
         manifest = self.run.manifest
         if manifest.device_profile is None:
             return np.full((len(scenes), self.vehicles), np.nan)
@@ -224,8 +232,9 @@ class ReplayedRun:
         return taken
 
     def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
-        """Return joules that radios take to send the messages of each decision, (n,);
-        NaN where unknown.
+        """Return the joules of the radios for each decision's messages, (n,); NaN where unknown.
+
+        They are known only for a run with a device profile.
         """
         profile = self.run.manifest.device_profile
         if profile is None:
@@ -235,19 +244,21 @@ class ReplayedRun:
 
     @property
     def spec(self) -> Spec:
-        """The evaluation that made the run, with all that decides its answers;
-        it has no conditions.
+        """Return the evaluation that made the run, with all that its answers depend on.
+
+        It has no conditions.
         """
         return self._asker.spec
 
     @property
     def answers(self) -> Mapping[str, Answer]:
-        """The answers that are there, by request id; nothing is asked or written."""
+        """Return the answers that are stored, by request id; nothing is asked."""
         return self._asker.answers
 
     def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
-        """Return all answers by request id, with these;
-        what is not there is asked, and kept in the run.
+        """Return all stored answers by request id, after asking for the missing ones of `requests`.
+
+        New answers are stored in the run's folder.
         """
         with self._writing():
             self._asker.answer(requests)
@@ -255,7 +266,7 @@ class ReplayedRun:
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """What was asked here and got no answer, and where walks were left out, in sentences."""
+        """Return sentences on requests that got no answer here, and on episodes left out."""
         counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
@@ -265,7 +276,7 @@ class ReplayedRun:
         return tuple(filter(None, (lost, left_out if n else "")))
 
     def settle(self) -> None:
-        """Raise Unanswered if too many of the questions that were asked here got no answer."""
+        """Raise Unanswered if too many of the requests made here got no answer."""
         self._asker.settle()
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
@@ -276,15 +287,20 @@ class ReplayedRun:
             return self._asker(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return what every vehicle intends. Where the run has no answer its model is asked."""
+        """Return the intents (distributions over actions) of all vehicles in these scenes.
+
+        The model is asked for what is not stored.
+        """
         with self._writing():
             return self._asker.whole(scenes)
 
     def helpers(
         self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Return what vehicles intend where a helper is wanted;
-        the model is asked what the run lacks.
+        """Return the intents (distributions over actions) of helpers where `wanted`, a mask (n, H).
+
+        The model is asked `question` for what is not stored. Raises UserError if it may not be
+        asked and an answer is missing.
         """
         asked, places = wanted_in(scenes, wanted)
         if not self._asks and any(self._asker.lacks(asked, question, places)):
@@ -299,8 +315,10 @@ class ReplayedRun:
             return self._asker.helpers(scenes, wanted, question)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """Return what vehicles intend; unless the model is asked,
-        walks without an answer are left out.
+        """Return the vehicles' intents (distributions over actions) in these scenes, as stored.
+
+        Where the ego's is missing, the model is asked; if it may not be, `leave_out` is called with
+        the mask (n,) of these scenes, whose episodes are left out.
         """
         lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
         if any(lacks):
@@ -312,8 +330,10 @@ class ReplayedRun:
         return self._asker.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return the same where helpers are asked another question,
-        as far as the run has answers or asks them all.
+        """Return the vehicles' intents if helpers are asked `question` instead of the plain one.
+
+        Missing answers are NaN, or asked for if the run asks all helpers: then in the scenes whose
+        indices are in `at`.
         """
         with self._writing():
             return self._asker.others(scenes, question, at)
@@ -321,8 +341,9 @@ class ReplayedRun:
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers to these sets of messages;
-        what the run lacks is asked, and kept in it.
+        """Return the ego's answers after hearing messages; the model is asked what is not stored.
+
+        Raises UserError if the model may not be asked.
         """
         if not self._asks:
             raise UserError(
@@ -333,7 +354,10 @@ class ReplayedRun:
             return self._asker.fusion_call(scenes, codes, rewrites)
 
     def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
-        """Return the call of agents that hear plans; a run of frozen scenes has none."""
+        """Return a function that asks agents again with the plans they heard.
+
+        Frozen runs, in which only the ego decides, do not use it. `at` has indices of scenes.
+        """
         return self._asker.plan_call(scenes, at, intents)
 
     @contextmanager
@@ -405,6 +429,6 @@ class _Nearest:
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return the success rule of each of some runs that are read together."""
+    """Return each run's rule for success: balanced if it is so for all of them, else plain."""
     rules = alike([Success(run.dataset.dangerous) for run in runs])
     return dict(zip(runs, rules, strict=True))

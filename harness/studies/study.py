@@ -35,7 +35,11 @@ SOURCE = ("name", "latency")  # of a source, what makes a study another one
 
 @dataclass(frozen=True)
 class Study:
-    """A finished study."""
+    """Hold a finished study: its texts, tables, figures, data and manifest.
+
+    `data` has tables to write by file name, `answer` is what --json prints, and `figures` draws the
+    pictures by file name.
+    """
 
     kind: str  # names its manifest, `<kind>.json`
     title: str  # what was run
@@ -54,14 +58,14 @@ class Study:
 
 
 def p_cell(p: float | None) -> str:
-    """Return a p-value as a cell, bold where it is at most `LEVEL`; a dash where there is none."""
+    """Return a p-value as a cell, bold if it is at most `LEVEL`; a dash for None."""
     if p is None:
         return "–"
     return strong("< 0.001" if p < 0.001 else f"{p:.3f}", p <= LEVEL)
 
 
 def ends(e: Estimate) -> dict[str, Any]:
-    """Return an estimate, its 95 % interval and its n as columns of a row."""
+    """Return an estimate as columns of a row: `value`, `ci_low`, `ci_high` and `n`."""
     return {"value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n}
 
 
@@ -72,12 +76,19 @@ def corrected(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def percent(row: Any, value: str, low: str, high: str) -> str:
-    """Return columns of a row, a share with its interval, as `89.0 [81.4, 93.7]` percent."""
+    """Return a share with its interval in percent, `89.0 [81.4, 93.7]`, from columns of a row.
+
+    `value`, `low` and `high` are the columns' names.
+    """
     return PERCENT.interval(row[value], row[low], row[high])
 
 
 def write_study(study: Study, out: Path) -> Path:
-    """Write figures, tables, the page, and last the manifest, each file whole; return the page."""
+    """Write a study's figures, tables, page and manifest into a folder; return the page.
+
+    Figures are skipped if matplotlib is not installed. Raises UserError if the folder holds
+    something else.
+    """
     refuse_taken(out, study.kind)
     out.mkdir(parents=True, exist_ok=True)
     pictures = _pictures(study, out) if undrawn(study) is None else {}
@@ -100,8 +111,9 @@ def write_study(study: Study, out: Path) -> Path:
 
 
 def undrawn(study: Study) -> UserError | None:
-    """Return what keeps the figures of a study from being drawn:
-    a package that is not installed.
+    """Return the error that keeps a study's figures from being drawn; None if there is none.
+
+    It is that Matplotlib is not installed.
     """
     if study.figures is dict:
         return None
@@ -126,7 +138,10 @@ def _pictures(study: Study, out: Path) -> dict[str, tuple[str, int]]:
 
 
 def write_table(table: "pd.DataFrame", path: Path) -> None:
-    """Write a table as CSV, whose texts no spreadsheet takes for formulas, and as JSON Lines."""
+    """Write a table as `path`.csv and `path`.jsonl.
+
+    In the CSV file, texts that a spreadsheet takes for formulas get an apostrophe before them.
+    """
     safe = table.copy(deep=False)
     texts = table.select_dtypes(exclude=["number", "bool"])
     for name, column in texts.items():
@@ -140,7 +155,7 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
 
 
 def refuse_taken(out: Path, kind: str) -> None:
-    """Raise UserError if a folder has a finished run, or a finished study of another kind."""
+    """Raise UserError if a folder holds a finished run, or a finished study of another kind."""
     for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
@@ -150,11 +165,10 @@ def refuse_taken(out: Path, kind: str) -> None:
 
 
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
-    """Raise UserError if a folder has a run, another kind of study,
-    or one of this kind made otherwise.
+    """Raise UserError if a folder holds a run, another kind of study, or one with other settings.
 
-    `manifest` is what its `<kind>.json` has to state; of sources, only what they are and their
-    latency. What an older study does not state is not held against it.
+    `manifest` is what its `<kind>.json` must state; of sources, only name and latency count. What
+    an older study does not state is ignored.
     """
     refuse_taken(out, kind)
     try:
@@ -177,9 +191,7 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 
 
 class Cells:
-    """Finished parts of a study in a file, a line each,
-    so that the same command continues a killed one.
-    """
+    """Keep finished parts of a study in a file, one a line, so that a killed study can continue."""
 
     def __init__(self, path: Path, depends_on: str) -> None:
         """Read a file. Torn lines and those of another digest of all that decides a part do not
@@ -205,9 +217,9 @@ class Cells:
     def part(
         self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]
     ) -> Mapping[str, Any]:
-        """Return a part as it was kept, to the last bit, or else compute it and keep it.
+        """Return the stored part with this key, or compute and store it.
 
-        Its values are plain, or arrays of two axes.
+        Its values are plain, or arrays with two axes, which are restored exactly.
         """
         if (kept := self._cells.get(tuple(key))) is not None:
             return kept

@@ -55,13 +55,13 @@ def settings(
     grids: Sequence[Sequence[Value] | None],
     conditions: Sequence[str],
 ) -> tuple[Setting, ...]:
-    """Return the grid points of one axis, or of several that are crossed, for each condition.
+    """Return the grid points of one axis, or of several crossed, for each condition.
 
-    A grid of None has the axis's usual values that the condition allows.
+    A grid of None stands for the axis's default values that the condition allows.
 
     Raises:
-        UserError: no such condition, one without a channel or in which an axis changes nothing,
-            more vehicles than there are, or too many points.
+        UserError: there is no such condition, it has no channel or an axis changes nothing in it,
+            a grid has more vehicles than the scenes, or there are too many points.
     """
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
     vehicles = min(run.vehicles for run in runs)
@@ -99,8 +99,9 @@ def settings(
 
 
 def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
-    """Return the runs' operating point of that name, or one of the paper's,
-    or a change of one of those.
+    """Return an operating point by name: the runs' own, one of the paper's, or a change of either.
+
+    Raises UserError if there is none, it has no channel, or it differs between the runs.
     """
     points = {run.points[name] for run in runs if name in run.points}
     if len(points) > 1:
@@ -116,8 +117,9 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
 
 
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
-    """Return the paper's panels: the runs' conditions, size under density-coupled loss,
-    loss and tau.
+    """Return the paper's panels: the runs' conditions, and sweeps of vehicle count, loss and tau.
+
+    In the sweep of vehicles, packet loss grows with their density.
     """
     vehicles = min(run.vehicles for run in runs)
     points = {name: point for run in runs for name, point in run.points.items()}
@@ -139,15 +141,15 @@ def panels_over(
     conditions: Sequence[str],
     apart: bool = False,
 ) -> dict[str, tuple[Setting, ...]]:
-    """Return the panels of a sweep by name.
+    """Return the grid points of a sweep by panel.
 
     Args:
-        runs: whose answers are scored.
+        runs: the runs whose answers are scored.
         over: names of axes; without any, the paper's panels are returned.
-        grids: the values of each, in the same order;
-            the usual ones that a condition allows without any.
+        grids: texts with the values of each axis, in the same order; a missing one stands for the
+            default values that a condition allows.
         conditions: names of the operating points that are varied.
-        apart: whether each axis has a panel of its own, instead of all in one, crossed.
+        apart: whether each axis has a panel of its own, instead of all crossed in one.
 
     Raises:
         UserError: as `settings`; or there are more grids than axes.
@@ -171,7 +173,7 @@ def panels_over(
 
 
 def folder_of(run: Path, panels: Iterable[str]) -> Path:
-    """Return where a run's sweep lies by default."""
+    """Return the default folder of a run's sweep, inside the run's folder."""
     return run / f"sweep-{'-'.join(panels).replace(CROSS, '-')}"
 
 
@@ -182,8 +184,10 @@ def run_sweep(
     out: Path,
     progress: Callable[[int], None],
 ) -> Study:
-    """Play every source at every grid point;
-    points and sources are paired by common random numbers.
+    """Score every source at every grid point of all panels, and return the study.
+
+    All points and sources share the channel's random numbers. `progress` is called with 1 after
+    each grid point.
 
     Raises:
         UserError: the folder holds another sweep.
@@ -252,7 +256,7 @@ def _figures(
 
 
 def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
-    """Return how many episodes and seeds each source has, in words."""
+    """Return a phrase with the numbers of episodes and seeds of each source."""
     of_sources = []
     for source in sources:
         whose = "" if source.same_episodes else " of their own"
@@ -282,7 +286,7 @@ def _map(part: "pd.DataFrame") -> "Figure":
 
 
 def tables(summary: "pd.DataFrame") -> list[Table]:
-    """Return a study's main figures, a table a source and curve."""
+    """Return a study's main results from its summary, a table for each source and curve."""
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     places = ["source", "panel", "condition", "value"]
     known = summary.assign(value=summary.value.where(summary.panel != CORE, None))
@@ -307,8 +311,9 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
 
 
 def in_a_sentence(table: Table) -> str:
-    """Say the headline metric at the ends of an axis and where it is best;
-    of crossed axes where worst and best.
+    """Return a sentence on the headline metric at both ends of an axis and where it is best.
+
+    For crossed axes it is about the worst and the best grid point.
     """
 
     def success(row: Sequence[str]) -> float:

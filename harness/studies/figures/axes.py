@@ -18,8 +18,10 @@ ROOM_IN = 0.5  # for names below a figure, in its height
 def paper_values(
     marks: "pd.DataFrame | None", panel: str, metric: str, **place: str
 ) -> "pd.DataFrame":
-    """Return what the paper says of a metric in a panel;
-    nothing if its values are not to be drawn.
+    """Return the paper's values of a metric in a panel, as rows with `value`, `low` and `high`.
+
+    `place` selects rows by further columns. It is empty if `marks`, the table of the paper's
+    values, is None.
     """
     import pandas as pd
 
@@ -32,7 +34,7 @@ def paper_values(
 
 
 def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
-    """Draw the paper's values at `x`: a cross, or the range that it gives."""
+    """Draw the paper's values at `x`: a cross for one value, an error bar for a range."""
     low, high = (theirs[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
     if single.any():
@@ -46,27 +48,26 @@ def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
 
 
 def lead_in(rows: "pd.DataFrame") -> str:
-    """Return the metric by which the sources of a summary's rows are read together."""
+    """Return the headline metric of a summary's rows: balanced success if all sources have it."""
     return leading(*(set(of.metric) for _, of in rows.groupby("source")))
 
 
 def interval_of(rows: "pd.DataFrame") -> str:
-    """Return `episodes` where every seed plays the same ones,
-    `seed means` where a seed has its own.
-    """
+    """Return the kind of interval to draw: `episodes` if the rows have it, else `seed means`."""
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
 
 
 def plain(axes: Any, lines: str) -> None:
-    """Draw pale lines behind the data, along `x`, `y` or both axes, and no frame."""
+    """Style Matplotlib axes: pale grid lines along `lines` (`x`, `y` or `both`), no frame."""
     axes.grid(axis=lines, color=PALE, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def key(figure: "Figure", named: Mapping[str, Any], most: int = 4) -> None:
-    """Name what is drawn below a figure, in `most` columns or as few as fit,
-    and make room for the rows.
+    """Add a legend below a figure, with at most `most` columns, and enlarge the figure for it.
+
+    `named` maps labels to Matplotlib handles.
     """
     if not named:
         return
@@ -88,6 +89,6 @@ def key(figure: "Figure", named: Mapping[str, Any], most: int = 4) -> None:
 
 
 def lettered(drawn: Any) -> None:
-    """Name panels (a), (b) and so on."""
+    """Title the axes (a), (b) and so on."""
     for axes, letter in zip(drawn, "abcdefg", strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=8)

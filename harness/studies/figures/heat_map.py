@@ -22,10 +22,9 @@ def heat_map(
     row: str = "",
     column: str = "",
 ) -> Figure:
-    """Draw percent (R, C) by title, with the names of rows and columns, and of what they are.
+    """Draw heat maps of percentages (R, C), one panel for each title.
 
-    Panels of few columns stand beside each other where their titles have room,
-    others below each other.
+    `rows` and `columns` are the names along both axes, `row` and `column` the titles of the axes.
     """
     room = COLUMN_IN * len(columns) / CHARACTER_IN
     beside = len(columns) <= MOST_BESIDE and max(map(len, panels)) <= room

@@ -45,12 +45,11 @@ def along(
     paper: "pd.DataFrame | None" = None,
     colours: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Draw success along one axis a panel, several sources in one,
-    with loss or trigger rate beside it.
+    """Draw success along an axis, a panel for each axis, with loss or trigger rate beside it.
 
-    Panels are parts of a study's summary. With the paper's values, as in `bars`, its best band of
-    tau is drawn. Conditions have their own colours, or those of `colours`; of several sources, each
-    curve has one.
+    Panels are parts of a study's summary, and each may have several sources. With the paper's
+    values (as in `bars`), its best range of tau is drawn. `colours` gives colours to conditions;
+    None for the usual ones. If there are several sources, each curve has a colour of its own.
     """
     width = max(2.5 * len(panels) + 0.2, LEAST_IN)
     figure = Figure(figsize=(width, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
@@ -134,14 +133,13 @@ def _along(
 def reception(
     name: str, channel: "Physical", messages: "Sequence[Drawn]", against: "Sequence[Compared]"
 ) -> Figure:
-    """Draw a radio's reception against distance, and beside it, if there are any,
-    against others' curves.
+    """Draw a radio's reception over distance, and beside it published curves against the model.
 
     Args:
-        name: of the condition.
-        channel: the radio.
-        messages: what was drawn in sight.
-        against: others' curves.
+        name: the condition's name.
+        channel: the radio's channel model.
+        messages: simulated reception in line of sight, by distance.
+        against: published curves; without any there is no second panel.
     """
     distances_m = np.linspace(1, messages[-1].distance_m, 250)
     curves = by_sight(channel, distances_m)
@@ -196,13 +194,12 @@ def reception(
 
 @styled
 def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) -> Figure:
-    """Draw the loss of one transmission against vehicles in the radius:
-    radios beside the paper's line.
+    """Draw the loss of one transmission over the number of vehicles: radios and the paper's line.
 
     Args:
-        vehicles: `(n,)`, sender and receiver included.
-        losses: losses by the name of a radio, `(n,)`, and the paper's line as `paper`.
-        title: what the losses are of.
+        vehicles: numbers of vehicles in radio range, sender and receiver included, (n,).
+        losses: losses from 0 to 1 by the name of a radio, and the paper's as `paper`, (n,) each.
+        title: the title.
     """
     figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))
     axes = figure.add_subplot()

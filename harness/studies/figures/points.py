@@ -18,7 +18,7 @@ from harness.studies.figures.axes import key, lettered, plain
 
 @dataclass(frozen=True)
 class Steps:
-    """Places `x` and `y` that steps join, ascending in both; `look` is Matplotlib's."""
+    """Describe a step curve of a figure: its points, ascending in x and y, label and line style."""
 
     label: str
     x: Sequence[float]
@@ -29,7 +29,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a panel, each with an estimate or none of every series."""
+    """Describe a panel of estimates: a row for each name, an estimate or None for each series."""
 
     quantity: str  # along the panel, with its unit
     names: Sequence[str]  # of the rows, from top to bottom
@@ -39,10 +39,10 @@ class Rows:
 
 @styled
 def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
-    """Draw estimates with their 95 % intervals along rows.
+    """Draw estimates with their 95 % intervals, a panel for each `Rows`, one below the other.
 
-    A series has a colour, and a marker that says it again.
-    Where an interval is not known, the point stands alone.
+    A series has a colour, by its name in `colours`, and a marker. Where an interval is unknown, the
+    point stands alone.
     """
     heights = [len(panel.names) * (0.1 + 0.1 * len(panel.series)) + 0.5 for panel in panels]
     # One below the other, as a telephone can show them.
@@ -84,9 +84,10 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
 
 @styled
 def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> Figure:
-    """Draw success, by what it is called, in percent against a cost.
+    """Draw success in percent against a cost, as step curves.
 
-    A panel has a title, the cost with its unit, and its steps.
+    A panel is its title, the label of the cost with its unit, and its curves; `success` is the
+    metric's name for people.
     """
     width = max(3.6 * len(panels), 4.4)
     figure = Figure(figsize=(width, 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
