@@ -76,7 +76,7 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
-    """Entry point: what a user can mend is one line on stderr, and one of `EXIT_CODES`."""
+    """Run the command line: print a UserError as one line on stderr, and exit with `EXIT_CODES`."""
     gc.set_threshold(COLLECT_AFTER, 10, 10)
     # all memory goes as the process ends; its last collections would walk it all
     atexit.register(gc.freeze)

@@ -83,27 +83,27 @@ OLD = {
 
 
 def commands() -> Mapping[str, str]:
-    """Return every command, with those of extensions."""
+    """Return the function (`module:function`) behind each command, those of extensions included."""
     return joined(COMMANDS, "commands")
 
 
 def groups() -> Mapping[str, str]:
-    """Return the help of every group."""
+    """Return the help text of each group of commands, those of extensions included."""
     return joined(GROUPS, "groups")
 
 
 def spellings() -> Mapping[str, str]:
-    """Return every old spelling, and what replaces it."""
+    """Return the new spelling of each renamed command by its old one, extensions' included."""
     return joined(OLD, "spellings")
 
 
 def short() -> Mapping[str, str]:
-    """Return what is short for a command of a group, for good and without a note."""
+    """Return permanent short forms of commands, by what is typed; only extensions have any."""
     return joined({}, "short")
 
 
 def panels() -> Mapping[str, tuple[str, ...]]:
-    """Return the panels of the first screen, each with its words."""
+    """Return the headings of the first help screen, each with the commands or groups below it."""
     words = {panel: list(names) for panel, names in PANELS.items()}
     for extension in extensions().values():
         for word, panel in extension.panels.items():

@@ -38,15 +38,16 @@ COLUMNS = (
 
 @runtime_checkable
 class Videos(Protocol):
-    """Draws episodes of a run that was driven."""
+    """Describe what an extension offers to draw videos of a closed-loop run's episodes."""
 
     def ready(self) -> None:
-        """Raise UserError if a package that it needs is missing."""
+        """Raise UserError if a package that drawing needs is not installed."""
         ...
 
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
-        """Draw at most so many episodes that failed under the run's last condition;
-        return the files.
+        """Draw up to `most` episodes that failed under the run's last condition; return the files.
+
+        `run` is the run's folder; `quiet` shows no progress.
         """
         ...
 
@@ -156,8 +157,10 @@ def command(
 
 
 def deciding(scenario: str, agents: str) -> str:
-    """Return the name of a scenario in which these agents decide.
-    Raises UserError if it has no seats.
+    """Return the name of a scenario with a setting of which vehicles decide for themselves.
+
+    `agents` is `ego`, `all` or a share of the other vehicles, such as 0.5. Raises UserError for any
+    other text, or a scenario in which only the ego has a goal.
     """
     from harness.world import scenarios
 
@@ -183,7 +186,7 @@ def deciding(scenario: str, agents: str) -> str:
 
 
 def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
-    """Print a closed-loop run."""
+    """Print a closed-loop run's results as a table, or as JSON, or not if `quiet`."""
     from harness.runs.folder import read
 
     if as_json:

@@ -205,16 +205,15 @@ def takes(
     help: Mapping[str, str] = {},
     without: Collection[str] = (),
 ) -> Callable[[Any], Any]:
-    """Give a command the options of an evaluation;
-    the command's first parameter gets their `Settings`.
+    """Return a decorator that gives a command the options of an evaluation.
 
-    A first argument names a file of settings, or a run's folder;
-    options that are typed beside it win.
+    The command's first parameter then gets a `Settings`. A first argument on the command line names
+    a file of settings, or a run's folder; options typed beside it win.
 
     Args:
-        world: what is evaluated.
-        help: other help for some options, by name.
-        without: the options to leave out.
+        world: what is evaluated, frozen scenes or a closed loop.
+        help: other help texts for some options, by name.
+        without: options to leave out.
     """
 
     def decorate(command: Any) -> Any:
@@ -255,8 +254,9 @@ def takes(
 
 
 def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
-    """Return a function as typer reads it:
-    with these parameters, and the name and help of a command.
+    """Return the function `typed` with the parameters given, and name and help of `command`.
+
+    So typer reads it as a command.
     """
     typed.__signature__ = inspect.Signature(parameters)
     typed.__annotations__ = {each.name: each.annotation for each in parameters}
@@ -288,14 +288,17 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
 
 
 def cards(models: "Sequence[str] | None") -> "list[Card]":
-    """Return cards of the models that a user names. Raises UserError if there is no such model."""
+    """Return the model cards of the models that a user names.
+
+    Raises UserError if there is no such model.
+    """
     from harness.backends.cards import resolve
 
     return [resolve(model) for model in models or ()]
 
 
 def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
-    """Say on stderr which of these have fewer episodes than --limit."""
+    """Print a line on stderr for each dataset that has fewer episodes than --limit."""
     for dataset in datasets:
         if limit is not None and limit > (n := dataset.manifest.episodes):
             echo(
@@ -306,7 +309,10 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
 
 
 def scenario_name(name: str | None, env: str | None, env_config: Path | None) -> str:
-    """Return the scenario of a name, or of an environment and what its configuration changes."""
+    """Return the name of a scenario, or of a highway-env environment with a file of changes.
+
+    Raises UserError unless exactly one of `name` and `env` is given and can be used.
+    """
     import json
 
     from harness.world.environments import environment
@@ -335,8 +341,9 @@ def scenario_name(name: str | None, env: str | None, env_config: Path | None) ->
 
 
 def typed_scenario(scenario: str) -> str:
-    """Return a scenario's name that the user typed,
-    which may thus import an environment's module.
+    """Return a scenario's name, and allow it to import an environment's module.
+
+    Only a name that the user typed may do so, not one from a file.
     """
     from harness.world.environments import environment
 
@@ -346,21 +353,21 @@ def typed_scenario(scenario: str) -> str:
 
 
 def workers_of(text: str) -> "parallel.Workers":
-    """Return who `--workers` names. Raises UserError where it names nobody."""
+    """Return the workers that a text of --workers names. Raises UserError if it names none."""
     from harness.core.parallel import workers_of
 
     return workers_of(text)
 
 
 def shard_of(text: str | None) -> "shards.Shard | None":
-    """Return the shard that `--shard` names; None where it is not given."""
+    """Return the shard (part I of N) that a text of --shard names; None for None."""
     from harness.core.shards import shard_of
 
     return None if text is None else shard_of(text)
 
 
 def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
-    """Say that a shard is done, and what is done with it."""
+    """Print that a shard is done, and the command that merges all of them."""
     echo(
         f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
         "`harness run merge FOLDER... --out FOLDER`"

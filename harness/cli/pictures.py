@@ -25,7 +25,10 @@ COLUMNS = 64  # of a picture in a terminal
 
 @dataclass(frozen=True)
 class PictureModel:
-    """A model that takes an image prompt's picture, by its card."""
+    """Hold a model with vision that pictures of a prompt are drawn for, and its picture size.
+
+    `processor_tokens` is the tokens of a picture by its own image processor; None if not asked.
+    """
 
     card: "Card"  # the model's
     vision: "Vision"  # how it takes pictures
@@ -34,7 +37,7 @@ class PictureModel:
 
     @property
     def picture(self) -> str:
-        """Its pictures, in a line."""
+        """Return a line on the size of the model's pictures, in pixels and tokens."""
         name, (width, height) = printable(self.card.name), self.vision.size_px
         return (
             f"{width} x {height} pixels, front above rear; {self.vision.tokens} tokens with {name}"
@@ -42,18 +45,21 @@ class PictureModel:
 
     @property
     def checked(self) -> bool:
-        """Whether its own image processor was asked."""
+        """Return whether the model's own image processor was asked for its number of tokens."""
         return self.processor_tokens is not None
 
     @property
     def difference(self) -> str | None:
-        """What to say where its processor makes other tokens of a picture than its card says."""
+        """Return a sentence if the image processor's number of tokens is not that on the card.
+
+        None if it is, or the processor was not asked.
+        """
         n = self.processor_tokens
         difference = None if n is None else self.vision.difference(n)
         return difference and f"model {printable(self.card.name)!r}: {difference}"
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the same as plain values."""
+        """Return the model's name and its pictures' size in pixels and tokens, as plain values."""
         width, height = self.vision.size_px
         return {
             "model": self.card.name,
@@ -66,15 +72,15 @@ class PictureModel:
 def picture_model(
     prompt: "Prompt", model: str | None, checked: bool = False
 ) -> PictureModel | None:
-    """Return the model that an image prompt's picture is drawn for; None if the prompt shows none.
+    """Return the model that a prompt's pictures are drawn for; None if the prompt shows none.
 
     Args:
-        prompt: the prompt.
-        model: as given to `--model`.
-        checked: whether to ask the model's own image processor, where it is here.
+        prompt: the prompt version.
+        model: name or path of the model; None for the default one.
+        checked: whether to ask the model's own image processor, if it is installed.
 
     Raises:
-        UserError: it reads texts alone.
+        UserError: the model reads text alone.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import processor_tokens
@@ -91,8 +97,9 @@ def picture_model(
 
 
 def write(image: "Image", file: Path) -> str:
-    """Write a picture as a PNG file, its folder made where it is not there;
-    returns what to say of it.
+    """Write an image as a PNG file, with its folder; return the line to print.
+
+    Raises UserError if it cannot be written.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -106,9 +113,7 @@ def write(image: "Image", file: Path) -> str:
 
 
 def draw(image: "Image") -> bool:
-    """Draw a picture in the terminal. False, and nothing drawn, where there is none,
-    or none with colours.
-    """
+    """Draw an image in the terminal, and return whether it was: it must be one with colours."""
     screen = console()
     if not screen.is_terminal or screen.color_system in (None, "standard"):
         return False
@@ -117,9 +122,7 @@ def draw(image: "Image") -> bool:
 
 
 def half_blocks(pixels: "Pixels") -> "Text":
-    """Return a picture in characters, of pixels (H, W, 3): each is an upper half block of one
-    pixel's colour on the colour of another.
-    """
+    """Return pixels (H, W, 3) as text of half-block characters, each with two pixels' colours."""
     from rich.color import Color
     from rich.style import Style
     from rich.text import Text

@@ -25,13 +25,13 @@ MARKS = 5  # lines over which the pace is taken
 
 
 class Bar(Progress):
-    """Called with how many are newly done.
+    """Count progress; it is called with the number of items that are newly done.
 
     Attributes:
         label: what is done.
-        total: how many there are, as far as is known; 0 while nobody knows.
-        grows: whether more follow from what is done, so that the time left is a least one.
-        done: how many are done.
+        total: number of items, as far as is known; 0 if unknown.
+        grows: whether finished items can add more, so that the time left is a least one.
+        done: number of items done.
     """
 
     def __init__(self, label: str, total: int, grows: bool = False) -> None:
@@ -45,19 +45,20 @@ class Bar(Progress):
         self.changed()
 
     def more(self, count: int) -> None:
-        """Add `count` to the total."""
+        """Add a number of items to the total."""
         self.total += count
         self.changed()
 
     def say(self, text: str) -> None:
-        """Write a line above the bar."""
+        """Print a line above the bar."""
         self.write(text)
 
 
 @contextmanager
 def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) -> Iterator[Bar]:
-    """How many are done, how fast, and the time left (at least, if more follows);
-    nothing if `quiet`.
+    """Show a progress bar with count, speed and time left on stderr; nothing if `quiet`.
+
+    Off a terminal it is a line every `LINE_S` seconds. `grows` is as in `Bar`.
     """
     progress = Bar(label, total, grows)
     if quiet:
@@ -105,8 +106,10 @@ def _lines(progress: Bar) -> Iterator[None]:
 
 
 def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> str:
-    """`asking proxy 812/1206 58.0/s 0:00:07 left`;
-    `marks` are times in seconds and what was done by then.
+    """Return a line such as `asking proxy 812/1206 58.0/s 0:00:07 left`.
+
+    `marks` are pairs of a time in s and the number done by then, from which the speed is taken;
+    `took_s` is the time since the start.
     """
     (since_s, before), (now_s, done) = marks[0], marks[-1]
     speed = (done - before) / (now_s - since_s)
@@ -120,7 +123,7 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
 
 
 def drawn(console: "Console") -> "Columns":
-    """Return the bar's columns. The bar itself gives way where the line is narrow."""
+    """Return Rich's progress display with a label, a bar, a count and the pace."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -150,11 +153,13 @@ def drawn(console: "Console") -> "Columns":
 def pace(
     speed: float | None, left_s: float | None, took_s: float | None, grows: bool = False
 ) -> str:
-    """`61.3/s 0:00:06 left`: what is known of how many a second (or minute),
-    and of the seconds to go.
+    """Return speed and time left, such as `61.3/s 0:00:06 left`; parts that are None are left out.
 
-    It is `at least` so long where more follows from what is done.
-    At the end, `took_s`, it is `in` how long all was done.
+    Args:
+        speed: items a second.
+        left_s: seconds left.
+        took_s: seconds that everything took, at the end; it replaces the time left.
+        grows: whether the time left is a least one.
     """
     parts = []
     if speed:

@@ -295,8 +295,9 @@ def _refuse_format(out: Path | None) -> None:
 
 
 def channel_of(text: str) -> "tuple[str, Channel]":
-    """Return the profile that a condition's text names,
-    and its channel with the text's settings.
+    """Return the profile's name and the channel of a condition such as `mode4:power_dbm=20`.
+
+    Raises UserError if there is no such condition, or it has no channel.
     """
     from harness.coordination.operating_point import named_point
     from harness.radio.wrapped import innermost

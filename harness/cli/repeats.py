@@ -18,7 +18,10 @@ MOST = 100
 
 
 def check(spec: "Spec", repeats: int) -> None:
-    """Raise UserError unless an evaluation can be repeated."""
+    """Raise UserError unless an evaluation can be repeated.
+
+    Its answers must be sampled, and its latency must not be measured.
+    """
     from harness.evaluate.latency import MEASURED
 
     in_range("--repeats", repeats, 2, MOST)
@@ -37,7 +40,7 @@ def check(spec: "Spec", repeats: int) -> None:
 def evaluate(
     spec: "Spec", repeats: int, out: Path | None, cache: Path | None, quiet: bool, as_json: bool
 ) -> None:
-    """Evaluate every repeat; write and print what they have in common and what not."""
+    """Evaluate every repeat, write the study of how they differ, and print it."""
     from harness.studies.repeats import FIGURES, MARKER, PAGE, each, repeats_study, run_repeats
 
     group = RunGroup(each(spec, repeats), "finished repeats", MARKER, (FIGURES, PAGE))

@@ -41,9 +41,17 @@ def write(
     workers: "Workers" = 1,
     full: bool = False,
 ) -> Path:
-    """Write a report, with a progress bar; returns the file.
+    """Write the report of runs or suites with a progress bar, and return the file.
 
-    `dataset` spares reading theirs again, or says in which folder it is.
+    Args:
+        runs: folders of runs, or of suites.
+        out: the file; None for report.html in the first folder.
+        quiet: whether to show no progress.
+        dataset: the runs' dataset, already loaded, or the folder it is in; None to find it.
+        workers: worker processes.
+        full: whether to include prompts of rules and all pictures.
+
+    Raises UserError if they cannot be reported together.
     """
     if any((run / SUITE).is_file() for run in runs):
         if isinstance(dataset, Path):

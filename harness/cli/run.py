@@ -33,16 +33,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a run's table: its head and its metric,
-    whose unit or whose `interval` it shows.
-    """
+    """Describe a column of a run's table: its head and its metric, with unit or with interval."""
 
     head: str
     metric: str
     interval: bool = False
 
     def cell(self, score: "Score | None") -> str:
-        """Return the metric's score; a dash if there is none."""
+        """Return a score of the column's metric as text; a dash for None."""
         if score is None or score.value is None:
             return "-"
         from harness.runs.metrics import entry, written
@@ -70,7 +68,7 @@ MOST_BESIDE = 3  # conditions of a table of intervals
 
 
 def file_name(model: str) -> str:
-    """Return a model's name as part of a folder's."""
+    """Return a model's name with characters that suit a folder's name."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
 
 
@@ -86,10 +84,18 @@ def evaluate(
     then: "Callable[[], object]" = lambda: None,
     hooks: "Mapping[str, Hook]" = MappingProxyType({}),
 ) -> "tuple[Evaluated, Path]":
-    """Evaluate, frozen or in closed loop, with a progress bar;
-    write the run and its page, `full` or not.
+    """Evaluate with a progress bar, write the run and its report, and return both.
 
-    `then` adds files to the run; a run that is stopped there resumes there. `hooks` follow it.
+    Args:
+        spec: what to evaluate, in frozen scenes or in closed loop.
+        folder: the run's folder.
+        opens: opens a backend; None for the usual way.
+        cache: file of stored completions; None for no cache.
+        quiet: whether to show no progress.
+        workers: worker processes.
+        full: whether the report includes prompts of rules and all pictures.
+        then: adds files to the run; if it is interrupted, the run can be resumed.
+        hooks: trackers that follow the run, by name.
     """
     from harness.cli.report import write
     from harness.evaluate.frozen_world import FrozenSource
@@ -119,7 +125,7 @@ def evaluate(
 
 
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
-    """Return the episodes that a run came to, which may have stopped early."""
+    """Return the part of a dataset that a run evaluated, which may have stopped early."""
     numbers = dataset.episodes[: run.manifest.world.episodes]
     if len(numbers) == len(dataset.episodes):
         return dataset
@@ -127,17 +133,17 @@ def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
 
 
 def default_out(spec: "Spec") -> Path:
-    """Return the first folder of the run's name under reports/ that is free,
-    or where this was stopped.
-    """
+    """Return the default folder of an evaluation under reports/: a new one, or a stopped one's."""
     from harness.evaluate.lifecycle import resumable
 
     return free_folder([spec], spec.source.name, lambda folder: resumable(spec, folder))
 
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
-    """Return the first folder of a name under reports/ that is not there,
-    or in which this goes on.
+    """Return a folder under reports/ named after model, prompts and `scenes`.
+
+    It is the first, with a number if needed, that does not exist or for which `goes_on` is true:
+    the same evaluation was stopped there.
     """
     ego, *helpers = specs[0].agents
     prompts = "-".join(dict.fromkeys(spec.ego.prompt.version for spec in specs))
@@ -149,10 +155,9 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
 
 
 def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
-    """Return the first under reports/ of this name, or of this name with a number,
-    that can be used.
+    """Return the first folder among reports/`name`, reports/`name`-2 and so on that is `usable`.
 
-    On stderr it says of a number that it was needed.
+    If it has a number, a line on stderr says so.
     """
     named = Path("reports") / name
     folders = (named if n == 1 else named.with_name(f"{name}-{n}") for n in count(1))
@@ -166,7 +171,10 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Several runs in one folder."""
+    """Describe several runs that are made in one folder, such as a suite's.
+
+    `specs` has their evaluations by folder name, `marker` the file that marks the folder as done.
+    """
 
     specs: "Mapping[str, Spec]"  # by the name of the run's own folder in it
     what: str  # they are when all is done: `a finished suite`
@@ -174,7 +182,7 @@ class RunGroup:
     others: Sequence[str]  # files that are written before it
 
     def check(self, out: Path) -> None:
-        """Raise UserError unless a folder is new, or these runs were stopped in it."""
+        """Raise UserError unless the folder is new or empty, or these runs were stopped in it."""
         from harness.evaluate.lifecycle import finished, unfinished
 
         if (out / self.marker).is_file():
@@ -195,7 +203,7 @@ class RunGroup:
             (finished if (out / name / "run.json").is_file() else unfinished)(spec, out / name)
 
     def goes_on(self, out: Path) -> bool:
-        """Return whether these runs were stopped in a folder, and nobody is at them."""
+        """Return whether these runs were stopped in a folder, and no process works on them."""
         try:
             self.check(out)
         except UserError:
@@ -210,8 +218,10 @@ def _mode(agent: "Agent") -> str:
 
 
 def as_mapping(run: "Run") -> dict[str, Any]:
-    """Return a finished run as plain values: its folder and manifest, its caveats and notes,
-    the rows of its summary.
+    """Return a finished run as plain values for JSON.
+
+    The keys are `run` (its folder), `manifest`, `caveats`, `notes` and `summary`, a row for each
+    score.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
 
@@ -232,10 +242,10 @@ def show(
     notes: Sequence[str],
     beside: "Mapping[str, Mapping[str, Score]] | None" = None,
 ) -> None:
-    """Print a run's table, a row a condition, with what it was run on and what to know about it.
+    """Print a run's table, a row for each condition, with its caveats and notes.
 
-    Rows `beside` it are of what needs no model: scores by name and metric. A run whose scenes know
-    their dangers has a table of balanced success before it.
+    `beside` adds rows of references without a model: scores by name and metric. A run with balanced
+    success has a table of it first.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
@@ -280,7 +290,10 @@ def _scores_table(
 
 
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
-    """Print success by who can tell of the danger, where layouts have declared witnesses."""
+    """Print success by the number of helpers that see the danger, if the layouts declare it.
+
+    `figures` holds scores by condition and metric.
+    """
     metrics = {}
     for name, metric in BY_WITNESSES.items():
         if (conditions[0], metric) in figures:

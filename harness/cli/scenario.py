@@ -97,8 +97,10 @@ def drive(
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
-    """Return the scenario. Raises UserError for none,
-    or for layouts that cannot be driven together.
+    """Return the scenario of this name, if so many layouts from this seed can be driven together.
+
+    Raises UserError if there is none, or the layouts are too many or serve different purposes.
+    `counted` is the option for their number.
     """
     from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios

@@ -23,15 +23,16 @@ DIGITS = 18  # most of a number that is read here
 
 
 class Stopped(Exception):
-    """A command was interrupted, of which typer would say nothing;
-    the cause is the KeyboardInterrupt.
+    """Signal that a command was interrupted; the cause is the KeyboardInterrupt.
+
+    Typer would end such a command without a word.
     """
 
 
 class Branch(Mapping[str, Any]):
-    """The commands and groups below a path, by name; each is loaded when it is looked up.
+    """Map names to the commands and groups below a group; each is imported when looked up.
 
-    Extensions are looked for only where the core has no such name, or all are listed.
+    Extensions are searched only if the core has no such name, or all names are listed.
     """
 
     def __init__(self, path: str) -> None:
@@ -100,10 +101,10 @@ def _of_package(called: Callable[..., Any], what: str) -> Callable[..., Any]:
 
 
 class Command(TyperCommand):
-    """A command whose help lists its options by panel, those without one first."""
+    """Extend typer's command by help that lists options under headings, those without one first."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments, then each panel's options."""
+        """Write the arguments, then the options under each heading, to the help."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             if record := parameter.get_help_record(ctx):
@@ -118,9 +119,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """A group of the table's commands; its help lists them in one column,
-    and the first screen in panels.
-    """
+    """Extend typer's group by commands that load on use, and help in one column."""
 
     def __init__(self, path: str = "", **attributes: Any) -> None:
         below: Any = Branch(path)
@@ -131,8 +130,9 @@ class Group(TyperGroup):
         self.path = path
 
     def invoke(self, ctx: Any) -> Any:
-        """Invoke the command. Raises Stopped if it is interrupted,
-        and UserError if a package ends it.
+        """Invoke the command that was typed.
+
+        Raises Stopped if it is interrupted, and UserError if a package tries to end the program.
         """
         try:
             return super().invoke(ctx)
@@ -144,7 +144,10 @@ class Group(TyperGroup):
             raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command that is typed. Of an old spelling, a line on stderr says the new one."""
+        """Return the command that was typed; for an old spelling, print the new one on stderr.
+
+        An unknown command ends with suggestions of similar ones.
+        """
         old, new = ("", "") if self.path else respelt(args)
         if new and old not in short() and not ctx.resilient_parsing:
             echo(
@@ -183,7 +186,7 @@ class Group(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write each panel's commands, each with the first sentence of its help."""
+        """Write each heading's commands to the help, each with the first sentence of its own."""
         here = [*self.commands]
         width = max(map(len, here))
         for panel, names in {"Commands": here}.items() if self.path else panels().items():
@@ -207,8 +210,9 @@ class Group(TyperGroup):
 
 
 def respelt(args: list[str]) -> tuple[str, str]:
-    """Return the old or short spelling with which arguments begin, and what it stands for;
-    empty if none.
+    """Return the old or short spelling that arguments begin with, and the command it stands for.
+
+    Both are empty if there is none.
     """
     spelt = [" ".join(args[:n]) for n in (2, 1)]
     for typed in spelt:
@@ -222,7 +226,7 @@ def respelt(args: list[str]) -> tuple[str, str]:
 
 
 def keep_encoding() -> None:
-    """Have typer write in the terminal's encoding: where that is ASCII, it would write UTF-8."""
+    """Have typer write in the terminal's encoding; it would write UTF-8 where that is ASCII."""
     streams: Any = import_module(echo.__module__.replace("utils", "_compat"))
     streams._stream_is_misconfigured = _never
 
@@ -232,7 +236,7 @@ def _never(stream: object) -> bool:
 
 
 def hasten(command: Any) -> None:
-    """Have a command read plain values without pydantic.
+    """Have a command convert plain arguments without pydantic, to start faster.
 
     Typer converts every value with pydantic, a missing one too, and loading that takes a tenth of a
     second. What is not plainly right is left to typer, which words the error.
@@ -254,8 +258,9 @@ def _value(parameter: Any, by_typer: Callable[[Any, Any], Any], context: Any, va
 
 
 def plain(annotation: Any, value: Any) -> Any:
-    """A value as its type has it, the same as typer reads it;
-    `UNREAD` where that takes typer to say.
+    """Return a typed value converted to its annotation, the same as typer converts it.
+
+    `UNREAD` if typer itself must convert or refuse it.
     """
     if get_origin(annotation) is list and isinstance(value, list | tuple):
         items = [plain(get_args(annotation)[0], item) for item in value]

@@ -18,7 +18,7 @@ CELL = 80
 
 
 def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False) -> None:
-    """Write a study, and print it as JSON or as text, unless `quiet`."""
+    """Write a study to a folder, and print it as JSON or as text, unless `quiet`."""
     from harness.studies.study import undrawn, write_study
 
     page = write_study(study, out)
@@ -32,7 +32,7 @@ def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False
 
 
 def echo_answer(study: "Study") -> None:
-    """Print what a study found as JSON: a data frame as records."""
+    """Print a study's result as JSON; a data frame as a list of records."""
 
     def records(frame: Any) -> Any:
         return json.loads(frame.to_json(orient="records"))
@@ -44,9 +44,7 @@ def echo_answer(study: "Study") -> None:
 
 
 def show(study: "Study") -> None:
-    """Print a study: its outcome, caveats, the tables that a terminal has room for,
-    and how it was made.
-    """
+    """Print a study: its outcome, caveats, tables and how it was made."""
     for text in (study.title, *study.headline, *study.caveats):
         typer.echo(fill(printable(text, LONGEST), WIDTH))
     for each in study.tables:

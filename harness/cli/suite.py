@@ -26,7 +26,10 @@ MOST_INTERVALS = 3  # conditions whose intervals fit into a line
 
 
 def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
-    """Raise UserError unless a model can be evaluated on a suite."""
+    """Raise UserError unless a model can be evaluated on a suite.
+
+    Each scenario may have one dataset, latency must not be measured, and no model may be a replay.
+    """
     from harness.evaluate.latency import MEASURED
 
     families = [spec.scenario.name for spec in specs]
@@ -58,9 +61,9 @@ def evaluate(
     quiet: bool,
     as_json: bool,
 ) -> Path:
-    """Evaluate on every dataset, `evaluated` with one backend for all; write and print the means.
+    """Evaluate on every dataset of a suite with one backend; write and print the means.
 
-    Returns the suite's folder.
+    `evaluated` evaluates one of them. Returns the suite's folder.
     """
     from harness.backends.registry import open_backend
     from harness.report import suite as report

@@ -27,12 +27,15 @@ _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]+?(?:  # (.*))?$", re.
 
 
 def echo_wrong(name: str, error: UserError) -> None:
-    """Print a thing of a list that cannot be used, and why."""
+    """Print the name of an entry in a list that cannot be used, and the error."""
     typer.echo(f"{printable(name)} · wrong\n  {error}")
 
 
 def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
-    """Print what a dry run counted of prompts, by role, or that there was nothing to count with."""
+    """Print a dry run's counts of prompt tokens by role: `least`, `most`, `mean` and `n`.
+
+    Without counts, it prints that there is no tokenizer.
+    """
     for role, s in (counted or {}).items():
         typer.echo(
             f"{role}: {s['least']} to {s['most']} prompt tokens, mean {s['mean']} (n = {s['n']})"
@@ -45,7 +48,7 @@ def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
 
 
 def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
-    """Print what a dry run says that so many repeats would cost, by model."""
+    """Print a dry run's estimate of cost by model, times the number of repeats."""
     for model, each in counted.items():
         prompts = each["prompts"]
         read = "prompts not counted" if prompts is None else f"{times * prompts:.4g} for prompts"
@@ -62,8 +65,9 @@ def echo_each(
     plain: Callable[[Thing], dict[str, Any]],
     show: Callable[[str, Thing], None],
 ) -> None:
-    """Print a list of things by name, and of one that cannot be used why;
-    as JSON, `plain` values of each.
+    """Print a list of entries by name, and the error of those that cannot be used.
+
+    `plain` returns an entry's values for JSON, `show` prints it as text.
     """
     if as_json:
         rows = []
@@ -80,9 +84,7 @@ def echo_each(
 
 
 def echo_json(value: Any, indent: int | None = 1) -> None:
-    """Print JSON. Of an estimate it has the value, the interval and n;
-    an unknown number is null.
-    """
+    """Print a value as JSON: an estimate as value, interval and n, an unknown number as null."""
     typer.echo(json.dumps(value, indent=indent, default=_plain))
 
 
@@ -98,13 +100,13 @@ def _plain(value: Any) -> Any:
 
 
 def echo_text(text: str) -> None:
-    """Print a text on lines as wide as the terminal, all but the first of them indented."""
+    """Print a text wrapped to `WIDTH` columns, all lines but the first indented."""
     whole = printable(text, LONGEST)
     typer.echo(fill(whole, WIDTH, subsequent_indent="  ", break_on_hyphens=False))
 
 
 def console() -> "Console":
-    """Return a console that prints plain text in 80 columns."""
+    """Return a Rich console that prints plain text in `WIDTH` columns."""
     from rich.console import Console
 
     class Plain(Console):
@@ -115,10 +117,10 @@ def console() -> "Console":
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print columns, the first aligned left and the others right.
+    """Print a table, the first column aligned left and the others right.
 
-    They are two spaces apart, or one where a name needs the room. A name that leaves no room for
-    its row even so stands above it; heads longer than `HEAD` are folded.
+    Columns are two spaces apart, or one if a name needs the room. A name that is still too long
+    stands on a line above its row; heads longer than `HEAD` are folded.
     """
     from rich.cells import cell_len, chop_cells
 
@@ -161,7 +163,7 @@ def _folded(heads: Sequence[str]) -> list[Sequence[str]]:
 
 
 def attributes(kind: type) -> dict[str, str]:
-    """Return the meaning of each field, those of its bases included.
+    """Return the meaning of each field of a class and its bases, by name.
 
     It is the comment beside or above the field, or stands in the docstring's section `Attributes:`.
     """
@@ -177,7 +179,7 @@ def attributes(kind: type) -> dict[str, str]:
 
 
 def echo_fields(record: Any) -> None:
-    """Print each field's value and meaning."""
+    """Print the value of each field of a dataclass, and its meaning from `attributes`."""
     meanings = attributes(type(record))
     for name, value in asdict(record).items():
         values = value if isinstance(value, tuple) else (value,)
