@@ -42,7 +42,7 @@ class Road(Closed, frozen=True):
 
 
 class Danger(Closed, frozen=True):
-    """The vehicle that the layout sends against the ego, and its sector; null if there is none."""
+    """The vehicle that the layout sends against the ego, if any."""
 
     sector: str | None
     vehicle: VehicleId | None
@@ -77,7 +77,7 @@ class EnvironmentRecord(Record, frozen=True):
 
 
 class End(Closed, frozen=True):
-    """How an episode ended: result, time, and of a collision the other vehicle and the fault."""
+    """How an episode ended."""
 
     result: Literal["cleared", "collision", "time_out", "off_road"]
     time_s: Number
@@ -87,11 +87,11 @@ class End(Closed, frozen=True):
 
 
 class Edge(Closed, frozen=True):
-    """What one or several equivalent actions do at a decision point, and what happens on the way.
+    """Where actions lead that come to the same, and what happens on the way.
 
     Attributes:
-        actions: meta-actions that have the same effect here.
-        to: index of the next decision point in the next level; None where the episode ends.
+        actions: meta-actions.
+        to: place of the next decision point in the next level; None where the episode ends.
         end: how it ends; None where it goes on.
         least_gap_m: smallest distance to another vehicle's outline on the way.
         hard_brakings: times the ego begins to brake harder than 4 m/s² on the way.
@@ -112,7 +112,9 @@ class Edge(Closed, frozen=True):
 
 
 class Branching(Closed, frozen=True):
-    """A decision point in its tree: what each reference driver does, and what actions lead to."""
+    """A decision point in its tree: what each reference driver does there,
+    and where actions lead.
+    """
 
     scene: SceneId
     drivers: dict[str, Text]
@@ -120,10 +122,10 @@ class Branching(Closed, frozen=True):
 
 
 class Tree(Closed, frozen=True):
-    """The decision tree of a layout, with all action sequences: `<episode>/tree.json`.
+    """Every course of a layout: `<episode>/tree.json` in `layouts.zip`.
 
     Attributes:
-        episode: number of the episode.
+        episode: its number.
         episode_seed: seed of the layout.
         danger: the vehicle that the layout sends against the ego, if any.
         levels: decision points by step; the first level is the start alone.
@@ -138,9 +140,10 @@ class Tree(Closed, frozen=True):
 
 
 class Manifest(Closed, frozen=True):
-    """The content of `manifest.json`: how a dataset was built, and digests of its files and trees.
+    """`manifest.json`: what a dataset was built from,
+    and the sha256 of every file and of every tree.
 
-    For an environment of highway-env it holds the whole configuration.
+    Of an environment it holds the whole configuration.
     """
 
     format: Literal["swarmdrive-dataset/2"]

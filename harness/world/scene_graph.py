@@ -20,7 +20,7 @@ BY_BEACON = ("v2x",)  # the source of a vehicle that is known by its beacons alo
 
 
 class Viewer(Closed, frozen=True):
-    """Describe the vehicle whose knowledge the graph holds."""
+    """The viewer itself."""
 
     speed_mps: Number
     lane: str
@@ -29,7 +29,7 @@ class Viewer(Closed, frozen=True):
 
 
 class Ego(Closed, frozen=True):
-    """Describe the ego as the viewer knows it, in the viewer's frame."""
+    """The ego, in the viewer's frame."""
 
     id: VehicleId
     speed_mps: Number
@@ -58,21 +58,23 @@ class Node(Closed, frozen=True):
 
 
 class Point(Closed, frozen=True):
-    """Describe a position in the viewer's frame."""
+    """A place in the viewer's frame."""
 
     forward_m: Number
     left_m: Number
 
 
 class EgoArrival(Closed, frozen=True):
-    """Hold how far the ego is from the conflict point; the time is None if it stands."""
+    """How far the ego is from a conflict; no time where it stands."""
 
     arc_m: Number  # distance to go along the path; negative once past
     time_s: Number | None  # time to get there at the present speed
 
 
 class Arrival(EgoArrival, frozen=True):
-    """Hold how far another vehicle is from the conflict point, and its speed and brake lamps."""
+    """How far another vehicle is from a conflict, how fast it is,
+    and whether it is seen to brake.
+    """
 
     speed_mps: Number
     braking: bool | UnsetType | None = UNSET

@@ -113,7 +113,7 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
 
 
 class Building(Closed, frozen=True):
-    """Describe an axis-parallel box that blocks sight, by the coordinates of its walls in m."""
+    """An axis-parallel box that blocks sight, by the positions of its walls in metres."""
 
     id: Annotated[str, Meta(pattern="^b[1-9]$")]
     west_m: Number
@@ -128,7 +128,7 @@ class Building(Closed, frozen=True):
 
 
 class Beacon(Closed, frozen=True, omit_defaults=True):
-    """Describe one broadcast of a vehicle's pose and speed, like a CAM or BSM, with errors."""
+    """A vehicle's message about itself, with its errors: see `harness.world.beacons`."""
 
     sender: VehicleId  # id of the vehicle
     time_s: Number  # when it was sent, since the start of the episode; negative before the start
@@ -190,10 +190,8 @@ class Snapshot(Closed, frozen=True):
 
 
 class ActionsTaken(Closed, frozen=True):
-    """Hold the frame and name of every action so far, from which an environment is replayed to now.
-
-    An environment of highway-env cannot be restored from a state, so its episode is simulated
-    again.
+    """What leads an environment from its seed to here again:
+    the frame and the name of each action.
     """
 
     frame: Count
