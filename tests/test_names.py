@@ -14,6 +14,10 @@ from harness.core.errors import UserError, unknown
 from harness.core.files import making, write_whole
 from harness.core.work import WorkStart, begun
 from harness.dataset.load import find
+from harness.runs import settings
+from harness.runs.folder import read
+from harness.runs.listing import runs
+from harness.runs.settings import FrozenSettings
 
 Typed = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[1]
@@ -34,6 +38,9 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
         lambda: resources.find("models", f"{name}.toml"),
         lambda: find(name),
         lambda: begun(tmp_path / name, WorkStart),
+        lambda: read(tmp_path / name),
+        lambda: runs(tmp_path / name),
+        lambda: settings.read(tmp_path / name, FrozenSettings, {}),
         lambda: write_whole(tmp_path / f"{name}.html", ""),
         lambda: making(tmp_path / f"{name}.d").__enter__(),
     ):

@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from harness.core import work
 from harness.core.config import LONGEST_S
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import SUITE
 from harness.core.memory import uncollected
@@ -292,8 +292,10 @@ class Run:
 def read(path: Path) -> Run:
     """Read the manifest of a run's folder and return the run.
 
-    Raises UserError if it holds no finished run, or its manifest is broken or of another version.
+    Raises UserError if nothing can show its name, if it holds no finished run, or its manifest is
+    broken or of another version.
     """
+    sayable("run", path.name)
     file = path / "run.json"
     if not file.is_file():
         raise UserError(f"{printable(path)} is {_other_than_run(path)}")

@@ -12,7 +12,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 from harness.core.extensions import studies
 from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
@@ -58,8 +58,9 @@ class Listed:
 def runs(folder: Path) -> list[Listed]:
     """Return the runs and studies in a folder, newest first; links out of it are skipped.
 
-    Raises UserError if there is no such folder.
+    Raises UserError if there is no such folder, or nothing can show its name.
     """
+    sayable("folder", folder.name)
     if not os.path.isdir(folder):
         raise UserError(
             f"{printable(folder)} is no folder; give one that holds runs, or make a run with "

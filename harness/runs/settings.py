@@ -17,7 +17,7 @@ from msgspec import Meta, Struct, structs, to_builtins
 
 from harness.core import extensions
 from harness.core.config import convert, toml
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 from harness.core.extensions import Setting
 from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
@@ -636,6 +636,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     replay, but no other model to open and no server to ask. Raises UserError if it cannot be read,
     is of another command, or names what only a user may.
     """
+    sayable("settings", file.name)
     file = file / FILE if file.is_dir() else file
     where = f"settings {printable(file)}"
     if not file.exists():
@@ -666,6 +667,22 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`"
         )
     return settings
+
+
+def otherwise(folder: Path, made_with: Settings) -> str | None:
+    """Return what the file of a run's folder states otherwise than the run; None without one."""
+    file = folder / FILE
+    if not file.exists():
+        return None
+    where = f"settings {printable(file)}"
+    try:
+        tables = _placed(toml(file, where), type(made_with.world), where)
+        before, now = difference(made_with, convert(tables, Settings, where))
+    except UserError as error:
+        return f"{error}."
+    if before == now:
+        return None
+    return f"{FILE} has {printable(now)}, and run.json beside it has {printable(before)}."
 
 
 def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> None:
