@@ -88,7 +88,7 @@ def won(row: Row) -> None:
 SOME = (
     "a figure", "success of episodes", "latency of decisions", "older rules", "a radio's name",
     "rules in another spelling", "a figure that is left out", "which layouts", "a dataset's name",
-    "a latency's source",
+    "a latency's source", "settings beside it", "an answer that is missing",
 )  # fmt: skip
 IN_TABLES = {
     "a figure": (
@@ -248,6 +248,12 @@ def latency(run: Path, **stated: object) -> None:
     configure(run, latency={**before, **stated})
 
 
+def unanswered(run: Path) -> None:
+    """Take the last answer away."""
+    lines = (run / "answers.jsonl").read_text().splitlines(keepends=True)
+    (run / "answers.jsonl").write_text("".join(lines[:-1]))
+
+
 def sooner(run: Path) -> None:
     """State that a latency is the card's."""
     stated = json.loads((run / "run.json").read_text())
@@ -298,6 +304,16 @@ OF_THE_RUN = {
             "a fusion call than of the",
     ),
     "a latency's source": (sooner, "run.json has another latency than its model's card"),
+    "settings beside it": (
+        table("run.toml", 'prompt = "v2"', 'prompt = "v4"'),
+        "run.toml has --prompt v4, and run.json beside it has --prompt v2",
+    ),
+    "settings that are none": (
+        lambda run: (run / "run.toml").write_text("[[["), "run.toml is no TOML: ",
+    ),
+    "an answer that is missing": (
+        unanswered, "answers.jsonl has no answer to 00001-",
+    ),
     "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
 }  # fmt: skip
 

@@ -180,6 +180,14 @@ class Replay:
         return {**ours, "answers_sha256": answers_sha256, "of": model}
 
 
+class LacksAnswer(UserError):
+    """A run has no answer to a question that is asked by what it states."""
+
+    def __init__(self, run: Path, question: str) -> None:
+        super().__init__(f"{printable(run)} holds no answer for {question}")
+        self.question = question
+
+
 class Kept(Replay):
     """A backend that gives a run's stored answers and never opens a model.
 
@@ -192,9 +200,7 @@ class Kept(Replay):
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """Raise UserError: the run has no such answer."""
-        raise UserError(
-            f"{printable(self._run.path)} holds no answer for {printable(requests[0].id)}"
-        )
+        raise LacksAnswer(self._run.path, printable(requests[0].id))
 
 
 def _turn(whole: Completion, first: FirstTurn, again: bool) -> Completion:

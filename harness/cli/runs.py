@@ -100,6 +100,7 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
     from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import read
     from harness.runs.run_dataset import dataset_of
+    from harness.runs.settings import otherwise
 
     run = read(path)
     open_points = [*unchecked(run), *of_card(run)]
@@ -121,6 +122,8 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
             how += f", and {amount(min(AGAIN, len(run.episodes)), 'episode')} driven again"
         except UserError as error:
             open_points.append(f"No episode was driven again: {error}.")
+    if stated := otherwise(path, run.manifest.settings):
+        wrong.append(stated)
     if not silent:
         rows = f"{amount(len(run.scores), 'figure')} and {amount(len(run.decisions), 'decision')}"
         equal = "equal where it can be checked" if open_points else "equal"

@@ -1,6 +1,6 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,10 @@ from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
-from harness.backends.replay import Kept
+from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.config import convert
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.dataset.load import Dataset
@@ -56,6 +56,7 @@ OF_ENDS = (  # what an episode's row says of how it ended
     "journeys",
 )
 RULES = (DRIVER, "proxy")  # engines that are no models
+REPLAY = "replay"  # the engine of stored answers
 
 
 class Held:
@@ -118,8 +119,7 @@ def differences(
         out: the folder, which is written.
         progress: called with the number of answers that were read again.
 
-    Raises UserError if a prompt, a channel or the like is not here as it was, or an answer is
-    missing.
+    Raises UserError if a prompt, a channel or the like is not here as it was.
     """
     world = run.manifest.world
     assert isinstance(world, FrozenScenes)
@@ -140,7 +140,11 @@ def differences(
     )
     points = tuple(points_of(run).values())
     spec = replace(stated, ego=ego, points=points, device_profile=profile, settings=settings)
-    ours, otherwise = computed(run, spec, out, progress)
+    try:
+        ours, otherwise = computed(run, spec, out, progress)
+    except LacksAnswer as lack:
+        lacks = f"answers.jsonl has no answer to {lack.question}, asked by what run.json states"
+        return [*contradictions(run), lacks], []
     wrong = [
         *contradictions(run),
         *_of_manifest(run, ours, stated.ego.card),
@@ -214,17 +218,36 @@ def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
     for name in here.keys() - {"path", "looks"}:
         if world.get(name) != here[name]:
             yield f"run.json has another {name} of its scenes than the dataset"
-    latency = stated.manifest.latency
-    if latency.source == "card" and card.latency.inference_s != latency.ego_s:
+    latency, card_s = stated.manifest.latency, card.latency.inference_s
+    if card.engine == REPLAY:  # its answers took as long as in the run that it replays
+        card_s = asked_card(stated).latency.inference_s
+    if latency.source == "card" and card_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
     yield from _of_latency(stated)
     if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
         yield "run.json says of a driver that it sees other than it does"
 
 
+def asked_card(run: Run) -> Card:
+    """Return the card of the model that was asked, as the run states it;
+    of answers that are replayed, that of the first run.
+
+    Raises UserError if it states none.
+    """
+    model: Any = run.manifest.model
+    identity: Any = run.manifest.identity
+    where = printable(run.path)
+    while model["engine"] == REPLAY and isinstance(replayed := identity.get("of"), Mapping):
+        model, identity = replayed.get("model"), replayed.get("identity")
+        if not (isinstance(model, Mapping) and isinstance(identity, Mapping)):
+            raise UserError(f"{where}: run.json states no model of what it replays; make it again")
+        convert(model, Card, f"{where}: the model that it replays")
+    return convert(model, Card, f"{where}: its model")
+
+
 def of_card(run: Run) -> Iterator[str]:
     """Yield a sentence if a run's latency is said to be its card's, and the card here differs."""
-    latency, name = run.manifest.latency, run.manifest.model["name"]
+    latency, name = run.manifest.latency, asked_card(run).name
     if latency.source != "card" or name not in cards.names():
         return
     here_s = cards.load(name).latency.inference_s
