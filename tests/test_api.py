@@ -148,7 +148,7 @@ def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
         assert scenario.frames is parameters.frames  # type: ignore[attr-defined]
     with pytest.warns(FutureWarning, match=r"is now Scenario\(world=Class\)"):
         old = replace(small.scenario, start=World.begun)
-    assert old.is_environment
+    assert old.has_own_world
     assert World.start(old, 3).state() == World.start(small.scenario, 3).state()
     assert replace(old, name="other").world is old.world
     with pytest.warns(FutureWarning, match=r"Old\.by_moment is now by_scene"):

@@ -245,7 +245,7 @@ def test_what_a_scenario_returns_is_held_to_what_it_must_be(
         (replace(SCENARIO, parameters=cast(Any, 5)), "its parameters are no Parameters"),
         (replace(SCENARIO, description=""), "its description is no text"),
         (replace(SCENARIO, words={"task": cast(Any, 5)}), "its words hold what is no text"),
-        (replace(SCENARIO, world=World), "it has a world of its own; register an environment"),
+        (replace(SCENARIO, world=World), "it has a world of its own; make an environment"),
         (replace(SCENARIO, one_sided=cast(Any, 5)), "one_sided is no text"),
         (replace(SCENARIO, dials=("zork",)), "its dial 'zork' is no parameter"),
         (replace(SCENARIO, actions=()), "its actions are (), and not SLOWER, IDLE, FASTER, with"),

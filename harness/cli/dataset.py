@@ -3,6 +3,7 @@ compare them with closed loop.
 """
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,14 +28,14 @@ Dataset = Annotated[
 ]
 
 
+@options.of_families
 def build(
+    of_family: Mapping[str, str],
     name: str | None = typer.Argument(
         None,
         help="Scenario to freeze; `harness dataset scenario list` shows them.",
         show_default=False,
     ),
-    env: options.Env = None,
-    env_config: options.EnvConfig = None,
     episodes: int = typer.Option(200, help="Number of episodes, each on a layout of its own."),
     seed: options.FirstSeed = 0,
     workers: options.Workers = "2",
@@ -55,7 +56,11 @@ def build(
 
     If the build is stopped, the same command continues it.
     """
-    name = options.typed_scenario(options.scenario_name(name, env, env_config))
+    from harness.world.families import family_of
+
+    name = options.scenario_name(name, of_family)
+    family = family_of(name)
+    note = family.allow(name) if family else None
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
     if lag is not None:
         period_s = scenario.parameters.decision_period_s
@@ -66,7 +71,6 @@ def build(
         scenario = replace(scenario, parameters=replace(scenario.parameters, decision_lag_s=lag))
     from harness.dataset.build import build as build_dataset
     from harness.world import scenarios
-    from harness.world.environments import environment
 
     begun_s, part = time.monotonic(), options.shard_of(shard)
     mine = len(part.part(range(episodes))) if part else episodes
@@ -82,11 +86,8 @@ def build(
         f"{dataset_size(manifest['episodes'], manifest['nodes'])}, "
         f"in {time.monotonic() - begun_s:.0f} s"
     )
-    if env and (module := environment.module_of(name)):
-        shown = printable(module)
-        typer.echo(
-            f"commands that read it import {shown}, if you set {environment.IMPORTS}={shown}"
-        )
+    if note:
+        typer.echo(note)
 
 
 def check(dataset: Dataset, as_json: options.Json = False) -> None:

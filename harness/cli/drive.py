@@ -1,6 +1,7 @@
 """`harness drive`: a model with a prompt drives in the simulator."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
@@ -56,10 +57,10 @@ VIDEOS = Plugins[Videos]("swarmdrive.videos", Videos, {})  # those that extensio
 
 
 @options.takes(DriveSettings)
+@options.of_families
 def command(
     settings: Settings,
-    env: options.Env = None,
-    env_config: options.EnvConfig = None,
+    of_family: Mapping[str, str],
     agents: options.Agents = None,
     workers: options.ModelWorkers = "2",
     out: Path | None = typer.Option(
@@ -95,7 +96,7 @@ def command(
             )
         settings = changed(settings, {"condition": ()})
     name = options.scenario_name(
-        world.scenario if world.scenario or env else DEFAULT, env, env_config
+        world.scenario if world.scenario or of_family else DEFAULT, of_family
     )
     name = name if agents is None else deciding(name, agents)
     who, part = options.workers_of(workers), options.shard_of(shard)

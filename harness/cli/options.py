@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable
-from harness.core.files import text_of
 from harness.runs import settings as stated
 from harness.runs.settings import HELP
 
@@ -51,22 +50,6 @@ RunModel = Annotated[
 ]
 Scenario = Annotated[
     str, Argument(help="Scenario name; `harness dataset scenario list` shows them.")
-]
-Env = Annotated[
-    str | None,
-    Option(
-        help="A highway-env environment to use instead of a scenario: merge-v0, or "
-        "my_package:MyEnv-v0 for "
-        "one of your own.",
-        rich_help_panel=stated.EPISODES,
-    ),
-]
-EnvConfig = Annotated[
-    Path | None,
-    Option(
-        help="With --env: JSON file with changes to its configuration.",
-        rich_help_panel=stated.EPISODES,
-    ),
 ]
 Engine = Annotated[str | None, Option(help=HELP["engine"])]
 Prompt = Annotated[str, Option(help="Prompt version; `harness prompt list` shows them.")]
@@ -308,47 +291,62 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
             )
 
 
-def scenario_name(name: str | None, env: str | None, env_config: Path | None) -> str:
-    """Return the name of a scenario, or of a highway-env environment with a file of changes.
+def of_families(command: Any) -> Any:
+    """Give a command the options that name a scenario of a family.
 
-    Raises UserError unless exactly one of `name` and `env` is given and can be used.
+    The command gets what is typed for them as `of_family`: texts by the option's name.
     """
-    import json
+    from harness.world.families import FAMILIES
 
-    from harness.world.environments import environment
+    added = []
+    for family in FAMILIES.usable().values():
+        for option, text in family.options.items():
+            default = Option(None, help=text, rich_help_panel=family.heading)
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameter = inspect.Parameter(option, kind, default=default, annotation=str | None)
+            added.append(parameter)
 
-    if (name is None) == (env is None):
-        raise UserError(
-            "give either a scenario or --env; `harness dataset scenario list` lists scenarios"
-        )
-    if name is not None:
-        if env_config is not None:
-            raise UserError("--env-config changes an environment; give --env as well")
+    def typed(*settings: Any, **values: Any) -> Any:
+        given = {each.name: values.pop(each.name) for each in added}
+        of_family = {name: value for name, value in given.items() if value is not None}
+        return command(*settings, **values, of_family=of_family)
+
+    own = list(inspect.signature(command).parameters.values())
+    own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
+    place = [each.name for each in own].index("of_family")
+    return as_command(typed, command, [*own[:place], *added, *own[place + 1 :]])
+
+
+def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:
+    """Return the name of a scenario, or of one of a family by the options that were typed.
+
+    Raises UserError unless exactly one of the two is given and can be used.
+    """
+    from harness.world.families import FAMILIES
+
+    if name is not None and not of_family:
         return name
-    assert env is not None
-    typed_scenario(f"{environment.PREFIX}{env}")
-    if env_config is None:
-        return f"{environment.PREFIX}{env}"
-    try:
-        named = environment.named(env, json.loads(text_of(env_config, "settings")))
-        named.encode()  # JSON can write half a character, which no file can hold
-        return named
-    except (OSError, ValueError, RecursionError) as error:
+    families = FAMILIES.usable().values()
+    first = [next(iter(family.options)) for family in families]
+    typed = [family for family in families if family.options.keys() & of_family.keys()]
+    if not typed or (name is not None and not of_family.keys().isdisjoint(first)):
+        flags = [f" or --{option.replace('_', '-')}" for option in first]
         raise UserError(
-            f"--env-config {printable(env_config)} cannot be read ({printable(error)}); give a "
-            "JSON file"
-        ) from None
+            f"give either a scenario{''.join(flags)}; `harness dataset scenario list` lists "
+            "scenarios"
+        )
+    return typed[0].named(of_family)
 
 
 def typed_scenario(scenario: str) -> str:
-    """Return a scenario's name, and allow it to import an environment's module.
+    """Return a scenario's name, and allow it to open what it needs, such as a module.
 
     Only a name that the user typed may do so, not one from a file.
     """
-    from harness.world.environments import environment
+    from harness.world.families import family_of
 
-    if scenario.startswith(environment.PREFIX):
-        environment.allow(scenario)
+    if family := family_of(scenario):
+        family.allow(scenario)
     return scenario
 
 

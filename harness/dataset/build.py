@@ -44,8 +44,6 @@ from harness.dataset.schema import (
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
-from harness.world.environments import environment
-from harness.world.environments.examination import examine
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 from harness.world.scenario_of_package import is_ours
@@ -108,8 +106,8 @@ def build(
     seeds are for several purposes; or the audit needs a package that is missing.
     """
     refuse_agents(scenario, "a dataset")
-    # An environment states no danger.
-    audits = audits and episodes >= LEAST_AUDITED and not scenario.is_environment and bool(AUDITS)
+    # Of worlds that are played elsewhere no danger is known.
+    audits = audits and episodes >= LEAST_AUDITED and not scenario.has_own_world and bool(AUDITS)
     if audits and not shard:
         for plugin in AUDITS.values():
             plugin.ready()
@@ -134,8 +132,8 @@ def build(
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
     if begun := work.begun(out, work.WorkStart):
         work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
-    elif scenario.is_environment:
-        examine(scenario, seed)
+    elif scenario.world:
+        scenario.world.examine(scenario, seed)
     with work.working(out, begun or work.WorkStart(settings=config, shard=part)) as place:
         _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
         if shard:
@@ -159,8 +157,8 @@ def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
         "purpose": purpose(seed, episodes),
         "versions": versions,
     }
-    if scenario.is_environment:
-        settings["environment"] = environment.config(scenario.name)
+    if scenario.world and (config := scenario.world.stated(scenario)):
+        settings["environment"] = config
     return settings
 
 

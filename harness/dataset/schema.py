@@ -70,8 +70,8 @@ class Record(Closed, frozen=True):
     snapshot: Snapshot | UnsetType = UNSET
 
 
-class EnvironmentRecord(Record, frozen=True):
-    """A decision point of a highway-env environment, whose snapshot is the actions taken so far."""
+class RecordOfActions(Record, frozen=True):
+    """A decision point of a world that is played elsewhere; its snapshot is the actions so far."""
 
     snapshot: ActionsTaken | UnsetType = UNSET  # type: ignore[assignment]
 
@@ -163,7 +163,7 @@ class Manifest(Closed, frozen=True):
 
 def plain_type(scenario: Scenario) -> type[Record]:
     """Return the type of a scenario's records that allows any names of paths and sectors."""
-    return EnvironmentRecord if scenario.is_environment else Record
+    return RecordOfActions if scenario.has_own_world else Record
 
 
 @lru_cache(maxsize=8)
@@ -197,7 +197,7 @@ def record_type(scenario: Scenario) -> type[Record]:
         state=_narrowed(WorldState, vehicles=Annotated[_tuple(vehicle), Meta(min_length=1)]),
         graphs=GenericAlias(dict, (VehicleId, graph)),
         snapshot=ActionsTaken
-        if scenario.is_environment
+        if scenario.has_own_world
         else _narrowed(Snapshot, sections=_tuple(section)),
     )
     return kind

@@ -31,7 +31,6 @@ from harness.dataset.schema import (
 )
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
-from harness.world.environments import environment
 from harness.world.parameters import LATER
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot
@@ -97,9 +96,9 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {example}"
     if missing := usual.keys() - dict(LATER).keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
-    if not scenario.is_environment:
+    if scenario.world is None:
         return
-    here, stated = environment.config(scenario.name), manifest.environment
+    here, stated = scenario.world.stated(scenario) or {}, manifest.environment
     if stated != here:
         there = stated or {}
         differing = sorted(key for key, value in here.items() if there.get(key, here) != value)
@@ -359,7 +358,7 @@ def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name:
     named = nodes | {conflict.vehicle for conflict in conflicts}
     egos = [n for n, v in enumerate(state.vehicles) if v.part == "ego"]
     road, speeds = scenario.road(), manifest.parameters["target_speeds_mps"]
-    # None in an environment, whose snapshots are other ones
+    # None in a world that is played elsewhere, whose snapshots are other ones
     snapshot = record.snapshot if isinstance(record.snapshot, Snapshot) else None
     conditions = {
         "it is the scene of another decision point": record.scene == name,

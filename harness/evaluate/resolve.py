@@ -71,7 +71,6 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
-    from harness.world.environments.examination import examine
 
     name = scenario or world.scenario or DEFAULT
     shipped = _shipped(name.partition(":")[0])
@@ -86,8 +85,8 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
             f"--sample {world.sample}: a run that stops takes layouts in their order; leave it out"
         )
     source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed, enough)
-    if source.scenario.is_environment:
-        examine(source.scenario, first_seed)
+    if world_of_scenario := source.scenario.world:
+        world_of_scenario.examine(source.scenario, first_seed)
     return source
 
 

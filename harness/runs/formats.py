@@ -13,6 +13,7 @@ from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from harness.core.errors import UserError, printable
+from harness.world.families import FAMILIES
 
 NUMBER = 2
 UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
@@ -254,8 +255,9 @@ def _may_be(typed: Any, names: Any) -> bool:
         return typed is None or names is None
     if "://" in typed or typed.startswith("replay:"):
         return True
-    if typed.startswith("env:"):  # whose name stands behind a colon, and settings have commas
-        return typed.split(":")[:2] == names.split(":")[:2]
+    if (prefix := typed.partition(":")[0]) in FAMILIES:  # whose names have colons and commas
+        family = FAMILIES[prefix]
+        return family.split(typed)[0] == family.split(names)[0]
     each_name = names.split(",")
     each_typed = typed.split(",", len(each_name) - 1)
     pairs = zip(each_typed, each_name, strict=False)

@@ -43,7 +43,7 @@ def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
         for world, until in zip(worlds, until_frames, strict=True)
         if world.frame < until and not world.ended
     ]
-    if going and going[0][0].scenario.is_environment:
+    if going and going[0][0].scenario.has_own_world:
         for world, until in going:
             world.advance(until)
         return

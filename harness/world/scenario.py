@@ -14,6 +14,8 @@ from harness.world.parameters import SETTABLE, Parameters
 from harness.world.road import PathKey, Road
 from harness.world.state import Building, Kind, Part
 
+KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
+
 
 @dataclass(frozen=True)
 class Draws:
@@ -132,8 +134,8 @@ class Scenario:
     # the same object; `cleared` of a seat's scenario is asked about its agent alone. None if only
     # the ego has a goal
     seats: Callable[[], Mapping[PathKey, Seat]] | None = None
-    # subclass of `World` whose episodes an environment simulates; None for the harness's own
-    # simulator
+    # the class of its worlds, an `OwnWorld`, if they are played elsewhere; None for the harness's
+    # own simulator
     world: type[Any] | None = None
     # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
@@ -147,8 +149,10 @@ class Scenario:
             put_doors(self)
 
     @property
-    def is_environment(self) -> bool:
-        """Whether a highway-env environment runs the episodes; it declares no layout or danger."""
+    def has_own_world(self) -> bool:
+        """Whether something beside the harness's simulator plays the episodes; the harness then
+        knows no layout and no danger.
+        """
         return self.world is not None
 
     @property
@@ -169,18 +173,14 @@ def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
     """Return a class of worlds that a function starts. It warns:
     the class is what a scenario states now.
     """
-
-    def resumed(cls: Any, *taken: Any) -> Any:
-        from harness.world.environments.world import EnvironmentWorld
-
-        return EnvironmentWorld.resumed.__func__(cls, *taken)  # type: ignore[attr-defined]
+    from harness.world.own_world import OwnWorld
 
     warn(
         "Scenario(start=f) is now Scenario(world=Class), whose `begun` is f; it works until 0.4.0",
         FutureWarning,
         stacklevel=4,
     )
-    return type("Started", (), {"begun": staticmethod(start), "resumed": classmethod(resumed)})
+    return type("Started", (OwnWorld,), {"begun": staticmethod(start)})
 
 
 if not TYPE_CHECKING:

@@ -41,7 +41,7 @@ OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
-NAMED = ("contents", "schedules", "readers")
+NAMED = ("families", "contents", "schedules", "readers")
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -452,18 +452,17 @@ def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
 
 
 @pytest.mark.slow
-def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_part_of(
-    core: Path, tmp_path: Path
-) -> None:
+def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_path: Path) -> None:
     """Runs have it, whether it did something or not."""
     code = (
         "from harness.coordination.operating_point import OperatingPoint, named_point\nfrom "
-        "harness.core.errors import UserError\nprint(OperatingPoint.from_dict({'name': '6g', "
+        "harness.core.errors import UserError\nfrom harness.world.scenarios import get\n"
+        "print(OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
         "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
         "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin'), "
-        "lambda: named_point('6g:schedule=learnt')):\n    try:\n        "
+        "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
     done = in_the_core(core, tmp_path, code)
@@ -477,6 +476,8 @@ def test_a_setting_of_a_condition_that_is_gone_does_nothing_or_says_what_it_was_
             f"schedule {what} is part of the extension schedules, which is not installed"
             for what in ("margin", learnt)
         ],
+        "scenario env:merge-v0:decisions=2 is part of the extension environments, which is not "
+        "installed",
     ]
 
 

@@ -33,10 +33,10 @@ def command(
     above chance, the scenario leaks it.
     """
     scenario, who = ready_to_drive(name, layouts, seed, "--layouts"), options.workers_of(workers)
-    if scenario.is_environment:
+    if scenario.has_own_world:
         raise UserError(
-            f"{printable(name)} is an environment without a known danger, so there is nothing to "
-            "audit; give a scenario"
+            f"{printable(name)} has a world of its own and no known danger, so there is nothing to "
+            "audit; give a scenario of the harness's own simulator"
         )
     from harness.extensions.audit.tells import audit
     from harness.world import scenarios

@@ -2,7 +2,7 @@
 whose name is the file's with `-` for `_`.
 
 Other packages add theirs by an entry point of the group `swarmdrive.scenarios`;
-`env:ID` is an environment.
+extensions add families of them (`harness.world.families`).
 """
 
 import copyreg
@@ -17,9 +17,9 @@ from harness.core.config import convert, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.plugins import Plugins
-from harness.world.environments import environment
+from harness.world.families import family_of
 from harness.world.parameters import LATER, SCENES, SUITES, Parameters
-from harness.world.scenario import Scenario
+from harness.world.scenario import KNOWN_ACTIONS, Scenario
 
 FURTHER = ("LANE_LEFT", "LANE_RIGHT")  # actions that the simulator knows beside those of drivers
 
@@ -40,11 +40,11 @@ class PackagesScenarios(Plugins[Scenario]):
         if not isinstance(plugin.one_sided, str | None):
             raise ValueError("one_sided is no text, and not None")
         if plugin.world is not None:
-            raise ValueError("it has a world of its own; register an environment, and name env:ID")
+            raise ValueError("it has a world of its own; make an environment of highway-env of it")
         actions = plugin.actions
         if not isinstance(actions, tuple) or len(set(actions)) < len(actions):
             raise ValueError("its actions are no tuple, or one is there twice")
-        needed = environment.KNOWN_ACTIONS
+        needed = KNOWN_ACTIONS
         if not {*needed} <= {*actions} <= {*needed, *FURTHER}:
             allowed = f"{', '.join(needed)}, with or without {' and '.join(FURTHER)}"
             raise ValueError(f"its actions are {printable(repr(actions))}, and not {allowed}")
@@ -85,8 +85,8 @@ def get(text: str) -> Scenario:
 
 def split(text: str) -> tuple[str, str | None]:
     """Split a scenario argument such as `NAME:key=value` into name and settings, or None."""
-    if text.startswith(environment.PREFIX):
-        return environment.split(text)
+    if family := family_of(text):
+        return family.split(text)
     name, colon, settings = text.partition(":")
     return name, settings if colon else None
 
@@ -135,7 +135,9 @@ def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
             value = getattr(scenario.parameters, dial)
             text = value if isinstance(value, str) else canonical_json(value)
             settings.append(f"{dial}={text}")
-    return environment.joined(scenario.name, settings)
+    if family := family_of(scenario.name):
+        return family.joined(scenario.name, settings)
+    return ":".join([scenario.name, *([",".join(settings)] if settings else [])])
 
 
 def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
@@ -154,11 +156,8 @@ def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
 
 
 def _named(name: str) -> Scenario:
-    if name.startswith(environment.PREFIX):
-        # imports highway-env
-        from harness.world.environments.world import scenario as of_environment
-
-        return of_environment(name)
+    if family := family_of(name):
+        return family.scenario(name)
     if is_here(name):
         scenario: Scenario = import_module(f"{__name__}.{name.replace('-', '_')}").SCENARIO
         return scenario

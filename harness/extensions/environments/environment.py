@@ -19,6 +19,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.strangers import strangers
 from harness.world.road import Lane
+from harness.world.scenario import KNOWN_ACTIONS
 
 PREFIX, CHANGES = "env:", ":config="
 # environment variable: modules, with commas, that names may have imported
@@ -26,7 +27,6 @@ IMPORTS = "SWARMDRIVE_IMPORTS"
 OWN_PACKAGE = "highway_env"
 # what the ego of meta-actions has
 OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")
-KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
 def named(env: str, config: Any = None) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.world.environments import environment
-from harness.world.environments.environment import lane_of, reset
-from harness.world.environments.routes import Routes, routes
+from harness.extensions.environments import environment
+from harness.extensions.environments.environment import lane_of, reset
+from harness.extensions.environments.routes import Routes, routes
 from harness.world.parameters import Parameters as Common
 from harness.world.road import ONE_LANE_M, Crossing, Lane, Path, PathKey, Road, crossings, lanes_of
 

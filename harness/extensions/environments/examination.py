@@ -5,8 +5,8 @@ before a dataset is built or an episode is driven.
 from collections.abc import Sequence
 
 from harness.core.errors import UserError
-from harness.world.environments.environment import meta_actions, numbered, raised, reset, shown
-from harness.world.environments.world import EnvironmentWorld
+from harness.extensions.environments.environment import meta_actions, numbered, raised, reset, shown
+from harness.extensions.environments.world import EnvironmentWorld
 from harness.world.scenario import Scenario
 
 TRIED = ("IDLE", "FASTER", "SLOWER")

@@ -16,10 +16,9 @@ from typing import Any, cast
 import numpy as np
 
 from harness.core.errors import UserError
-from harness.world import beacons
-from harness.world.conflict_measures import observe
-from harness.world.environments.environment import (
+from harness.extensions.environments.environment import (
     Constants,
+    config,
     hittable,
     lane_of,
     meta_actions,
@@ -27,20 +26,23 @@ from harness.world.environments.environment import (
     reset,
     shown,
 )
-from harness.world.environments.place import Parameters, ends_of, first_target_mps, place
+from harness.extensions.environments.place import Parameters, ends_of, first_target_mps, place
+from harness.world import beacons
+from harness.world.conflict_measures import observe
 from harness.world.gaps import least_gaps_m
+from harness.world.own_world import OwnWorld
 from harness.world.parameters import DIALS
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
-from harness.world.state import SIZES_M, ActionsTaken, Building, Kind, Part, WorldState
-from harness.world.world import Target, World
+from harness.world.state import SIZES_M, ActionsTaken, Building, Kind, Part
+from harness.world.world import Target
 
 MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 
 @dataclass
-class EnvironmentWorld(World):
+class EnvironmentWorld(OwnWorld):
     """Simulate one episode in an environment of highway-env."""
 
     env: Any = None  # highway-env's environment
@@ -88,14 +90,15 @@ class EnvironmentWorld(World):
         return world
 
     @classmethod
-    def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
-        world = cls.begun(scenario, state.episode_seed)
-        for frame, action in snapshot.taken:
-            world.advance(frame)
-            world.take(action)
-        world.advance(snapshot.frame)
-        world.step = state.step
-        return world
+    def examine(cls, scenario: Scenario, seed: int) -> None:
+        from harness.extensions.environments.examination import examine
+
+        examine(scenario, seed)
+
+    @classmethod
+    def stated(cls, scenario: Scenario) -> dict[str, Any]:
+        """Return the environment's whole configuration, which its name and package decide."""
+        return config(scenario.name)
 
     @property
     def vehicles(self) -> Sequence[Any]:

@@ -24,14 +24,14 @@ from harness.core.errors import UserError
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.dataset.verify import check
+from harness.extensions.environments.environment import named, reset
+from harness.extensions.environments.examination import examine
+from harness.extensions.environments.place import CAREFUL_FIRST
+from harness.extensions.environments.world import EnvironmentWorld
 from harness.report.drawing.scene import draw
 from harness.runs.folder import read
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
-from harness.world.environments.environment import named, reset
-from harness.world.environments.examination import examine
-from harness.world.environments.place import CAREFUL_FIRST
-from harness.world.environments.world import EnvironmentWorld
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.reference import drive
 from harness.world.state import ActionsTaken, WorldState
@@ -705,7 +705,7 @@ def test_bad_input_is_a_line(harness, tmp_path, arguments, said):
 
 
 def test_the_page_shows_the_environment_of_these_tests():
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     assert (root / "tests/my_roads.py").read_text() in (root / "docs/environments.md").read_text()
 
 

@@ -1,0 +1,73 @@
+"""The family `env`: scenarios that are environments of highway-env."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from harness.core.errors import UserError, printable
+from harness.core.files import text_of
+
+if TYPE_CHECKING:
+    from harness.world.scenario import Scenario
+
+ENV, CONFIG = "env", "env_config"  # the options of commands that take a scenario
+
+
+class Environments:
+    """Read names such as `env:merge-v0:config={...}`."""
+
+    heading = "Environments"
+    options: ClassVar[Mapping[str, str]] = {
+        ENV: "A highway-env environment to use instead of a scenario: merge-v0, or "
+        "my_package:MyEnv-v0 for one of your own.",
+        CONFIG: "With --env: JSON file with changes to its configuration.",
+    }
+
+    def named(self, typed: Mapping[str, str]) -> str:
+        if ENV not in typed:
+            raise UserError("--env-config changes an environment; give --env as well")
+        from harness.extensions.environments import environment
+
+        name = environment.named(typed[ENV])
+        environment.allow(name)
+        if CONFIG not in typed:
+            return name
+        file = Path(typed[CONFIG])
+        try:
+            name = environment.named(typed[ENV], json.loads(text_of(file, "settings")))
+            name.encode()  # JSON can write half a character, which no file can hold
+        except (OSError, ValueError, RecursionError) as error:
+            raise UserError(
+                f"--env-config {printable(file)} cannot be read ({printable(error)}); give a JSON "
+                "file"
+            ) from None
+        return name
+
+    def scenario(self, name: str) -> "Scenario":
+        from harness.extensions.environments.world import scenario  # imports highway-env
+
+        return scenario(name)
+
+    def split(self, text: str) -> tuple[str, str | None]:
+        from harness.extensions.environments import environment
+
+        return environment.split(text)
+
+    def joined(self, name: str, settings: Sequence[str]) -> str:
+        from harness.extensions.environments import environment
+
+        return environment.joined(name, settings)
+
+    def allow(self, name: str) -> str | None:
+        from harness.extensions.environments import environment
+
+        if not (module := environment.module_of(name)):
+            return None
+        environment.allow(name)
+        shown = printable(module)
+        variable = environment.IMPORTS
+        return f"commands that read it import {shown}, if you set {variable}={shown}"
+
+
+ENVIRONMENTS = Environments()
