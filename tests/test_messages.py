@@ -5,8 +5,6 @@ and by the values that each member may have.
 import json
 import math
 import re
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.coordination.operating_point import OperatingPoint
-from harness.radio.its_g5 import ItsG5
 from harness.radio.messages import (
     NAMES,
     PSIDS,
@@ -30,7 +26,6 @@ from harness.radio.messages import (
     table,
     wraps,
 )
-from harness.radio.profiles import CHANNELS
 
 # What pycrate writes: benchmarks/message_sizes.py.
 ENCODED = json.loads((Path(__file__).parent / "golden/message-sizes.json").read_text())
@@ -125,14 +120,6 @@ def test_beacons_load_the_channel_with_the_size_that_their_encoding_gives():
     assert beacon_bytes("etsi", 10) == math.ceil(178 + 141 / 10)
     assert beacon_bytes("sae", 10) == math.ceil(138 + 141 / 5)
     assert beacon_bytes("sae", 0) == 138 + 141
-    for profile in ("its-g5", "mode2"):
-        declared = OperatingPoint.of("p", profile)
-        at_20_hz = declared.changed(encoding="etsi").of_radio({"rate_hz": "20"})
-        written_out = at_20_hz.of_radio({"packet_bytes": "300"})
-        assert asdict(at_20_hz.channel)["packet_bytes"] == math.ceil(178 + 141 / 20)
-        assert asdict(written_out.channel)["packet_bytes"] == 300
-        assert declared.channel == CHANNELS[profile]
-    assert OperatingPoint.of("p", "mode4", encoding="etsi").channel == CHANNELS["mode4"]
 
 
 def test_the_certificate_goes_along_when_it_is_due():
@@ -152,48 +139,4 @@ def test_headers_are_those_of_network_and_transport_and_no_radios(name: str):
     )
     etsi = name in NAMES["etsi"].values()
     assert headers / 8 == (44 if etsi else 3 if name == "BSM" else 4)
-    radio, packet = ItsG5(), packet_bits(name, 800.0)
-    assert packet == 800 + sum(share.bits for share in taken)
-    assert radio.message_s(packet) == radio.airtime_s(packet / 8 + radio.header_bytes)
-
-
-def test_the_command_shows_bytes_members_and_time_on_air(
-    harness: Callable[..., tuple[int, str, str]],
-):
-    code, out, _ = harness("radio", "messages", "--objects", "2", "--channel", "its-g5")
-    assert code == 0
-    assert max(map(len, out.splitlines())) <= 80
-    assert re.search(r"^CPM +77 +94 +44 +215 +356 +0\.38$", out, re.MULTILINE)
-    code, out, _ = harness("radio", "messages", "CPM", "--no-optional", "--json")
-    found = json.loads(out)
-    assert found["content"]["optional"] is False
-    (row,) = found["messages"]
-    assert sum(member["bits"] for member in found["members"]) == row["packet_bits"]
-    assert all(member["source"] for member in found["members"])
-    code, out, _ = harness("radio", "messages", "CPM")
-    assert max(map(len, out.splitlines())) <= 80
-    assert re.search(r"^envelope\.signature\.r +256$", out, re.MULTILINE)
-
-
-def test_the_page_on_radios_shows_what_the_command_prints(
-    harness: Callable[..., tuple[int, str, str]],
-):
-    page = (Path(__file__).parent.parent / "docs/radio.md").read_text()
-    assert harness("radio", "messages", "--channel", "its-g5")[1] in page
-
-
-@pytest.mark.parametrize(
-    ("typed", "message"),
-    [
-        (["CPN"], "unknown message 'CPN'; did you mean 'CPM'?"),
-        (["--objects", "300"], "--objects 300 is out of range; give 0 to 255"),
-        (["--channel", "6g"], "--channel 6g: give a physical radio, such as its-g5"),
-    ],
-)
-def test_a_wrong_argument_is_one_line(
-    harness: Callable[..., tuple[int, str, str]], typed: list[str], message: str
-):
-    code, out, err = harness("radio", "messages", *typed)
-    assert (code, out) == (2, "")
-    assert message in err
-    assert err.count("\n") == 1
+    assert packet_bits(name, 800.0) == 800 + sum(share.bits for share in taken)

@@ -117,8 +117,8 @@ def test_a_key_with_thousands_of_dots_is_refused_at_once() -> None:
 QUICK = ("eval", "--dataset", "small", "--limit", "1", "--seeds", "0", "--dry-run")
 # Files of a project, and a command that reads each.
 READ: dict[str, tuple[str, ...]] = {
-    "channels/mine.toml": ("radio", "show", "mine"),
-    "channels/points.csv": ("radio", "show", "trace"),
+    "channels/mine.toml": (*QUICK, "--condition", "mine"),
+    "channels/points.csv": (*QUICK, "--condition", "trace"),
     "networks/mine.toml": (*QUICK, "--condition", "cloud:round_trip=mine"),
     "devices/mine.toml": ("model", "device", "show", "mine"),
     "schedules/mine.toml": (*QUICK, "--condition", "6g:schedule=mine"),

@@ -41,11 +41,6 @@ COMMANDS = {
     "dataset scenario list": "scenario:list_scenarios",
     "dataset scenario show": "scenario:show",
     "dataset scenario drive": "scenario:drive",
-    "radio list": "radio:list_channels",
-    "radio show": "radio:show",
-    "radio check": "radio:check",
-    "radio crowd": "radio:crowd",
-    "radio messages": "messages",
 }
 
 GROUPS = {
@@ -56,14 +51,13 @@ GROUPS = {
     "prompt": "List prompts; show, compare, release them; parse answers.",
     "dataset": "Build, check, show, rank, export datasets; list scenarios.",
     "dataset scenario": "List scenarios, show or drive one.",
-    "radio": "List radios, show or check one; show what messages take.",
 }
 
 # The panels of the first screen.
 PANELS = {
     "Evaluate": ("init", "eval", "drive"),
     "Look at results": ("compare", "report"),
-    "More": ("plan", "study", "run", "model", "prompt", "dataset", "radio"),
+    "More": ("plan", "study", "run", "model", "prompt", "dataset"),
 }
 
 # Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.
@@ -78,7 +72,6 @@ OLD = {
     "prompt lock": "prompt release",
     "scenario check": "dataset scenario drive",
     "scenario": "dataset scenario",
-    "channel": "radio",
 }
 
 

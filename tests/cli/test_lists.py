@@ -11,7 +11,6 @@ pytestmark = pytest.mark.usefixtures("svg_alone")
 Typed = Callable[..., tuple[int, str, str]]
 # What is listed, by which command, what else it must have, and a command that needs the wrong one.
 LISTS = {
-    "channels": (("radio", "list"), "mode4", ("radio", "show", "bad")),
     "models": (("model", "list"), "proxy", ("eval", "--model", "bad")),
     "devices": (("model", "device", "list"), "agx-orin", ("model", "device", "show", "bad")),
 }
@@ -21,7 +20,7 @@ LISTS = {
 def project(tmp_path: Path) -> Path:
     """A project in which each file is wrong."""
     (tmp_path / "swarmdrive.toml").touch()
-    for kind in (*LISTS, "networks", "schedules"):
+    for kind in (*LISTS, "channels", "networks", "schedules"):
         (tmp_path / kind).mkdir()
         (tmp_path / kind / "bad.toml").write_text("model = [\n")
     return tmp_path
@@ -56,7 +55,6 @@ def test_what_needs_another_file_does_not_fail(
     for command in (
         ("study", "sweep", "run", "--over", "reliability", "--grid", "1"),
         ("study", "sweep", "run", "--over", "loss", "--grid", "0"),
-        ("radio", "crowd"),
         ("study", "schedule", "compare", "run", "--schedule", "never"),
     ):
         code, _, said = harness(*command)

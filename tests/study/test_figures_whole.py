@@ -14,14 +14,12 @@ from matplotlib.figure import Figure
 from whole_figures import LONG, NAMES, check
 
 from harness.core.statistics import Estimate
-from harness.radio.profiles import CHANNELS
-from harness.radio.reception import DISTANCES_M, Compared, Curve, Drawn
 from harness.report.drawing.colours import COLOURS, CONDITIONS, INK, PAGE
 from harness.report.drawing.pictures import save
 from harness.report.library import on_dark_too
 from harness.studies.figures.bars import operating_points
 from harness.studies.figures.heat_map import heat_map
-from harness.studies.figures.lines import along, crowds, reception
+from harness.studies.figures.lines import along
 from harness.studies.figures.points import Rows, Steps, fronts, intervals
 
 METRICS = (
@@ -40,13 +38,6 @@ def summary(variable: str, values: list[Any], sources: list[str]) -> pd.DataFram
     ])  # fmt: skip
 
 
-def of_radio() -> Figure:
-    radio: Any = CHANNELS.usable()["mode4"]
-    curve = Curve("", "somebody", np.array([10.0, 200.0]), np.array([1.0, 0.5]))
-    messages = [Drawn(distance, 0.5, SEEN, SEEN, 0.1) for distance in DISTANCES_M]
-    return reception(LONG, radio, messages, [Compared(curve, np.array([0.9, 0.6]))])
-
-
 def over(*variables: str) -> Figure:
     return along([summary(variable, [0.1, 0.9], ["run"]) for variable in variables])
 
@@ -61,7 +52,6 @@ def of_rows() -> Figure:
     return intervals([rows], dict(zip(NAMES, COLOURS, strict=False)))
 
 
-LOSSES = {name: np.array([0.1, 0.2, 0.9]) for name in ["paper", *NAMES, "a", "b", "c"]}
 SOME = ("operating points", "a sweep", "intervals", "fronts")  # of each kind of figure one
 FIGURES: Mapping[str, Callable[[], Figure]] = {
     "operating points": lambda: operating_points(summary("", [0], ["run"])),
@@ -76,8 +66,6 @@ FIGURES: Mapping[str, Callable[[], Figure]] = {
     ),
     "intervals": of_rows,
     "fronts": of_costs,
-    "reception": of_radio,
-    "crowds": lambda: crowds([2, 4, 8], LOSSES, f"{LONG} {LONG}"),
 }
 
 
@@ -99,11 +87,6 @@ def test_a_condition_has_the_colour_that_reports_have_and_of_several_runs_each_c
     assert len(set(colours.values())) == len(NAMES)
     [axes, *_] = along([summary("loss", [0.0, 0.5], ["one", "other"])]).axes
     assert [line.get_color() for line in axes.lines[:3]] == list(COLOURS[:3])
-
-
-def test_every_radio_is_drawn_however_many_there_are() -> None:
-    [axes] = crowds([2, 4, 8], LOSSES, "").axes
-    assert {line.get_label() for line in axes.lines} >= LOSSES.keys() - {"paper"}
 
 
 def test_a_page_turns_a_figure_dark_and_its_file_stays_light(tmp_path: Path) -> None:

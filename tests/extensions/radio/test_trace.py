@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from harness.core.errors import UserError
+from harness.extensions.radio.reception import curves_of
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.reception import curves_of
 from harness.radio.trace import Trace, from_profile, read
 from harness.radio.wrapped import heard_s
 

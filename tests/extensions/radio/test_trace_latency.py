@@ -16,10 +16,10 @@ from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
+from harness.extensions.radio.reception import drawn
 from harness.radio.channel import REPLY, REQUEST, Draws, Site, Unit
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
-from harness.radio.reception import drawn
 from harness.radio.trace import Spread, Trace, from_profile, read
 
 MEAN = "distance_m,reception,latency_ms\n"

@@ -32,6 +32,24 @@ def test_list_says_what_each_radio_rests_on(harness: Callable[..., Said]) -> Non
     assert all(profile["source"] for profile in listed)
 
 
+@pytest.mark.slow
+def test_a_wrong_file_stands_in_the_list_and_keeps_no_other_from_its_command(
+    harness: Callable[..., Said], tmp_path: Path
+) -> None:
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "channels").mkdir()
+    (tmp_path / "channels/bad.toml").write_text("model = [\n")
+    lines = harness("radio", "list")[1].splitlines()
+    assert "channels/bad.toml" in lines[lines.index("bad · wrong") + 1]
+    rows = {row["name"]: row for row in json.loads(harness("radio", "list", "--json")[1])}
+    assert "channels/bad.toml" in rows["bad"]["error"]
+    assert "error" not in rows["mode4"]
+    code, _, err = harness("radio", "show", "bad")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "channels/bad.toml" in err
+    assert harness("radio", "crowd")[0] == 0
+
+
 @pytest.mark.parametrize("name", PHYSICAL)
 def test_show_has_settings_sources_and_the_reach(harness: Callable[..., Said], name: str) -> None:
     code, out, err = harness("radio", "show", name)

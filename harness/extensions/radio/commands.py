@@ -15,9 +15,9 @@ from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
+    from harness.extensions.radio.reception import Check
     from harness.radio.channel import Channel
     from harness.radio.profiles import Profile
-    from harness.radio.reception import Check
 
 MOST_TRIPS = 100_000  # at each distance
 Name = typer.Argument(
@@ -45,10 +45,10 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     Reception is the probability that one message arrives, averaged over shadowing. A table's
     latencies are shown if it has their percentiles.
     """
+    from harness.extensions.radio.reception import DISTANCES_M, by_sight, latencies_ms
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
     from harness.radio.profiles import CHANNELS
-    from harness.radio.reception import DISTANCES_M, by_sight, latencies_ms
 
     profile_name, channel = channel_of(name)
     profile, settings = CHANNELS.profile(profile_name), asdict(channel)
@@ -128,11 +128,11 @@ def check(
     vehicle to the next; they take a tenth as many samples. Each published curve is compared at its
     own settings.
     """
+    from harness.extensions.radio.reception import PACKETS
+    from harness.extensions.radio.reception import check as checked
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
     from harness.radio.profiles import CHANNELS
-    from harness.radio.reception import PACKETS
-    from harness.radio.reception import check as checked
 
     in_range("-n", n, 100, MOST_TRIPS)
     profile, channel = channel_of(name)
@@ -145,8 +145,8 @@ def check(
     result = checked(channel, n, against or (), f"channel profile {profile}")
     beyond = outside(asdict(channel), CHANNELS.profile(profile).limits)
     if out:
+        from harness.extensions.radio.figures import reception
         from harness.report.drawing.pictures import save
-        from harness.studies.figures.lines import reception
 
         save(reception(name, channel, result.messages, result.curves), out, out.suffix[1:])  # type: ignore[arg-type]
     if as_json:
@@ -237,9 +237,9 @@ def crowd(
     The road has the same density of vehicles everywhere as within the radius, and all of them send.
     """
     from harness.core.config import settable
+    from harness.extensions.radio.reception import VEHICLES, crowds
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS
-    from harness.radio.reception import VEHICLES, crowds
     from harness.radio.trace import SIGHTS
 
     if sight not in SIGHTS:
@@ -256,8 +256,8 @@ def crowd(
         )
     losses = crowds(loaded, radius_m, distance_m, sight)
     if out:
+        from harness.extensions.radio.figures import crowds as draw
         from harness.report.drawing.pictures import save
-        from harness.studies.figures.lines import crowds as draw
 
         words = {"clear": "in sight", "vehicle": "behind a car", "building": "behind a building"}
         distance = f"{distance_m:g} m {words[sight]}"

@@ -3,10 +3,10 @@
 import typer
 
 from harness.cli import options
-from harness.cli.radio import channel_of
 from harness.cli.terminal import echo_json, table
 from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.figures import Unit
+from harness.extensions.radio.commands import channel_of
 
 
 def command(

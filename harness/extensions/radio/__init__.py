@@ -1,0 +1,19 @@
+"""Give vehicles physical radios, whose losses follow from where they are; list and check radios."""
+
+from harness.core.extensions import Extension
+
+_HERE = "harness.extensions.radio"
+
+EXTENSION = Extension(
+    name="radio",
+    commands={
+        "radio list": f"{_HERE}.commands:list_channels",
+        "radio show": f"{_HERE}.commands:show",
+        "radio check": f"{_HERE}.commands:check",
+        "radio crowd": f"{_HERE}.commands:crowd",
+        "radio messages": f"{_HERE}.messages_command:command",
+    },
+    groups={"radio": "List radios, show or check one; show what messages take."},
+    panels={"radio": "More"},
+    spellings={"channel": "radio"},
+)
