@@ -24,17 +24,18 @@ from harness.runs.sources import prompt_of
 
 Typed = Callable[..., tuple[int, str, str]]
 Once = Callable[[str, Callable[[Path], object]], Path]
-TABLE = "distance_m,reception\n0,1\n400,0\n"
-PROFILE = """model = "trace"
-description = "a table of one's own"
+PROFILE = """model = "constant"
+description = "a radio of one's own"
 source = "this test"
 status = "assumed"
 [parameters]
-file = "{file}"
+latency_s = 0.01
+loss = 0.1
+bandwidth_bps = 1e7
+access = "parallel"
 """
 OF_RUN = (
-    "--prompt", "mine", "--dataset", "own/scenes", "--condition", "mine", "--condition", "far",
-    "--condition", "6g:round_trip=5g-city",
+    "--prompt", "mine", "--dataset", "own/scenes", "--condition", "mine", "--condition", "6g:round_trip=5g-city",
 )  # fmt: skip
 EVAL = ("eval", "--model", "proxy", "--seeds", "0", "--limit", "1", "--quiet")
 
@@ -51,19 +52,14 @@ def prompt(version: str, word: str) -> None:
 
 
 def _make(out: Path, scenes: Path) -> None:
-    """Make a project with a prompt, channels with tables,
-    and a run of them on a dataset of its own.
-    """
+    """Make a project with a prompt, a channel, and a run of them on a dataset of its own."""
     shutil.copytree(scenes, out / "own/scenes")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(out)
         Path("swarmdrive.toml").touch()
         prompt("mine", "Mind: ")
         Path("channels").mkdir()
-        Path("channels/mine.toml").write_text(PROFILE.format(file="near.csv"))
-        Path("channels/near.csv").write_text(TABLE)
-        Path("channels/far.csv").write_text(TABLE)
-        Path("channels/far.toml").write_text(PROFILE.format(file="far.csv"))
+        Path("channels/mine.toml").write_text(PROFILE)
         patch.setattr(sys, "argv", ["harness", *EVAL, *OF_RUN, "--out", "reports/run"])
         with pytest.raises(SystemExit) as ended:
             cli.main()
@@ -95,12 +91,11 @@ def prompts_shown(page: Path) -> list[str]:
 def test_a_run_keeps_each_file_that_made_it_once(project: Path, harness: Typed) -> None:
     files, manifest = kept(project / "reports/run"), read(project / "reports/run").manifest
     assert sorted(files) == [
-        "channels/6g.toml", "channels/far.csv", "channels/far.toml", "channels/mine.toml",
-        "channels/near.csv", "models/proxy.toml", "networks/5g-city.toml", "prompts/mine/ego.j2",
+        "channels/6g.toml", "channels/mine.toml", "models/proxy.toml", "networks/5g-city.toml", "prompts/mine/ego.j2",
         "prompts/mine/helper.j2", "prompts/mine/prompt.toml", "schemas/mine/ego.json",
         "schemas/mine/helper.json",
     ]  # fmt: skip
-    for name in ("prompts/mine/ego.j2", "channels/mine.toml", "channels/near.csv"):
+    for name in ("prompts/mine/ego.j2", "channels/mine.toml"):
         assert files[name] == Path(name).read_text()
     texts = {name: files[f"prompts/mine/{name}"] for name in ("ego.j2", "helper.j2", "prompt.toml")}
     assert digest(texts) == manifest.prompt["sha256"]

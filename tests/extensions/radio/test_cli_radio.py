@@ -289,6 +289,25 @@ def test_a_sweep_refuses_a_run_whose_radio_has_changed_since(
     assert "channel profile mine has changed since; restore it or run again" in err
 
 
+@pytest.mark.slow
+def test_a_run_keeps_the_table_that_a_profile_names(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("swarmdrive.toml").touch()
+    Path("channels").mkdir()
+    for name in ("near", "far"):
+        Path(f"channels/{name}.csv").write_text("distance_m,reception\n0,1\n400,0\n")
+        Path(f"channels/{name}.toml").write_text(
+            'model = "trace"\ndescription = "x"\nsource = "x"\nstatus = "assumed"\n'
+            f'[parameters]\nfile = "{name}.csv"\n'
+        )
+    points = (named_point("near"), named_point("far"))
+    run = evaluate(spec_of(small, points=points, seeds=(0,)), tmp_path / "run").out
+    kept = {file.name: file.read_text() for file in (run / "sources/channels").iterdir()}
+    assert kept == {file.name: file.read_text() for file in Path("channels").iterdir()}
+
+
 @pytest.mark.exhaustive
 def test_no_messages_is_a_control_of_a_physical_radio_too(
     harness: Callable[..., Said], done: Path
