@@ -16,11 +16,11 @@ from time import process_time
 import numpy as np
 from rows import Row, finish
 
+from harness.extensions.radio.its_g5 import ItsG5
+from harness.extensions.radio.lte_mode4 import LteMode4
+from harness.extensions.radio.nr_mode2 import NrMode2
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.its_g5 import ItsG5
-from harness.radio.lte_mode4 import LteMode4
-from harness.radio.nr_mode2 import NrMode2
 
 SMALLEST = "--links 30 --repeats 1"
 TABLE = "--repeats 3"

@@ -30,6 +30,7 @@ from harness.core import extensions, resources
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.radio import profiles
 from harness.studies import axes
 
 pytest_plugins = ["browsing", "relabelling", "studied"]
@@ -234,7 +235,7 @@ def part_noted(extension: str) -> str:
 
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
-    for module in (axes, operating_point, parts, schedules):
+    for module in (axes, operating_point, parts, profiles, schedules):
         module.__dict__["part_of"] = part_noted
 
 

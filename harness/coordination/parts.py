@@ -384,7 +384,7 @@ class Radio(Part, frozen=True, kw_only=True):
     edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
     # How messages are encoded, which is their size (`harness.coordination.encodings`).
     encoding: Text = JSON
-    further: Text = ""  # further settings of the profile's channel, such as `density_per_km=200`
+    further: Text = ""  # further settings of the profile's channel, such as `jitter_s=0.01`
 
     def check(self) -> None:
         if self.profile is not None and self.profile not in CHANNELS:

@@ -143,8 +143,7 @@ def wraps(
         since_certificate_s: seconds since the sender's last message with its certificate. From
             `CERTIFICATE_EVERY_S` on this one has it, else the certificate's digest.
         headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio
-            never do: `its-g5` adds its `header_bytes`, and a sidelink's blocks are taken as they
-            are.
+            never do: a channel's model adds its own.
     """
     encoding = _encoding_of(name)
     certificate = np.asarray(since_certificate_s) >= CERTIFICATE_EVERY_S[encoding]

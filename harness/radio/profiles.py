@@ -7,7 +7,6 @@ entry point in the group `swarmdrive.channels`.
 
 import os
 from dataclasses import MISSING, asdict, dataclass, field, fields
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,22 +15,17 @@ import numpy as np
 
 from harness.core.config import convert, settable, toml
 from harness.core.errors import UserError, printable, unknown
+from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.files import read_once
-from harness.core.plugins import FilesAndPlugins
+from harness.core.plugins import FilesAndPlugins, Plugins
 from harness.core.strangers import worded
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
 from harness.radio.wrapped import is_ours
 
 # Models by name: a class, or a function of a file's parameters, its folder and their name in
-# messages. Physical models are slow to import, so a model is imported only when a profile names it.
-MODELS = {
-    "constant": "harness.radio.constant:Radio",
-    "lte-v2x-mode4": "harness.radio.lte_mode4:LteMode4",
-    "nr-v2x-mode2": "harness.radio.nr_mode2:NrMode2",
-    "its-g5": "harness.radio.its_g5:ItsG5",
-    "trace": "harness.radio.trace:from_profile",
-}
+# messages. Beside the paper's, only extensions that ship have one.
+MODELS = Plugins[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 
 @dataclass(frozen=True)
@@ -100,10 +94,7 @@ class Profiles(FilesAndPlugins[Channel]):
 def _read(path: Path) -> tuple[Profile, Channel]:
     where = f"channel file {printable(path)}"
     profile = convert(toml(path, where), Profile, where)
-    if profile.model not in MODELS:
-        raise unknown(f"model in {where}", profile.model, MODELS)
-    module, _, name = MODELS[profile.model].partition(":")
-    model: Any = getattr(import_module(module), name)
+    model = _model(profile.model, where)
     parameters = f"{where} [parameters]"
     if isinstance(model, type):
         channel: Channel = convert(profile.parameters, model, parameters)
@@ -118,6 +109,17 @@ def _read(path: Path) -> tuple[Profile, Channel]:
                 "the largest"
             )
     return profile, channel
+
+
+def _model(name: str, where: str) -> Any:
+    """Return the model that a file names.
+    Raises UserError if it is unknown, or its extension is gone.
+    """
+    if MODELS.is_ours(name):
+        return MODELS[name]
+    if owner := owner_of_plugin("channel_models", name):
+        raise UserError(f"{where}: model {printable(name)} is {part_of(owner)}")
+    raise unknown(f"model in {where}", name, [each for each in MODELS if MODELS.is_ours(each)])
 
 
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})

@@ -131,7 +131,7 @@ class AtLoss(Wrapped):
         return Delivery(up, delay_s, np.full_like(loss, self.probability), airtime_s)
 
     def idle(self, setting: str | None) -> str | None:
-        return "its loss is given" if setting == "beyond" else None
+        return "its loss is given" if setting in getattr(self.channel, "of_loss", ()) else None
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         return np.full(np.shape(distance_m), 1 - self.probability)

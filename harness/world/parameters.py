@@ -66,8 +66,8 @@ class Parameters:
     beacon_hz: float = 10.0  # beacons a second; under `cam`, checks a second whether one is due
     beacon_delay_s: float = 0.02  # time from a beacon's pose until receivers have it
     beacon_loss: float = 0.08  # probability that a receiver does not receive a beacon
-    # physical radio that gives this loss on each link instead, with settings of its own:
-    # `its-g5+density_per_km=120+rate_hz=20`
+    # physical radio that gives this loss on each link instead, and settings of its own, each
+    # behind `+`
     beacon_channel: str = ""
     beacon_noise_m: float = 0.2  # standard deviation of a beacon's position on each axis
     beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed

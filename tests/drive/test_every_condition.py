@@ -111,7 +111,7 @@ class Typed:
 
 @st.composite
 def conditions(draw: st.DrawFn) -> Typed:
-    profile = draw(st.sampled_from(sorted(CHANNELS)))
+    profile = draw(st.sampled_from(sorted(CHANNELS.usable())))
     chosen = draw(st.lists(st.sampled_from(sorted(SETTINGS)), min_size=1, max_size=4, unique=True))
     return Typed(profile, {name: draw(st.sampled_from(SETTINGS[name])) for name in chosen})
 

@@ -24,6 +24,7 @@ from harness.coordination.operating_point import POINTS, OperatingPoint, named_p
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.live_world import LiveSource
+from harness.radio.profiles import CHANNELS
 from harness.report.caveats import unmeasured
 from harness.runs import folder
 from harness.runs.folder import Run
@@ -37,6 +38,7 @@ CONTENT = {
 }
 WITHOUT_WORDS = tuple(CONTENT[name] for name in of_any_model())
 SPOKEN = [point for point in CONTENT.values() if point not in WITHOUT_WORDS]
+PHYSICAL = [named_point(name) for name in ("its-g5",) if name in CHANNELS.usable()]
 SAME = (
     "layout_seed", "danger", "success", "failure", "time_s", "delay_s", "partner", "striker", "fault",
     "least_gap_m", "hard_brakings", "other_crashes", "decisions", "messages", "trigger_rate", "latency_ms",
@@ -92,7 +94,7 @@ def off_lag(of: Run) -> set[Place]:
         ),
         *few_or_many("proxy", (ALONE, OVER_6G), (0, 1), 0.8, layouts=(2, 20)),
         *few_or_many("proxy", WITHOUT_WORDS, (0,), 0.8, layouts=(2, 20)),
-        many("proxy", (named_point("its-g5"),), (0, 1), 0.5, 20),
+        *(many("proxy", (point,), (0, 1), 0.5, 20) for point in PHYSICAL),
         many("proxy-faulty", (ALONE, OVER_6G), (0, 1), 0.4, 20),
         *(many("swarm-tiny-six", (point,), (0,), 0.8, 3) for point in SPOKEN),
     ],

@@ -41,7 +41,7 @@ OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
-NAMED = ("families", "contents", "schedules", "readers")
+NAMED = ("families", "channel_models", "contents", "schedules", "readers")
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -462,11 +462,17 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
         "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
         "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin'), "
-        "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2')):\n    try:\n        "
+        "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2'), "
+        "lambda: named_point('its-g5'), lambda: named_point('mine')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
+    (tmp_path / "swarmdrive.toml").touch()
+    (tmp_path / "channels").mkdir()
+    profile = 'description = "x"\nsource = "x"\nstatus = "assumed"\nmodel = "trace"\n'
+    (tmp_path / "channels/mine.toml").write_text(profile)
     done = in_the_core(core, tmp_path, code)
     of_one = "is part of the extension calibration, which is not installed"
+    mine = printable(tmp_path / "channels/mine.toml")
     learnt = f"file {printable(core / 'schedules/learnt.toml')}: what reads it"
     assert done.stdout.splitlines() == [
         "True",
@@ -478,6 +484,14 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         ],
         "scenario env:merge-v0:decisions=2 is part of the extension environments, which is not "
         "installed",
+        *[
+            f"channel file {file}: model {model} is part of the extension radio, which is not "
+            "installed"
+            for file, model in (
+                (printable(core / "channels/its-g5.toml"), "its-g5"),
+                (mine, "trace"),
+            )
+        ],
     ]
 
 

@@ -13,9 +13,10 @@ from harness.coordination.operating_point import more_parts
 from harness.coordination.schedules import SCHEDULES
 from harness.core.extensions import Extension, control_settings, extensions
 from harness.extensions.trust.part import DEFENCES
+from harness.radio.profiles import CHANNELS
 
 HARNESS = Path(__file__).parents[2] / "harness"
-WORD = re.compile(r"[a-z]+(?:-[a-z]+)*")
+WORD = re.compile(r"[a-z][a-z0-9]*(?:-[a-z0-9]+)*")
 BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and ends of lines
 
 # Names of extensions that the core has for something of its own.
@@ -59,6 +60,7 @@ ORDINARY = {
     "serve": "what a server does with a model",
     "tells": "a verb",
     "text": "what is read and written",
+    "trace": "of a matrix",
     "trust": "how far a rule, or a loader of weights, trusts what it is given",
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",
@@ -90,12 +92,19 @@ def typed(extension: Extension) -> set[str]:
     return {*extension.commands, *extension.groups, *extension.spellings, *extension.short}
 
 
+def read(extension: Extension) -> set[str]:
+    """Return the names of the shipped channel files that state a model of an extension."""
+    models = extension.adds.get("channel_models", {})
+    files = (HARNESS.parent / "channels").glob("*.toml")
+    return {file.stem for file in files if CHANNELS.profile(file.stem).model in models}
+
+
 def names(extension: Extension) -> set[str]:
     """Return every single word that an extension gives a thing."""
     given = {extension.name, *extension.settings, *extension.studies}
     words = {word for path in typed(extension) for word in path.split()}
     added = {name for table in extension.adds.values() for name in table}
-    return given | words | added
+    return given | words | added | read(extension)
 
 
 def phrases(extension: Extension) -> Iterator[str]:

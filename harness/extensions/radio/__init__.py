@@ -16,4 +16,12 @@ EXTENSION = Extension(
     groups={"radio": "List radios, show or check one; show what messages take."},
     panels={"radio": "More"},
     spellings={"channel": "radio"},
+    adds={
+        "channel_models": {
+            "its-g5": f"{_HERE}.its_g5:ItsG5",
+            "lte-v2x-mode4": f"{_HERE}.lte_mode4:LteMode4",
+            "nr-v2x-mode2": f"{_HERE}.nr_mode2:NrMode2",
+            "trace": f"{_HERE}.trace:from_profile",
+        }
+    },
 )

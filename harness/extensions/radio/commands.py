@@ -238,9 +238,9 @@ def crowd(
     """
     from harness.core.config import settable
     from harness.extensions.radio.reception import VEHICLES, crowds
+    from harness.extensions.radio.trace import SIGHTS
     from harness.radio.channel import Physical
     from harness.radio.profiles import CHANNELS
-    from harness.radio.trace import SIGHTS
 
     if sight not in SIGHTS:
         raise unknown("--sight", sight, SIGHTS)

@@ -16,12 +16,12 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import known
 from harness.core.pairs import pairs
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
+from harness.extensions.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
+from harness.extensions.radio.trace import SIGHTS, Trace
+from harness.extensions.radio.transceiver import Transceiver
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
-from harness.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
-from harness.radio.trace import SIGHTS, Trace
-from harness.radio.transceiver import Transceiver
 from harness.radio.wrapped import heard_s
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)

@@ -13,8 +13,8 @@ from evaluating import spec_of
 from harness.cli.terminal import attributes
 from harness.coordination.operating_point import named_point
 from harness.dataset.load import Dataset
+from harness.extensions.radio.its_g5 import ItsG5
 from harness.radio.channel import Physical
-from harness.radio.its_g5 import ItsG5
 from harness.radio.profiles import CHANNELS
 
 Said = tuple[int, str, str]

@@ -12,7 +12,7 @@ import pytest
 from reference import DOCS
 
 from harness.coordination.operating_point import OperatingPoint
-from harness.radio.its_g5 import ItsG5
+from harness.extensions.radio.its_g5 import ItsG5
 from harness.radio.messages import NAMES, packet_bits
 from harness.radio.profiles import CHANNELS
 

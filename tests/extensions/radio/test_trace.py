@@ -9,9 +9,9 @@ import pytest
 
 from harness.core.errors import UserError
 from harness.extensions.radio.reception import curves_of
+from harness.extensions.radio.trace import Trace, from_profile, read
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.trace import Trace, from_profile, read
 from harness.radio.wrapped import heard_s
 
 PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"

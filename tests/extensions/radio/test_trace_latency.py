@@ -17,10 +17,10 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.extensions.radio.reception import drawn
+from harness.extensions.radio.trace import Spread, Trace, from_profile, read
 from harness.radio.channel import REPLY, REQUEST, Draws, Site, Unit
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
-from harness.radio.trace import Spread, Trace, from_profile, read
 
 MEAN = "distance_m,reception,latency_ms\n"
 SPREAD = "distance_m,reception,latency_p50_ms,latency_p95_ms\n"

@@ -24,11 +24,11 @@ from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint, named_point
 from harness.dataset.load import Dataset
+from harness.extensions.radio.propagation import Propagation
+from harness.extensions.radio.trace import Point, Spread, Table, Trace
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Site, Unit
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
-from harness.radio.propagation import Propagation
-from harness.radio.trace import Point, Spread, Table, Trace
 from harness.world.sight_lines import site
 from harness.world.state import Building, VehicleState, WorldState
 

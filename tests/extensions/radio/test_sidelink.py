@@ -12,14 +12,14 @@ from scipy.stats import norm
 from tiers import some
 
 from harness.core.errors import UserError
-from harness.radio.block_error import block_error
+from harness.extensions.radio.block_error import block_error
+from harness.extensions.radio.lte_mode4 import LteMode4
+from harness.extensions.radio.nr_mode2 import NrMode2
+from harness.extensions.radio.sps import Scheduling, taken
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Links, Site
 from harness.radio.fading import Trips
 from harness.radio.limits import outside
-from harness.radio.lte_mode4 import LteMode4
-from harness.radio.nr_mode2 import NrMode2
 from harness.radio.profiles import CHANNELS
-from harness.radio.sps import Scheduling, taken
 
 QUIET = LteMode4(density_per_km=0.0)
 BUSY = LteMode4(density_per_km=200.0)

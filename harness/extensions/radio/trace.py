@@ -21,6 +21,7 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
+from harness.extensions.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
 from harness.radio.channel import (
     BUILDING,
     CLEAR,
@@ -34,7 +35,6 @@ from harness.radio.channel import (
     Way,
 )
 from harness.radio.constant import link_up
-from harness.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
 
 SIGHTS = {"clear": CLEAR, "vehicle": VEHICLE, "building": BUILDING}
 MEAN, SPREAD = "latency_ms", ("latency_p50_ms", "latency_p95_ms")
@@ -88,6 +88,8 @@ class Trace:
     # longer received, or `held`, that of the last row, for a table that ends early
     beyond: Literal["zero", "held"] = "zero"
     decorrelation_m: ClassVar[float] = math.inf
+    # settings that change losses alone, and nothing where an operating point gives the loss
+    of_loss: ClassVar[tuple[str, ...]] = ("beyond",)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         return self._at(distance_m, CLEAR if sight is None else sight, "reception")

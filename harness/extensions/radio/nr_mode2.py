@@ -25,9 +25,9 @@ from typing import Annotated, ClassVar, Literal
 from harness.core.config import between
 from harness.core.errors import UserError
 from harness.core.files import text_of
-from harness.radio.block_error import BlockError, block_error, threshold
-from harness.radio.propagation import Environment, noise_dbm
-from harness.radio.sidelink import Sidelink
+from harness.extensions.radio.block_error import BlockError, block_error, threshold
+from harness.extensions.radio.propagation import Environment, noise_dbm
+from harness.extensions.radio.sidelink import Sidelink
 
 # Resource blocks by bandwidth in MHz, for subcarriers of 15, 30 and 60 kHz (TS 38.101-1, table
 # 5.3.2-1).

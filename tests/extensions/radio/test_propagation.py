@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.extensions.radio.propagation import Propagation, noise_dbm
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE
-from harness.radio.propagation import Propagation, noise_dbm
 
 HIGHWAY = Propagation(environment="tr37885-highway", frequency_ghz=5.9)
 URBAN = Propagation(environment="tr37885-urban", frequency_ghz=5.9)

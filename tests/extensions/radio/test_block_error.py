@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from harness.core.errors import UserError
-from harness.radio.block_error import block_error, threshold
+from harness.extensions.radio.block_error import block_error, threshold
 
 
 def test_points_are_joined_and_held():

@@ -37,12 +37,12 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
 from harness.core.special import ndtr, ndtri
-from harness.radio import back_off
-from harness.radio.back_off import SLOT_S, free_share
-from harness.radio.block_error import block_error
+from harness.extensions.radio import back_off
+from harness.extensions.radio.back_off import SLOT_S, free_share
+from harness.extensions.radio.block_error import block_error
+from harness.extensions.radio.propagation import noise_dbm
+from harness.extensions.radio.transceiver import STEP_DB, STEP_M, Transceiver
 from harness.radio.channel import CLEAR, VEHICLE, Links, served_s
-from harness.radio.propagation import noise_dbm
-from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
 BANDWIDTH_HZ = 10e6
 SIFS_S, SYMBOL_S, PREAMBLE_S = 32e-6, 8e-6, 40e-6  # IEEE 802.11-2012, 10 MHz OFDM
@@ -89,10 +89,10 @@ class ItsG5(Transceiver):
     # back-off is uniform from 0 to this number of slots; a broadcast never doubles it. There is
     # always a back-off, as after a packet of one's own
     contention_window: Annotated[int, between(1, 1023)] = 15
-    # block error curve of frames, a name of `harness.radio.block_error`. `11p-goubet`, the
-    # source's, is over the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4 (6 or
-    # 12 Mb/s) is shifted for another rate by the additional SINR that an implementation at 0.37 of
-    # Shannon's rate needs
+    # block error curve of frames, a name of `harness.extensions.radio.block_error`. `11p-goubet`,
+    # the source's, is over the energy of a bit, so it holds for every rate. A curve of MCS 2 or 4
+    # (6 or 12 Mb/s) is shifted for another rate by the additional SINR that an implementation at
+    # 0.37 of Shannon's rate needs
     curve: str = "11p-goubet"
 
     def __post_init__(self) -> None:

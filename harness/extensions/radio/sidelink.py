@@ -22,10 +22,10 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
 from harness.core.special import ndtr
-from harness.radio.block_error import BlockError
+from harness.extensions.radio.block_error import BlockError
+from harness.extensions.radio.sps import Scheduling
+from harness.extensions.radio.transceiver import STEP_DB, STEP_M, Transceiver
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Links
-from harness.radio.sps import Scheduling
-from harness.radio.transceiver import STEP_DB, STEP_M, Transceiver
 
 # Interferers farther away do not count, as in the source; longer links have this length's
 # collisions.

@@ -10,9 +10,9 @@ simulation at 100 to 300 vehicles a kilometre, 10 and 20 Hz, 20 and 23 dBm, dist
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from harness.radio.block_error import BlockError, block_error
-from harness.radio.propagation import noise_dbm
-from harness.radio.sidelink import Sidelink
+from harness.extensions.radio.block_error import BlockError, block_error
+from harness.extensions.radio.propagation import noise_dbm
+from harness.extensions.radio.sidelink import Sidelink
 
 # Coding and resource blocks (of 50 in 10 MHz) of a packet, by number of sub-channels.
 CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}

@@ -11,8 +11,8 @@ import numpy as np
 from harness.core.arrays import Bools, Floats
 from harness.core.config import between, check
 from harness.core.errors import UserError
+from harness.extensions.radio.propagation import Propagation
 from harness.radio.channel import Broadcast, Delivery, Draws, Links, Physical, Site
-from harness.radio.propagation import Propagation
 
 # Steps of a model's tables: of distance between rows, and of received power between columns.
 STEP_M, STEP_DB = 10.0, 0.5

@@ -10,11 +10,11 @@ import pytest
 from tiers import some
 
 from harness.core.errors import UserError
-from harness.radio import back_off
-from harness.radio.back_off import SLOT_S
+from harness.extensions.radio import back_off
+from harness.extensions.radio.back_off import SLOT_S
+from harness.extensions.radio.its_g5 import ItsG5
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
-from harness.radio.its_g5 import ItsG5
 
 QUIET = ItsG5(density_per_km=0)
 CROWD = ItsG5(density_per_km=120, rate_hz=25)
