@@ -1,23 +1,41 @@
 """Compute the sizes of requests and replies by how messages are encoded.
 
-    json  compact JSON without a signature or headers, the paper's profiles' default
-    etsi  CPMs, and containers of our own for intents and requests, in PER; signed, with a digest of
-          the certificate, which beacons carry now and then
-    sae   SDSMs, and the same
-
-The background's packets are then CAMs or BSMs. Under a physical radio the headers of network and
-transport count as well; those of the radio are its own.
+`json` is compact JSON without a signature or headers, the paper's profiles' default. Encodings by
+standards are an extension's; under a physical radio the headers of network and transport count as
+well, and the background's packets are then their beacons. The radio's headers are its own.
 """
+
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats
-from harness.radio import messages
-from harness.radio.messages import NAMES, Counts, Encoding, message_bits, packet_bits
+from harness.core.plugins import Shipped
 
 JSON = "json"
-ENCODINGS = (JSON, *NAMES)
+Held = Literal["intent", "objects", "request"]
+
+
+@runtime_checkable
+class Encoding(Protocol):
+    """The sizes of messages by a standard."""
+
+    def packet_bits(self, holds: Held, headers: bool, **counts: Floats | float) -> Floats:
+        """Return the bits of messages, 0 where none is sent.
+
+        Args:
+            holds: what they hold.
+            headers: whether those of network and transport count.
+            counts: how much they hold: `actions` and `text_bytes` of an intent, `objects` that are
+                listed, `helpers` whom a request asks.
+        """
+
+    def beacon_bytes(self, rate_hz: float) -> int:
+        """Return the mean size of a vehicle's beacons at so many a second."""
+
+
+ENCODINGS = Shipped[Encoding]("swarmdrive.encodings", Encoding, {})  # those beside `json`
 SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 
 
@@ -28,8 +46,11 @@ def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """
     if encoding == JSON:
         return intents.payload_bits
-    counts = Counts(actions=intents.own.shape[-1], text_bytes=_text_bytes(intents))
-    return _replies(encoding, "intent", counts, intents, headers)
+    actions, text_bytes = intents.own.shape[-1], _text_bytes(intents)
+    bits = ENCODINGS[encoding].packet_bits(
+        "intent", headers, actions=actions, text_bytes=text_bytes
+    )
+    return np.broadcast_to(bits, intents.payload_bits.shape)
 
 
 def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
@@ -39,8 +60,8 @@ def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """
     if encoding == JSON:
         return 8 * (len(SAYS) + _text_bytes(intents))
-    counts = Counts(text_bytes=_text_bytes(intents))
-    return _replies(encoding, "intent", counts, intents, headers)
+    bits = ENCODINGS[encoding].packet_bits("intent", headers, text_bytes=_text_bytes(intents))
+    return np.broadcast_to(bits, intents.payload_bits.shape)
 
 
 def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
@@ -53,40 +74,24 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     assert intents.objects is not None
     if encoding == JSON:
         return intents.object_bits
-    return _replies(encoding, "objects", Counts(objects=intents.objects), intents, headers)
+    bits = ENCODINGS[encoding].packet_bits("objects", headers, objects=intents.objects)
+    return np.broadcast_to(bits, intents.payload_bits.shape)
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size in bits of a request to `helpers` vehicles; `encoding` is `etsi` or `sae`."""
-    return float(_packet(encoding, "request", Counts(helpers=helpers), headers))
+    """Return the size in bits of a request to `helpers` vehicles, by an encoding but `json`."""
+    return float(ENCODINGS[encoding].packet_bits("request", headers, helpers=helpers))
 
 
 def beacon_bytes(encoding: str, rate_hz: float) -> int:
     """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
 
-    `encoding` is `etsi` (CAM) or `sae` (BSM).
+    `encoding` is any but `json`.
     """
-    return messages.beacon_bytes(_standard(encoding), rate_hz)
+    return ENCODINGS[encoding].beacon_bytes(rate_hz)
 
 
 def _text_bytes(intents: Intents) -> Floats:
     if intents.text_bytes is None:
         return np.zeros(intents.payload_bits.shape)
     return intents.text_bytes
-
-
-def _replies(
-    encoding: str, content: str, counts: Counts, intents: Intents, headers: bool
-) -> Floats:
-    """Return the size of a message of each helper, `(..., H)`, by a standard's encoding."""
-    bits = _packet(encoding, content, counts, headers)
-    return np.broadcast_to(bits, intents.payload_bits.shape)
-
-
-def _standard(encoding: str) -> Encoding:
-    return "sae" if encoding == "sae" else "etsi"
-
-
-def _packet(encoding: str, content: str, counts: Counts, headers: bool) -> Floats:
-    name = NAMES[_standard(encoding)][content]
-    return packet_bits(name, message_bits(name, counts), headers=headers)

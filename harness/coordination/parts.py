@@ -289,12 +289,14 @@ def wrong(key: str, value: object, allowed: str) -> ValueError:
     return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
 
 
-def _lacking(setting: str, name: str, plugins: Plugins[Any]) -> UserError:
-    """Return the error for a name that no plug-in has: whose it is, if its extension is gone."""
+def _lacking(setting: str, name: str, plugins: Plugins[Any], *others: str) -> UserError:
+    """Return the error for a name that neither plug-ins nor `others` have: whose it is, if its
+    extension is gone.
+    """
     kind = plugins.group.rpartition(".")[2]
     if owner := owner_of_plugin(kind, name):
         return UserError(f"{setting} {printable(name)} is {part_of(owner)}")
-    return unknown(setting, name, plugins)
+    return unknown(setting, name, (*others, *plugins))
 
 
 class Ask(Part, frozen=True, kw_only=True):
@@ -393,8 +395,8 @@ class Radio(Part, frozen=True, kw_only=True):
             )
         if self.edge not in EDGES:
             raise unknown("edge", self.edge, EDGES)
-        if self.encoding not in ENCODINGS:
-            raise unknown("encoding", self.encoding, ENCODINGS)
+        if self.encoding != JSON and self.encoding not in ENCODINGS:
+            raise _lacking("encoding", self.encoding, ENCODINGS, JSON)
 
     @property
     def acts_on(self) -> Collection[ActsOn]:

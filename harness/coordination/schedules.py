@@ -10,11 +10,11 @@ from harness.coordination.scheduling import FORMULAS, Schedule
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.files import sha256_file
-from harness.core.plugins import FilesAndPlugins, Plugins, one_of, tuple_of
+from harness.core.plugins import FilesAndPlugins, Shipped, one_of, tuple_of
 
 NEEDS = ("in_time", "outlook", "lot")  # what a schedule may need to know
 # By folder, such as `schedules`, what reads the files in it; only extensions that ship have one.
-READERS = Plugins[Callable[[Any], Schedule]]("swarmdrive.readers", Callable, {})
+READERS = Shipped[Callable[[Any], Schedule]]("swarmdrive.readers", Callable, {})
 
 
 def _is_threshold(value: Any) -> bool:
@@ -37,7 +37,7 @@ class Schedules(FilesAndPlugins[Schedule]):
         Raises UserError if the file is wrong, or the extension that reads such files is not
         installed.
         """
-        if not READERS.is_ours(self.folder):
+        if self.folder not in READERS:
             owner = owner_of_plugin("readers", self.folder)
             reader = f"is {part_of(owner)}" if owner else "is gone; install the harness again"
             raise UserError(f"schedule file {printable(file)}: what reads it {reader}")

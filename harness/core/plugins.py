@@ -251,6 +251,13 @@ class Plugins(Mapping[str, T], Generic[T]):
         """Raise any error if a package's plug-in is inconsistent; for subclasses to override."""
 
 
+class Shipped(Plugins[T]):
+    """Plug-ins that the core and extensions that ship have; other packages add none."""
+
+    def _entries(self) -> Mapping[str, Any]:
+        return {name: entry for name, entry in super()._entries().items() if is_ours(entry)}
+
+
 class FilesAndPlugins(Plugins[T]):
     """Hold plug-ins that may also be TOML files, shipped or in the user's project.
 

@@ -17,7 +17,7 @@ from harness.core.config import convert, settable, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.files import read_once
-from harness.core.plugins import FilesAndPlugins, Plugins
+from harness.core.plugins import FilesAndPlugins, Shipped
 from harness.core.strangers import worded
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
@@ -25,7 +25,7 @@ from harness.radio.wrapped import is_ours
 
 # Models by name: a class, or a function of a file's parameters, its folder and their name in
 # messages. Beside the paper's, only extensions that ship have one.
-MODELS = Plugins[Any]("swarmdrive.channel_models", object, {"constant": Radio})
+MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ def _model(name: str, where: str) -> Any:
     """Return the model that a file names.
     Raises UserError if it is unknown, or its extension is gone.
     """
-    if MODELS.is_ours(name):
+    if name in MODELS:
         return MODELS[name]
     if owner := owner_of_plugin("channel_models", name):
         raise UserError(f"{where}: model {printable(name)} is {part_of(owner)}")
-    raise unknown(f"model in {where}", name, [each for each in MODELS if MODELS.is_ours(each)])
+    raise unknown(f"model in {where}", name, MODELS)
 
 
 CHANNELS = Profiles("swarmdrive.channels", Channel, {})

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from harness.backends.base import Completion, Request
 from harness.coordination.contents import CONTENTS
-from harness.coordination.encodings import ENCODINGS
+from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.operating_point import (
     OperatingPoint,
     more_parts,
@@ -45,7 +45,7 @@ AT_THE_LAG = Latency("card", "declared: for this test", 0.145, 0.145, 0.0)
 NUMBERS = {bool: ("true", "false"), int: ("0", "1", "2"), float: ("0", "0.05", "0.5", "1", "40")}
 WORDS: Mapping[str, Sequence[str]] = {
     "edge": EDGES,
-    "encoding": ENCODINGS,
+    "encoding": (JSON, *ENCODINGS),
     "schedule": [name for name in SCHEDULES if SCHEDULES.is_ours(name)],
     "content": tuple(CONTENTS),
     "consensus": names(),

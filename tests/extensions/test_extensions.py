@@ -23,7 +23,9 @@ from reference import DOCS, blocks
 import harness as package
 from harness.cli.commands import COMMANDS
 from harness.coordination.added_parts import added_parts
+from harness.coordination.encodings import ENCODINGS
 from harness.coordination.operating_point import more_parts
+from harness.coordination.schedules import READERS
 from harness.core import extensions as known
 from harness.core.errors import UserError, printable
 from harness.core.extensions import Extension
@@ -31,6 +33,7 @@ from harness.core.plugins import Plugins
 from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import begin, unfinished
+from harness.radio.profiles import MODELS
 from harness.report import sections
 from harness.runs import metrics
 from harness.runs.folder import read
@@ -41,7 +44,7 @@ OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
-NAMED = ("families", "channel_models", "contents", "schedules", "readers")
+NAMED = ("channel_models", "contents", "encodings", "families", "readers", "schedules")
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -463,7 +466,8 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "'calibration': 'l1'}), lambda: named_point('6g:calibration=l1'), lambda: "
         "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin'), "
         "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2'), "
-        "lambda: named_point('its-g5'), lambda: named_point('mine')):\n    try:\n        "
+        "lambda: named_point('its-g5'), lambda: named_point('mine'), "
+        "lambda: named_point('6g:encoding=etsi')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
     (tmp_path / "swarmdrive.toml").touch()
@@ -492,6 +496,7 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
                 (mine, "trace"),
             )
         ],
+        "encoding etsi is part of the extension radio, which is not installed",
     ]
 
 
@@ -633,6 +638,18 @@ def test_metadata_that_cannot_be_read_are_one_line(
     assert code == 0
     assert "the entry points of package by-hand cannot be read" in err
     assert known.extensions()
+
+
+@pytest.mark.parametrize("registry", [MODELS, ENCODINGS, READERS])
+def test_no_package_adds_what_only_extensions_that_ship_add(
+    installed: Installed, registry: Plugins
+) -> None:
+    kind = registry.group.rpartition(".")[2]
+    before = list(registry)
+    installed(odd=f'Extension(name="odd", adds={{"{kind}": {{"mine": "of_others:ODD"}}}})')
+    assert "odd" in known.extensions()
+    assert list(registry) == before
+    assert "mine" not in registry
 
 
 def test_a_plug_in_of_an_extension_with_the_name_of_a_built_in_one_is_left_out(

@@ -36,6 +36,7 @@ ORDINARY = {
     "env": "of highway-env, and a variable of the shell",
     "environment": "one of highway-env, and a variable of the shell",
     "environments": "those of highway-env",
+    "etsi": "whose standards are cited",
     "examples": "what a prompt shows as earlier turns",
     "failures": "episodes and answers that failed",
     "grid": "the values of a sweep, and the episodes of a run by seed",

@@ -1,4 +1,6 @@
-"""Give vehicles physical radios, whose losses follow from where they are; list and check radios."""
+"""Give vehicles physical radios, whose losses follow from where they are, and messages the sizes of
+the standards; list and check radios.
+"""
 
 from harness.core.extensions import Extension
 
@@ -22,6 +24,7 @@ EXTENSION = Extension(
             "lte-v2x-mode4": f"{_HERE}.lte_mode4:LteMode4",
             "nr-v2x-mode2": f"{_HERE}.nr_mode2:NrMode2",
             "trace": f"{_HERE}.trace:from_profile",
-        }
+        },
+        "encodings": {"etsi": f"{_HERE}.messages:ETSI", "sae": f"{_HERE}.messages:SAE"},
     },
 )

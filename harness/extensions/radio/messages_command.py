@@ -35,8 +35,8 @@ def command(
     and then, the certificate. The headers are those of network and transport. With a message's
     name, its members are listed, in bits.
     """
+    from harness.extensions.radio.messages import NAMES, Counts, shares, size, wraps
     from harness.extensions.radio.transceiver import Transceiver
-    from harness.radio.messages import NAMES, Counts, shares, size, wraps
 
     in_range("--objects", objects, 0, 255)
     in_range("--points", points, 0, 23)

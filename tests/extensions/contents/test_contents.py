@@ -35,9 +35,9 @@ from harness.dataset.load import Dataset, Scene
 from harness.evaluate.dry_run import count
 from harness.evaluate.fusion import source_of
 from harness.evaluate.sharing import as_asked, listed
+from harness.extensions.radio.messages import Counts, size
 from harness.prompts import versions as prompts
 from harness.radio.channel import Draws
-from harness.radio.messages import Counts, size
 from harness.runs import folder
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph

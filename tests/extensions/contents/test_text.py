@@ -21,8 +21,8 @@ from harness.dataset.load import Dataset
 from harness.evaluate.dry_run import count
 from harness.evaluate.fusion import source_of
 from harness.evaluate.spec import Spec
+from harness.extensions.radio.messages import Counts, size
 from harness.prompts import versions as prompts
-from harness.radio.messages import Counts, size
 from harness.runs import folder
 
 TEXT = named_point("6g:loss=0,content=text,schedule=always")

@@ -13,7 +13,7 @@ from reference import DOCS
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.extensions.radio.its_g5 import ItsG5
-from harness.radio.messages import NAMES, packet_bits
+from harness.extensions.radio.messages import NAMES, packet_bits
 from harness.radio.profiles import CHANNELS
 
 

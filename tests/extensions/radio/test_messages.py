@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from harness.radio.messages import (
+from harness.extensions.radio.messages import (
     NAMES,
     PSIDS,
     Counts,
@@ -28,7 +28,7 @@ from harness.radio.messages import (
 )
 
 # What pycrate writes: benchmarks/message_sizes.py.
-ENCODED = json.loads((Path(__file__).parent / "golden/message-sizes.json").read_text())
+ENCODED = json.loads((Path(__file__).parents[2] / "golden/message-sizes.json").read_text())
 MESSAGES = [name for names in NAMES.values() for name in names.values()]
 ROWS = [member for members in table().values() for member in members]
 counts = st.integers(0, 200)

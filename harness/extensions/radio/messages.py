@@ -15,12 +15,13 @@ size depends on values, only on how much is listed.
 No standard has a message for an intent or for its request. Theirs are containers of our own, made
 of the standards' elements. All sizes are held against an encoder (`benchmarks/message_sizes.py`).
 
-`harness.coordination.encodings` chooses among these and the size of a reply's text.
+A condition's `encoding` chooses one (`harness.coordination.encodings`).
 """
 
 import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -180,6 +181,23 @@ def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
     beacon = size(NAMES[encoding]["beacon"], Counts())
     every = max(1, math.ceil(CERTIFICATE_EVERY_S[encoding] * rate_hz))
     return math.ceil((beacon.packet + (beacon.with_certificate - beacon.packet) / every) / 8)
+
+
+@dataclass(frozen=True)
+class Standard:
+    """A standard's messages as an `encoding` of conditions."""
+
+    encoding: Encoding
+
+    def packet_bits(self, holds: str, headers: bool, **counts: Count) -> Floats:
+        name = NAMES[self.encoding][holds]
+        return packet_bits(name, message_bits(name, Counts(**counts)), headers=headers)
+
+    def beacon_bytes(self, rate_hz: float) -> int:
+        return beacon_bytes(self.encoding, rate_hz)
+
+
+ETSI, SAE = Standard("etsi"), Standard("sae")
 
 
 def _encoding_of(name: str) -> Encoding:
