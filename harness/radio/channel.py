@@ -21,7 +21,7 @@ CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
 class Unit(NamedTuple):
-    """A fixed roadside unit."""
+    """Hold the position and antenna height of a roadside unit, m."""
 
     x_m: float  # position, m to the east of the centroid of the conflict zone
     y_m: float  # position, m to the south of it
@@ -30,7 +30,10 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class Site:
-    """The true positions of the ego and its helpers, and what stands between them."""
+    """Hold the true positions of the ego and its H helpers, m, and what blocks each link.
+
+    Arrays have leading batch dimensions, `(...)`; the ego's position is the first of 1+H.
+    """
 
     xy_m: Floats  # positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper
     # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
@@ -51,13 +54,14 @@ class Site:
 
     @property
     def between(self) -> tuple[Ints, Floats, Floats, float | None]:
-        """The inputs of `Propagation` besides distances:
-        sight, blocker, corner, first antenna's height.
+        """Return the arguments of `Propagation.path_loss_db` that follow the distance.
+
+        They are obstacle, blocker's height, distances to the corner and the first antenna's height.
         """
         return self.sight, self.blocker_m, self.corner_m, self.first_m
 
     def take(self, at: Any) -> "Site":
-        """Select sites by places of the leading dimension."""
+        """Return the part with these indices of the first batch dimension."""
         units = {unit: its.take(at) for unit, its in self.units.items()}
         return Site(
             self.xy_m[at],
@@ -69,7 +73,7 @@ class Site:
         )
 
     def select(self, links: slice) -> "Site":
-        """Select some of the links, `(..., h)`."""
+        """Return the part with a slice of the helpers, `(..., h)`; without roadside units."""
         xy_m = np.concatenate(
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
@@ -77,7 +81,7 @@ class Site:
         return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
     def of_helpers(self, places: Ints) -> "Site":
-        """Select helpers by their places, `(n, H')`; a helper may be repeated."""
+        """Return the part with the helpers of these indices, `(n, H')`; one may be repeated."""
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return Site(
             np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
@@ -91,7 +95,10 @@ class Site:
 
 @dataclass(frozen=True)
 class Draws:
-    """The channel's draws in [0, 1), which are the same for every operating point."""
+    """Hold the channel's uniform random numbers in [0, 1), the same for every operating point.
+
+    `link` and `jitter` are of constant channels; `trips` has the keys of those of physical radios.
+    """
 
     # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
     # episode under block fading
@@ -102,60 +109,70 @@ class Draws:
     given: Floats | None = None  # draws of packets, `(..., 1+2H)`, instead of those of `trips`
 
     def take(self, at: Any) -> "Draws":
-        """Select draws by places of the leading dimension."""
+        """Return the part with these indices of the first batch dimension."""
         given = None if self.given is None else self.given[at]
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
-        """Select the draws of helpers by their places, `(n, H')`;
-        a repeated helper has the same link.
+        """Return the draws of the helpers with these indices, `(n, H')`.
+
+        A repeated helper has the same link.
         """
         link = np.take_along_axis(self.link, places[..., None], axis=-2)
         return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
 
     @cached_property
     def packet(self) -> Floats:
-        """Draws of the request and the reply of each helper, `(..., H, 2)`, new at every step."""
+        """Return draws for loss of each helper's request and reply, `(..., H, 2)`.
+
+        They are new at every step.
+        """
         return self._uniforms[..., 1:].reshape(*self.jitter.shape, 2)
 
     @cached_property
     def wait(self) -> Floats:
-        """Draw of the request's wait for its turn, `(...)`, new at every step."""
+        """Return draws for the request's wait for the medium, `(...)`, new at every step."""
         return self._uniforms[..., 0]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
-        """Return the shadowing of each helper's link, `(..., H)`,
-        standard normal: `fading.Trips.shadow`.
+        """Return the shadowing of each helper's link, `(..., H)`, standard normal.
+
+        `xy_m` are positions of the ego and its helpers, `(..., 1+H, 2)`; see `fading.Trips.shadow`.
         """
         return self._trips.shadow(xy_m, decorrelation_m)
 
     def of(self, links: str) -> "Draws":
-        """Return the draws of other links, such as those of a roadside unit, by the links' name."""
+        """Return independent draws for other links, such as a roadside unit's, by their name."""
         return replace(self, trips=replace(self._trips, links=links), given=None)
 
     @cached_property
     def first_packets(self) -> Floats:
-        """Draws of one wait and two packets for a link that exists even without helpers,
-        `(..., 3)`.
+        """Return draws for one wait and two packets of a link without any helper, `(..., 3)`.
+
+        Such a link is that of the ego and a roadside unit.
         """
         return self._trips.uniforms(1)
 
     @cached_property
     def latency(self) -> Floats:
-        """Draws of how long each helper's request and reply take, `(..., H, 2)`,
-        new at every step.
+        """Return draws for the latency of each helper's request and reply, `(..., H, 2)`.
+
+        They are new at every step.
         """
         return self.of(f"{self._trips.links}.latency").packet
 
     @cached_property
     def first(self) -> "Draws":
-        """The draws of a link that exists even without helpers, as those of one helper."""
+        """Return the draws of the link of ego and roadside unit, as if it were one helper's.
+
+        The link exists even without helpers.
+        """
         none = np.zeros((*self.jitter.shape[:-1], 1))
         return Draws(np.stack([none, none], axis=-1), none, self._trips)
 
     @cached_property
     def requested(self) -> "Draws":
-        """The same draws, but with requests that are always received, whatever the loss."""
+        """Return the same draws, but with requests that are always received, whatever the loss."""
         given = self._uniforms.copy()
         given[..., 1::2] = 1.0
         return replace(self, given=given)
@@ -179,7 +196,10 @@ NO_SITE = (
 
 @dataclass(frozen=True)
 class Links:
-    """The inputs of a channel about the links between the ego and its helpers."""
+    """Hold what a channel must know of the links between the ego and its H helpers, (..., H).
+
+    `ready_s` is when a helper has heard the request and has its own answer, s after the request.
+    """
 
     # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
     asked: Bools
@@ -196,13 +216,13 @@ class Links:
 
     @property
     def where(self) -> Site:
-        """The site. Raises UserError in a world without positions."""
+        """Return the positions. Raises UserError in a world without positions."""
         if self.site is None:
             raise UserError(NO_SITE)
         return self.site
 
     def take(self, at: Any) -> "Links":
-        """Select links by places of the leading dimension."""
+        """Return the part with these indices of the first batch dimension."""
         return Links(
             self.asked[at],
             self.ready_s[at],
@@ -222,7 +242,7 @@ REPLY: Way = 1
 
 
 class Broadcast(NamedTuple):
-    """The times of a request's broadcast."""
+    """Hold when a broadcast request is received and how long it is on air, s."""
 
     # seconds from the decision to ask until the helpers have the request, `(...)` or one number;
     # NaN if it depends on the link (`ByLink`)
@@ -231,7 +251,11 @@ class Broadcast(NamedTuple):
 
 
 class Delivery(NamedTuple):
-    """What becomes of the replies on a channel."""
+    """Hold which of H helpers' replies are received on a channel, when, and their airtime.
+
+    `up` is whether request and reply are received, `delay_s` is from the request to the reply's
+    end, `loss` that of one transmission, (..., H) each.
+    """
 
     # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
     up: Bools
@@ -248,66 +272,63 @@ class Delivery(NamedTuple):
 
 @runtime_checkable
 class Channel(Protocol):
-    """A channel model: a frozen dataclass.
-    Overrides of an operating point replace fields by name.
-    """
+    """Describe a channel model: a frozen dataclass, whose fields operating points override."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when helpers have a request or other broadcast of so many bits,
-        `(...)` or one number.
-        """
+        """Return when helpers have received a broadcast of so many bits, `(...)` or one number."""
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Return what happens to the request and the reply of each link."""
+        """Return whether, and when, each helper's request and reply are received."""
 
 
 @runtime_checkable
 class Physical(Channel, Protocol):
-    """A channel whose losses follow from the vehicles' positions and what stands between them.
+    """Describe a channel whose losses depend on the vehicles' positions and on obstacles.
 
-    Only such a channel reads `Links.site` and the draws of trips.
-    It does not read `Links.in_radius`.
+    Only such a channel reads `Links.site` and the draws of shadowing and packets. It does not read
+    `Links.in_radius`.
     """
 
     @property
     def decorrelation_m(self) -> float:
-        """Decorrelation distance of shadowing (`fading.Trips.shadow`); inf without shadowing."""
+        """Return the distance at which shadowing's correlation is 1/e, m; inf without shadowing."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of packets of the background's size that are received at distances
-        `(n,)`.
+        """Return the packet reception ratio at distances `(n,)`, for background packets.
 
-        It is averaged over shadowing, and without `sight` also over obstacles as in the model's
-        source.
+        `sight` is the obstacle, such as `CLEAR`. It is averaged over shadowing, and without `sight`
+        also over obstacles as in the model's source.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost, `(..., H)`,
-        given each link's shadowing.
+        """Return the probability that a message is lost on each link, `(..., H)`.
+
+        `shadow` is the link's shadowing, standard normal, `(..., H)`.
         """
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio under the background load;
-        NaN if the model does not have it.
-        """
+        """Return the channel busy ratio under the background load; NaN if the model has none."""
 
 
 @runtime_checkable
 class ByLink(Physical, Protocol):
-    """A physical channel on which a message takes as long as its own link says."""
+    """Describe a physical channel on which a message's latency depends on its link."""
 
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
         """Return the seconds from the wish to send until reception on each link, `(..., H)`.
 
-        They may depend on `draws.latency` of this way.
+        `way` is `REQUEST` or `REPLY`, which chooses the draws of `draws.latency` they may depend
+        on.
         """
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
-    """Return when each slot `(..., H)` on a serial medium ends:
-    first come, first served, nearest first.
+    """Return when each reply's slot on a serial medium ends, s, `(..., H)`.
+
+    Replies are served in the order in which they are ready, of equal ones the nearest first.
+    `slot_s` is a slot's length, `ready_s` when a helper may send, `range_m` its distance.
     """
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)

@@ -18,7 +18,10 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 
 @dataclass(frozen=True)
 class Radio:
-    """A channel with a nominal latency and one loss for all links."""
+    """Define a channel with one nominal latency and one loss for all links, as the paper has it.
+
+    Both are assumptions; there is no link budget.
+    """
 
     # nominal seconds of one exchange, the request included, without serialisation
     latency_s: Seconds
@@ -39,14 +42,16 @@ class Radio:
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """A request takes its serialisation only;
-        the rest of its time is in the nominal latency.
+        """Return when helpers have a request: after its bits divided by the bandwidth.
+
+        The rest of its time is in the nominal latency.
         """
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """A serial medium serves the first helper that is ready,
-        so a slow helper delays no other.
+        """Return whether, and when, each helper's reply is received.
+
+        A serial medium serves the helper first that is ready first, so a slow one delays no other.
         """
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + count_of(active)[..., None])
@@ -62,20 +67,18 @@ class Radio:
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
-    """Return the loss of one transmission if `n_active` vehicles `(...)`, with the ego,
-    share the channel.
+    """Return the loss of one transmission, `(...)`, for this number of active vehicles.
 
-    It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active
-    vehicles), clipped to [0, 1]; a single vehicle loses nothing.
+    `n_active` includes the ego. It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4,
+    18.6 % at 8 active vehicles), clipped to [0, 1]; a single vehicle loses nothing.
     """
     return np.where(n_active > 1, np.clip(0.006 + 0.03 * (n_active - 2), 0.0, 1.0), 0.0)
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return which helpers' request and reply are both received, `(..., H)`;
-    the probability is (1 - loss)^2.
+    """Return which helpers' request and reply are both received, `(..., H)`.
 
-    `uniforms` are the request's and the reply's draws, `(..., H, 2)`. At a roadside edge a reply
-    has a second path, so that it is lost with probability loss^2.
+    The probability is (1 - loss)^2. `uniforms` are draws of request and reply, `(..., H, 2)`. With
+    a roadside edge a reply has a second path, so that it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

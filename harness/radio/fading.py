@@ -24,7 +24,10 @@ BLOCK = 1024  # decisions computed at once, so that their waves stay in the proc
 
 @dataclass(frozen=True)
 class Trips:
-    """The keys of each decision's draws."""
+    """Hold the keys of the channel's random numbers: seed, layout and step of each decision.
+
+    They have the decisions' shape, `(...)`.
+    """
 
     seed: Ints  # seed of the channel, `(...)`
     layout_seed: Ints  # seed of the episode's layout, `(...)`
@@ -36,17 +39,18 @@ class Trips:
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:
-        """Return the draws of each decision's packets, `(..., 1 + 2H)`:
-        one for the wait, then H pairs.
+        """Return uniform draws for each decision's packets, `(..., 1 + 2H)`.
+
+        The first is for the request's wait, then a pair (request, reply) for each of H helpers.
         """
         pairs_draws, place = self._once_a_pair(_packets, self.steps, helpers)
         return pairs_draws[place, self.step]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
-        """Return the shadowing of the link to each helper, `(..., H)`, standard normal.
+        """Return the shadowing of the link to each of H helpers, `(..., H)`, standard normal.
 
-        Positions are those of the ego and its helpers, `(..., 1+H, 2)`. The correlation is 1/e when
-        both ends have moved `decorrelation_m` (root of the sum of squares).
+        `xy_m` are positions of the ego and its helpers, m, `(..., 1+H, 2)`. The correlation is 1/e
+        when both ends have moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
         waves, place = self._once_a_pair(_waves, helpers)

@@ -6,8 +6,9 @@ from typing import Any
 
 
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a sentence for each setting outside the limits for which the source validated the
-    model.
+    """Return a sentence for each setting outside the range for which the model was validated.
+
+    `limits` has the least and largest value by the setting's name.
     """
     return [
         f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "

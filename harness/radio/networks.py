@@ -17,7 +17,7 @@ Milliseconds = Annotated[float, between(0, 1000 * LONGEST_S)]
 
 @dataclass(frozen=True)
 class Network:
-    """A distribution of round trips, without the time of the answer at the other end."""
+    """Hold measured quantiles of round trips to a cloud, without the time of its answer."""
 
     description: str  # one sentence for lists
     source: str  # who measured the round trips, where and how many
@@ -32,12 +32,12 @@ class Network:
 
 
 def names() -> list[str]:
-    """Return the names of all networks, with a project's."""
+    """Return the names of all networks, a project's own included."""
     return resources.names("networks")
 
 
 def network(name: str) -> Network:
-    """Load a network by name. Raises UserError if it is unknown or its file is wrong."""
+    """Return a network by name. Raises UserError if it is unknown or its file is wrong."""
     if name not in names():
         raise unknown("round_trip", name, names())
     return _read(resources.find("networks", f"{name}.toml"))

@@ -30,7 +30,7 @@ MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 @dataclass(frozen=True)
 class Profile:
-    """The content of a file of `channels/`."""
+    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source."""
 
     model: str  # one of `MODELS`
     description: str  # one sentence for lists
@@ -43,7 +43,7 @@ class Profile:
 
 
 class Profiles(FilesAndPlugins[Channel]):
-    """The channels of all profiles, by name."""
+    """Hold the channels of all profiles by name, from files and from packages."""
 
     folder = "channels"
 
@@ -51,7 +51,7 @@ class Profiles(FilesAndPlugins[Channel]):
         return _read(file)[1]
 
     def profile(self, name: str) -> Profile:
-        """Return the profile in the channel's file, or one made up for a package's channel."""
+        """Return the profile in a channel's file; of a package's channel, one made of its class."""
         if file := self.file(name):
             return _read(file)[0]
         kind = type(self[name])
@@ -59,8 +59,9 @@ class Profiles(FilesAndPlugins[Channel]):
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
 
     def files(self, name: str) -> dict[str, Path]:
-        """Return a profile's file and the table that it names,
-        by their paths within `channels/`.
+        """Return a profile's file, and the table it names, by their paths within `channels/`.
+
+        It is empty for a package's channel.
         """
         file = self.file(name)
         if file is None:
@@ -71,8 +72,9 @@ class Profiles(FilesAndPlugins[Channel]):
         return files
 
     def unchanged(self, name: str, recorded: Any) -> bool:
-        """Return whether the channel does what a record of it said;
-        a newer parameter had its default.
+        """Return whether a channel does what a run recorded of it, by model and parameters.
+
+        A parameter that is newer than the record had its default.
         """
         if name not in self:
             return False
@@ -82,7 +84,7 @@ class Profiles(FilesAndPlugins[Channel]):
         return bool((now["model"], now["parameters"]) == (then["model"], before))
 
     def record(self, name: str) -> dict[str, Any]:
-        """Return all that decides what the channel does, as plain values."""
+        """Return a channel's profile with all parameters as plain values, for a run's manifest."""
         parameters = asdict(self[name])
         plain = {**asdict(self.profile(name)), "parameters": parameters}
         with worded(f"channel profile {printable(name)}", built_in=is_ours(self[name])):

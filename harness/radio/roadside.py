@@ -25,7 +25,7 @@ EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and thos
 
 @dataclass(frozen=True)
 class Relay(Wrapped):
-    """A channel with a unit that sends replies once more; requests go directly.
+    """Wrap a channel by a roadside unit that repeats replies; requests go directly.
 
     A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
     that comes first: the direct one, unless latencies depend on the link. Copies are sent whether
@@ -36,7 +36,10 @@ class Relay(Wrapped):
     delay_s: float  # time from a reply's end at the unit until its copy is to be sent
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """A lost reply keeps its slot, and that of its copy if there is one."""
+        """Return which replies arrive, directly or by the unit, and when the first copy does.
+
+        A lost reply keeps its slot on the medium, and that of its copy if there is one.
+        """
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
         has_request = draws.packet[..., 0] >= link_loss(
             self.channel, links.where, draws, links.request_bits
@@ -70,7 +73,11 @@ class Relay(Wrapped):
 
 
 class Consulted(NamedTuple):
-    """Result of a consultation, in seconds from the ego's request."""
+    """Hold the result of asking H helpers, with times in s from the start of the ego's request.
+
+    `up` and `fused` say which replies (..., H) were received and were in time for fusion; `acts_s`
+    is when the ego stops waiting, (...).
+    """
 
     # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
     asked: Bools
@@ -97,15 +104,21 @@ def by_unit(
     ready: Callable[[Floats], Floats],
     left_s: Floats,
 ) -> Consulted:
-    """Let a unit ask the helpers for the ego, and send the ego a policy in time.
+    """Simulate a roadside unit that asks the helpers for the ego and sends it a policy in time.
 
     The unit sends when the last reply's slot has ended, but not so late that its own wait and time
     on air take the policy out of the window: it knows the slot that it has taken, or a table's
     latency, and until when the ego waits. An ego without a policy by then acts alone.
 
-    `delay_s` lies between what the unit has received and what it sends for that. The `ready_s` of
-    the links is not used: `ready` gives when replies can leave, `(..., H)`, from when helpers have
-    the request, of the same shape or `(..., 1)`. The window closes in `left_s`, `(...)`.
+    Args:
+        channel: the channel between vehicles.
+        unit: the unit.
+        delay_s: time from what the unit has received to what it sends for that.
+        links: the helpers' links; their `ready_s` is not used.
+        draws: random numbers.
+        ready: returns when replies can leave, `(..., H)`, from when helpers have the request, of
+            the same shape or `(..., 1)`.
+        left_s: when the decision window closes, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
     ego_link, helper_links = (replace(links, site=at_unit.select(ends)) for ends in (EGO, HELPERS))
@@ -149,7 +162,5 @@ def by_unit(
 
 
 def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one transmission of so many bits is lost on each link,
-    `(..., H)`.
-    """
+    """Return the probability that one transmission of so many bits is lost, `(..., H)`."""
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

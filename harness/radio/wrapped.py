@@ -21,7 +21,7 @@ from harness.radio.channel import (
 
 @dataclass(frozen=True)
 class Wrapped:
-    """A physical channel that forwards everything to another one."""
+    """Wrap a physical channel and forward everything to it, as a base for changes."""
 
     channel: Physical  # the wrapped channel
 
@@ -46,7 +46,7 @@ class Wrapped:
 
 
 def innermost(channel: Channel) -> Channel:
-    """Return the innermost channel, without wrappers."""
+    """Return the channel without its wrappers."""
     return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
 
 
@@ -58,11 +58,10 @@ def is_ours(channel: Channel) -> bool:
 
 
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
-    """Let a channel deliver. A package's cannot write to what it gets,
-    and what it returns is checked.
+    """Return what a channel delivers, checked if its model is another package's.
 
-    Raises ValueError if that has a wrong shape or type,
-    or states what cannot be of helpers that were asked.
+    Such a model gets arrays that it cannot write to. Raises ValueError if a result has a wrong
+    shape or type, or an impossible value for a helper that was asked.
     """
     if is_ours(channel):
         return channel.deliver(links, draws)
@@ -90,7 +89,7 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
 
 
 def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast:
-    """Let a channel say when a request is heard, with the same care as `delivered`.
+    """Return when a channel's request is received, checked if its model is another package's.
 
     Raises ValueError for a time that is negative or infinite; NaN is one that is unknown.
     """
@@ -105,8 +104,9 @@ def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast
 
 
 def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) -> Floats:
-    """Return when each receiver has a broadcast, `(..., H)`,
-    or `(..., 1)` if all have it at once.
+    """Return when each receiver has a broadcast, in s from the wish to send, `(..., H)`.
+
+    It is `(..., 1)` if all have it at once.
     """
     model = innermost(channel)
     if isinstance(model, ByLink):
@@ -119,9 +119,7 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """A physical channel that loses every transmission with one probability,
-    wherever its ends are.
-    """
+    """Wrap a physical channel so that every transmission has the same loss everywhere."""
 
     probability: float  # probability that one transmission is lost
 

@@ -20,7 +20,10 @@ SATURATED = 0.6  # above this busy ratio, vehicles that all hear each other neve
 
 
 def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
-    """Return how many packets begin in a second of idle time at a busy ratio."""
+    """Return the number of packets that begin in a second of idle time, at a channel busy ratio.
+
+    `packet_s` is a packet's time on air.
+    """
     return busy / (1 - busy) / packet_s
 
 
@@ -28,16 +31,17 @@ def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
     """Return the share of time in which a vehicle that hears this busy ratio may begin to send.
 
     It is the idle time without the AIFS of each gap, whose lengths are assumed to be exponential.
+    `packet_s` is a packet's time on air; the shape is that of `busy`.
     """
     return (1 - np.asarray(busy)) * np.exp(-aifs_s * begin_per_s(busy, packet_s))
 
 
 def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
-    """Return the mean seconds from the wish to send until the medium is taken.
+    """Return the mean access delay in s, from the wish to send until the medium is taken.
 
     A packet on air ends first; then the medium must be idle for an AIFS, and for each slot of the
-    back-off. A packet in between costs its airtime and another AIFS. Packets begin at random in
-    idle time.
+    back-off (uniform from 0 to `window` slots). A packet in between costs its airtime and another
+    AIFS. Packets begin at random in idle time.
     """
     per_s = float(begin_per_s(busy, packet_s))
     aifs_idle_s = _idle_s(aifs_s, per_s, packet_s)
@@ -54,11 +58,10 @@ def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
 
 @lru_cache(maxsize=64)
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
-    """Return the distribution of the access delay, whose mean is `mean_access_s`,
-    by its generating function.
+    """Return the distribution of the access delay: probabilities (n,) and seconds (n,).
 
-    These are probabilities and seconds:
-    with each probability the delay is no longer than the seconds.
+    With each probability the delay, from the wish to send until the medium is taken, is no longer
+    than the seconds. The arguments are those of `mean_access_s`, its mean.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time
@@ -83,7 +86,7 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
 def same_slot(
     per_slot: float, packet_slots: float, aifs_slots: float, window: int
 ) -> tuple[float, float]:
-    """Return the share of packets that begin with another, if all can hear all, and the busy ratio.
+    """Return the share of packets that collide in their first slot if all hear all, and busy ratio.
 
     Vehicles that want to send while the medium is busy end their back-off soon after it, so packets
     collide more often than if they began at random. The model follows the mean number of vehicles
@@ -111,11 +114,10 @@ def same_slot(
 
 
 def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
-    """Return how many times as often packets begin in one slot as if they began at random in free
-    time.
+    """Return how many times as often packets begin in one slot as if they began at random.
 
-    It is that of vehicles which all hear each other and together cause this busy ratio;
-    above `SATURATED` it is constant.
+    It is for vehicles which all hear each other and together cause this busy ratio; above
+    `SATURATED` it is constant.
     """
     packet_slots = packet_s / SLOT_S
     per_slot = min(busy, SATURATED) / packet_slots

@@ -58,8 +58,10 @@ IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arX
 
 
 class Hazards(NamedTuple):
-    """Mean number of harmful packets, by distance (steps of STEP_M) and received power (steps of
-    STEP_DB).
+    """Hold the mean number of packets that spoil one, as tables (D, P).
+
+    Rows are distances in steps of `STEP_M`, columns received powers in steps of `STEP_DB`. `before`
+    counts packets on air earlier, `during` later ones for each second of airtime.
     """
 
     # packets that began earlier or at the same time and that the receiver is locked to, or that
@@ -70,7 +72,10 @@ class Hazards(NamedTuple):
 
 @dataclass(frozen=True)
 class ItsG5(Transceiver):
-    """802.11p with background traffic, which sends packets of one size at one rate."""
+    """Model 802.11p (ITS-G5) under background traffic of packets of one size and rate.
+
+    It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022); fields are its settings.
+    """
 
     # carrier frequency, here the control channel's
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
@@ -110,18 +115,21 @@ class ItsG5(Transceiver):
 
     @property
     def aifs_s(self) -> float:
-        """Time that the medium must be idle before anybody counts down."""
+        """Return the AIFS, s: how long the medium must be idle before a back-off counts down."""
         return SIFS_S + self.aifs_slots * SLOT_S
 
     def airtime_s(self, size_bytes: Floats | float) -> Floats:
-        """Return the time on air of frames of a size with headers (IEEE 802.11-2012, 18.4.3)."""
+        """Return the time on air of frames of this size with headers, s.
+
+        It is by IEEE 802.11-2012, 18.4.3.
+        """
         bits_per_symbol = self.data_rate_mbps * 1e6 * SYMBOL_S
         symbols = np.ceil((8 * np.asarray(size_bytes) + SERVICE_AND_TAIL_BITS) / bits_per_symbol)
         return PREAMBLE_S + SYMBOL_S * symbols
 
     @property
     def packet_bits(self) -> int:
-        """Size of a background packet without headers."""
+        """Return the size of a background packet without headers, bits."""
         return 8 * self.packet_bytes
 
     @property
@@ -132,10 +140,10 @@ class ItsG5(Transceiver):
         return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio (35):
-        the source's fit to its simulations of a load (34) up to 1.3.
+        """Return the channel busy ratio by a fit to simulations (Sepulcre et al., equation 35).
 
-        Beyond the maximum of the fit's parabola, 0.84 at a load of 1.84, it stays constant.
+        It is a parabola of the load (34), fitted up to 1.3; beyond its maximum, 0.84 at a load of
+        1.84, it stays constant.
         """
         sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
         load = min(
@@ -151,11 +159,10 @@ class ItsG5(Transceiver):
         return block_error(self.curve)(sinr_db - more_db)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of background packets received at distances `(n,)`,
-        averaged over shadowing.
+        """Return the packet reception ratio at distances `(n,)` for background packets.
 
-        Without `sight`, it is also averaged over clear and blocked links by the environment's
-        shares.
+        It is averaged over shadowing, and without `sight` (the obstacle) also over clear and
+        blocked links by the environment's shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]

@@ -20,7 +20,7 @@ CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 
 @dataclass(frozen=True)
 class LteMode4(Sidelink):
-    """Mode 4 in 10 MHz."""
+    """Model LTE-V2X Mode 4 in a 10 MHz channel, where vehicles choose resources by sensing."""
 
     # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2
     # at 0.5

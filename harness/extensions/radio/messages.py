@@ -51,7 +51,10 @@ LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
 
 
 class Counts(NamedTuple):
-    """How much a message holds; each message has its part of it. Arrays broadcast."""
+    """Hold how much a message lists; numbers or arrays, which broadcast.
+
+    A message uses those that apply to it.
+    """
 
     objects: Count = 0  # listed in a CPM or SDSM
     # whether objects have what is optional and scene graphs know: in a CPM speed, heading and
@@ -64,7 +67,11 @@ class Counts(NamedTuple):
 
 
 class Member(NamedTuple):
-    """A row of the table."""
+    """Hold a row of `messages.csv`: a member of a message by its standard, and its bits.
+
+    `values` says what it may hold, `each` names the field of `Counts` it is repeated by, and `bits`
+    is None for a member of another sequence type.
+    """
 
     type: str  # the message or sequence that it is a member of
     member: str
@@ -76,7 +83,10 @@ class Member(NamedTuple):
 
 
 class Share(NamedTuple):
-    """What a member takes in a message, all of its kind together."""
+    """Hold the bits of a member in a message, all its occurrences together.
+
+    `path` names the member and those that contain it, the outermost first.
+    """
 
     path: tuple[str, ...]  # names of the member and of those that it is in, the outermost first
     bits: Floats
@@ -84,7 +94,11 @@ class Share(NamedTuple):
 
 
 class Size(NamedTuple):
-    """What a message takes, in bits."""
+    """Hold the sizes of a message in bits, each as an array.
+
+    `packet` is the sum of message, signed envelope and network headers; `with_certificate` is a
+    packet that has the certificate instead of its digest.
+    """
 
     message: Floats
     envelope: Floats  # with the digest of the certificate
@@ -95,7 +109,7 @@ class Size(NamedTuple):
 
 @cache
 def table() -> Mapping[str, tuple[Member, ...]]:
-    """Return the members of each type, in their order."""
+    """Return the members of each message and sequence type, in their order."""
     members: dict[str, tuple[Member, ...]] = {}
     for row in csv.DictReader(text_of(Path(__file__).with_name("messages.csv")).splitlines()):
         bits = int(row.pop("bits") or -1)
@@ -105,9 +119,10 @@ def table() -> Mapping[str, tuple[Member, ...]]:
 
 
 def message_bits(name: str, content: Counts) -> Floats:
-    """Return the bits of a message of `NAMES`, in whole octets; 0 where none is sent.
+    """Return the size of a message in bits, whole octets; 0 where none is sent.
 
-    An SDSM lists at least one object, so a vehicle that sees none sends none.
+    `name` is one of `NAMES`, such as CPM. An SDSM lists at least one object, so a vehicle that sees
+    none sends none.
 
     Raises:
         ValueError: more objects than the message may list.
@@ -119,7 +134,7 @@ def message_bits(name: str, content: Counts) -> Floats:
 
 
 def shares(name: str, content: Counts) -> list[Share]:
-    """Return what each member of a message takes; the last is what fills the octet."""
+    """Return the bits of each member of a message; the last entry is the padding to an octet."""
     counts = {**content._asdict(), "path": np.asarray(content.points) > 0}
     members = list(_shares(name, counts, 1.0, ()))
     return [*members, Share(("filling",), -_total(members) % 8, "X.691 11.1")]
@@ -128,7 +143,10 @@ def shares(name: str, content: Counts) -> list[Share]:
 def packet_bits(
     name: str, bits: Floats | float, since_certificate_s: Floats | float = 0.0, headers: bool = True
 ) -> Floats:
-    """Return the bits of a message with what `wraps` it, 0 where the message has none."""
+    """Return the size of a message of so many bits with envelope and headers, bits; 0 stays 0.
+
+    The arguments are those of `wraps`.
+    """
     bits = np.asarray(bits, dtype=float)
     return np.where(bits > 0, bits + _total(wraps(name, bits, since_certificate_s, headers)), 0.0)
 
@@ -167,16 +185,16 @@ def wraps(
 
 
 def size(name: str, content: Counts) -> Size:
-    """Return what a message takes with its envelope and headers."""
+    """Return the size of a message in bits: alone, with its envelope, and with headers."""
     bits = message_bits(name, content)
     signed, packet = packet_bits(name, bits, headers=False), packet_bits(name, bits)
     return Size(bits, signed - bits, packet - signed, packet, packet_bits(name, bits, np.inf))
 
 
 def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
-    """Return the mean size of a vehicle's beacons, rounded up to a byte, without a path behind it.
+    """Return the mean size of a vehicle's beacons (CAM or BSM), bytes, rounded up.
 
-    One in so many has the certificate: the first that is due.
+    They have no path history. Now and then one has the certificate, by `CERTIFICATE_EVERY_S`.
     """
     beacon = size(NAMES[encoding]["beacon"], Counts())
     every = max(1, math.ceil(CERTIFICATE_EVERY_S[encoding] * rate_hz))

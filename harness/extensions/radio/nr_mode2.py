@@ -42,7 +42,7 @@ CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 
 @dataclass(frozen=True)
 class NrMode2(Sidelink):
-    """Mode 2 in one resource pool."""
+    """Model NR-V2X Mode 2 in one resource pool, where vehicles choose resources by sensing."""
 
     environment: Environment = "tr37885-highway"
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
@@ -86,7 +86,7 @@ class NrMode2(Sidelink):
 
     @property
     def block_bits(self) -> int:
-        """Bits in the sub-channels of a packet."""
+        """Return the bits that fit into the sub-channels of a background packet."""
         return int(self._subchannels * self._subchannel_bits)
 
     @property

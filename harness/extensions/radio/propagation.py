@@ -25,9 +25,7 @@ NEAREST_M = 3.0
 
 @dataclass(frozen=True)
 class Propagation:
-    """The laws of propagation with their heights and widths.
-    A radio model inherits these as settings.
-    """
+    """Define path loss, blockage and shadowing, with heights and widths as settings of a radio."""
 
     # law of links without a building between, with its LOS probabilities and decorrelation
     environment: Environment = "winner-b1"
@@ -54,12 +52,15 @@ class Propagation:
         corner_m: Floats | None = None,
         first_m: float | None = None,
     ) -> Floats:
-        """Return the mean loss `(...)` of links `(...)`, with the blockage of a vehicle between.
+        """Return the mean path loss `(...)` of links, dB, blockage by a vehicle included.
 
-        The height of a vehicle between, `blocker_m`, is the model's own if None; `first_m` is that
-        of one antenna, if it is not `antenna_m`. `corner_m` are the distances of both ends to the
-        crossing's centre, `(..., 2)`; NaN if the building is not at a corner. Then the NLOS law of
-        TR 37.885 holds.
+        Args:
+            distance_m: distance between the ends, `(...)`.
+            sight: what stands between: `CLEAR`, `VEHICLE` or `BUILDING`, `(...)`.
+            blocker_m: height of a vehicle between; None for the model's own.
+            corner_m: distances of both ends to the crossing's centre, `(..., 2)`; NaN if a building
+                between is not at a corner, for which the NLOS law of TR 37.885 holds.
+            first_m: height of one antenna, if it is not `antenna_m`.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
         clear_db = self.clear_db(distance_m, first_m)
@@ -78,7 +79,10 @@ class Propagation:
         )
 
     def clear_db(self, distance_m: Floats, first_m: float | None = None) -> Floats:
-        """Return the loss in line of sight."""
+        """Return the path loss `(...)` in line of sight, dB.
+
+        `first_m` is the height of one antenna, if it is not `antenna_m`.
+        """
         if self.environment == "winner-b1":
             effective_m = self._mean_height_m(first_m, self.environment_height_m)
             return winner_b1_db(distance_m, self.frequency_ghz, effective_m)
@@ -100,12 +104,11 @@ class Propagation:
         blocker_m: Floats | float | None = None,
         first_m: float | None = None,
     ) -> tuple[Floats, Floats]:
-        """Return the additional loss of a vehicle between (TR 37.885, 6.2.1):
-        mean and deviation, `(...)`.
+        """Return mean and standard deviation, `(...)`, of a blocking vehicle's additional loss, dB.
 
-        The loss is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both antennas are
-        lower than the blocker, 5 and 4 if only one is. There is none if both are higher. Beyond 541
-        m the mean grows by 15 log10 d - 41.
+        By TR 37.885, 6.2.1, it is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both
+        antennas are lower than the blocker, 5 and 4 if only one is. There is none if both are
+        higher. Beyond 541 m the mean grows by 15 log10 d - 41.
         """
         blocker_m = self.blocker_m if blocker_m is None else blocker_m
         other_m = self.antenna_m if first_m is None else first_m
@@ -117,11 +120,10 @@ class Propagation:
         return np.where(higher < 0, 0.0, mean_db[higher] + growth_db), deviation_db[higher]
 
     def corner_db(self, corner_m: Floats, first_m: float | None = None) -> Floats:
-        """Return the loss `(...)` round a corner, from the ends' distances to its centre,
-        `(..., 2)`.
+        """Return the path loss `(...)` round a corner, dB (Mangel et al.).
 
-        The law is not quite reciprocal, but a radio link is,
-        so the mean of both directions in dB is taken.
+        `corner_m` are the distances of both ends to the crossing's centre, `(..., 2)`. The law is
+        not quite reciprocal, but a radio link is, so the mean of both directions in dB is taken.
         """
         one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
         height_m = self._mean_height_m(first_m)
@@ -145,11 +147,11 @@ class Propagation:
         corner_m: Floats | None = None,
         first_m: float | None = None,
     ) -> Floats:
-        """Return the standard deviation `(...)` of shadowing and blockage together.
+        """Return the standard deviation `(...)` of shadowing and blockage together, dB.
 
-        3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind a
-        building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a corner
-        (Mangel et al.).
+        It is 3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind
+        a building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a
+        corner (Mangel et al.). The arguments are those of `path_loss_db`.
         """
         behind: Floats | float = 4.0
         if corner_m is not None:
@@ -161,8 +163,7 @@ class Propagation:
 
     @property
     def decorrelation_m(self) -> float:
-        """Distance over which shadowing's correlation falls to 1/e:
-        25 m on a highway and 10 m in a town.
+        """Return where shadowing's correlation is 1/e: at 25 m on a highway, else at 10 m.
 
         TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links
         without line of sight; here these have 10 m as well, so that shadowing does not jump when
@@ -171,10 +172,9 @@ class Propagation:
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 
     def clear_probability(self, distance_m: Floats) -> Floats:
-        """Return the share of links that no vehicle blocks,
-        without buildings (TR 37.885, table 6.2-1).
+        """Return the share of links of these lengths, m, that no vehicle blocks, without buildings.
 
-        In `winner-b1` no link is blocked.
+        It is that of TR 37.885, table 6.2-1. In `winner-b1` no link is blocked.
         """
         if self.environment == "winner-b1":
             return np.ones_like(distance_m)
@@ -198,7 +198,7 @@ _BLOCKAGE_DB = [_clipped(5.0, 4.0), _clipped(9.0, 4.5), (0.0, 0.0)]
 
 
 def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:
-    """Return the loss of WINNER+ B1 in line of sight, at least that of free space.
+    """Return the path loss of WINNER+ B1 in line of sight, dB, at least that of free space.
 
     `effective_m` is the effective antenna height.
     """
@@ -211,12 +211,10 @@ def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -
 
 
 def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
-    """Return the loss behind a building (TR 37.885, table 6.2.1-1)."""
+    """Return the path loss behind a building, dB (TR 37.885, table 6.2.1-1)."""
     return 36.85 + 30 * np.log10(distance_m) + 18.9 * math.log10(frequency_ghz)
 
 
 def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Return thermal noise at 290 K plus the receiver's:
-    -95 dBm in 10 MHz with a noise figure of 9 dB.
-    """
+    """Return the noise power of a receiver at 290 K: -95 dBm in 10 MHz with a figure of 9 dB."""
     return -174 + 10 * math.log10(bandwidth_hz) + noise_figure_db

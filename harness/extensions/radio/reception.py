@@ -34,7 +34,11 @@ COLUMNS = ("distance_m", "reception", "configuration", "source")  # of somebody 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a channel did to messages at one distance."""
+    """Hold how messages of a channel, simulated at one distance, were received.
+
+    `crossing` is the share of single transmissions received, `model` the same by the channel's
+    formula, `round_trip` the share of requests with a reply, and `delay_s` the mean time until it.
+    """
 
     distance_m: float  # between ego and helper
     model: float  # share of single transmissions that succeed, by the channel's own curve
@@ -45,7 +49,10 @@ class Drawn:
 
 
 def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[str, Floats]:
-    """Return the channel's own curve behind each of `SIGHTS`."""
+    """Return the channel's packet reception ratio at distances `(n,)` for each kind of obstacle.
+
+    The keys are those of `SIGHTS`: `clear`, `vehicle` and `building`.
+    """
     metres = np.asarray(distances_m, dtype=float)
     return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
 
@@ -53,8 +60,10 @@ def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[s
 def latencies_ms(
     channel: Channel, distances_m: Sequence[float]
 ) -> dict[str, dict[str, list[float]]]:
-    """Return `p50` and `p95` of a message's latency behind each of `SIGHTS`;
-    nothing if no table has them.
+    """Return a message's median and 95th percentile latency, ms, by obstacle and distance.
+
+    The keys are those of `SIGHTS`, then `p50` and `p95`, with one value for each distance. It is
+    empty unless the channel is a table that has both.
     """
     if not (isinstance(channel, Trace) and channel.spread):
         return {}
@@ -67,7 +76,10 @@ def latencies_ms(
 
 
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
-    """Draw `n` trips with one helper at each distance, in sight along one road."""
+    """Simulate `n` requests and replies to one helper at each distance, in line of sight.
+
+    The vehicles are on one road; each message has its own shadowing.
+    """
     result = []
     curve = by_sight(channel, distances_m)["clear"].tolist()
     for distance_m, model in zip(distances_m, curve, strict=True):
@@ -103,8 +115,10 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 
 @dataclass(frozen=True)
 class Gap:
-    """How long a receiver waits from one of a vehicle's packets to the next that it gets,
-    at one distance.
+    """Hold the inter-packet gap at one distance: the time between two received packets.
+
+    They are packets of one vehicle; estimates are over trips. `independent_s` is the mean gap if
+    losses were independent.
     """
 
     distance_m: float  # between the two
@@ -114,12 +128,11 @@ class Gap:
 
 
 def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
-    """Drive `n` trips of two vehicles at each distance, in sight,
-    14 m/s on one road, for `PACKETS`.
+    """Simulate inter-packet gaps on `n` trips of two vehicles at each distance.
 
-    Their shadowing changes as they go; a packet is drawn by its own loss, as runs draw messages.
-    What a trip's end cuts off is left out, so waits that would be longer than a tenth of a trip are
-    unknown.
+    They drive in line of sight at 14 m/s on one road, for `PACKETS` packets. Their shadowing
+    changes as they go; a packet is drawn by its own loss, as runs draw messages. Gaps that a trip's
+    end cuts off are left out, so ones that would be longer than a tenth of a trip are unknown.
     """
     moved_m = MPS / channel.rate_hz * np.arange(PACKETS)
     numbers = np.broadcast_to(np.arange(n)[:, None], (n, PACKETS))
@@ -160,7 +173,10 @@ def _p95(values: Floats, trips: Ints) -> Estimate:
 
 @dataclass(frozen=True)
 class Curve:
-    """Somebody else's curve."""
+    """Hold a published or simulated curve of packet reception ratio over distance, (n,) each.
+
+    `configuration` has the channel settings it was made with, as a condition states them.
+    """
 
     configuration: str  # settings of a channel that are theirs, as a condition has them
     source: str  # whose it is; else the file
@@ -169,10 +185,10 @@ class Curve:
 
 
 def curves_of(path: Path) -> list[Curve]:
-    """Read curves from a CSV: `distance_m`, `reception`,
-    and if it has them `configuration` and `source`.
+    """Return the curves in a CSV file with `distance_m` and `reception`.
 
-    Raises UserError, with file, line and value, if it is none or a value is not allowed.
+    It may also have `configuration` and `source`, each pair of which is a curve. Raises UserError,
+    with file, line and value, if it is no such table or a value is not allowed.
     """
     shown = printable(path)
     _, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
@@ -195,26 +211,27 @@ def curves_of(path: Path) -> list[Curve]:
 
 @dataclass(frozen=True)
 class Compared:
-    """A model held against a curve."""
+    """Hold a curve beside the channel model's reception at the same distances."""
 
     curve: Curve  # the curve
     reception: Floats  # the model's at its distances, `(n,)`
 
     @property
     def mean_difference(self) -> float:
-        """Mean absolute difference over the curve's points, a share."""
+        """Return the mean absolute difference in reception over the curve's points, 0 to 1."""
         return float(np.abs(self.reception - self.curve.reception).mean())
 
     @property
     def largest_difference(self) -> float:
-        """The difference that is largest, model less theirs, a share."""
+        """Return the difference of largest size, the model's reception less the curve's."""
         apart = self.reception - self.curve.reception
         return float(apart[np.abs(apart).argmax()])
 
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
-    """Compare the channel, with the curve's settings, with the curve.
-    Raises UserError for an unknown one.
+    """Compare a curve with the channel, adapted to the settings that the curve states.
+
+    `where` names the channel for errors. Raises UserError for a setting it does not have.
     """
     adapted = changed(channel, pairs(curve.configuration), where)
     assert isinstance(adapted, Physical)
@@ -223,7 +240,7 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 
 @dataclass(frozen=True)
 class Check:
-    """A radio held against simulation and against others' curves."""
+    """Hold a channel's comparison with its own simulated messages and with published curves."""
 
     n: int  # messages at each distance
     busy_ratio: float | None  # of its channel, under the background load
@@ -233,16 +250,15 @@ class Check:
 
     @property
     def mean_difference(self) -> float:
-        """Mean absolute difference from others' curves, each with the same weight, a share."""
+        """Return the mean absolute difference from the curves, equally weighted, 0 to 1."""
         return float(np.mean([curve.mean_difference for curve in self.curves]))
 
 
 def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
-    """Simulate `n` messages at each of `DISTANCES_M`,
-    and compare the radio with the curves of CSV files.
+    """Simulate `n` messages at each of `DISTANCES_M`, and compare a radio with curves of files.
 
-    Raises UserError if a file has no curves,
-    or one states a setting that the radio `where` does not have.
+    `where` names the radio for errors. Raises UserError if a file has no curves, or one states a
+    setting that the radio does not have.
     """
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(
@@ -259,12 +275,11 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
 def crowds(
     channels: Mapping[str, Channel], radius_m: float, distance_m: float, sight: str
 ) -> dict[str, Floats]:
-    """Return the loss of one transmission among each of `VEHICLES`,
-    by the name of a channel, `(n,)`.
+    """Return the loss of one transmission by channel, for each number in `VEHICLES`, `(n,)`.
 
-    Vehicles are within a radius; sender and receiver, `distance_m` apart with one of `SIGHTS`
-    between, are two of them, the others the background's load, evenly along one road. `paper` is
-    the paper's line.
+    Vehicles are within `radius_m`; sender and receiver, `distance_m` apart with the obstacle
+    `sight` between, are two of them, and the others are background load, evenly along one road. The
+    key `paper` has the paper's line.
     """
     losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
     for name, channel in channels.items():

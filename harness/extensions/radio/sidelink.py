@@ -38,8 +38,9 @@ CELLS = 160
 
 @dataclass(frozen=True)
 class Sidelink(Transceiver):
-    """The common part of LTE Mode 4 and NR Mode 2;
-    its fields and `Transceiver`'s are settings of both.
+    """Model the common part of the sidelink radios LTE Mode 4 and NR Mode 2.
+
+    Its fields and those of `Transceiver` are settings of both.
     """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second
@@ -64,17 +65,17 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def slot_s(self) -> float:
-        """Seconds of one slot, the time on air of one block."""
+        """Return the length of a slot, s: the time on air of one block."""
 
     @property
     @abstractmethod
     def blocks_per_slot(self) -> int:
-        """Number of blocks that fit beside each other in one slot."""
+        """Return the number of blocks that fit into one slot, side by side in frequency."""
 
     @property
     @abstractmethod
     def block_bits(self) -> int:
-        """Bits in one block; a larger message takes several blocks, and each must be received."""
+        """Return the bits in one block; a larger message takes several, and all must arrive."""
 
     @property
     def packet_bits(self) -> int:
@@ -83,21 +84,22 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def noise_dbm(self) -> float:
-        """Noise power in the bandwidth of a block."""
+        """Return the noise power in the bandwidth of a block."""
 
     @property
     @abstractmethod
     def block_error(self) -> BlockError:
-        """Block error rate as a function of the signal-to-interference-and-noise ratio."""
+        """Return the function from SINR in dB to block error rate."""
 
     def busy_ratio(self) -> float:
         return self._scheduling().busy_ratio
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of background packets received, averaged over shadowing, `(n,)` (6).
+        """Return the packet reception ratio at distances `(n,)` for background packets.
 
-        Without `sight`, no building stands between,
-        and vehicles do with the environment's probability.
+        It is equation 6 of Gonzalez-Martin et al. (2019), averaged over shadowing. Without `sight`
+        (the obstacle), no building stands between, and vehicles do with the environment's
+        probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array(
@@ -110,7 +112,7 @@ class Sidelink(Transceiver):
         return (self.t1_slots + np.floor(uniforms * self._window)) * self.slot_s
 
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return the time on air: one slot for each block and copy, one after another."""
+        """Return the time on air, s: one slot for each block and repetition, one after another."""
         return self._blocks(bits) * (self.transmissions * self.slot_s)
 
     def _turns(

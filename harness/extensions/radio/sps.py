@@ -26,7 +26,11 @@ STEP_DB = 0.1  # step by which Step 3 raises the threshold until enough resource
 
 @dataclass(frozen=True)
 class Scheduling:
-    """The inputs of a vehicle's choice among the resources of one period."""
+    """Hold what a vehicle's choice of a resource depends on in semi-persistent scheduling.
+
+    Equations are numbered as in Gonzalez-Martin et al. (IEEE TVT 68(2), 2019). `sensed` maps
+    distances in m and a threshold in dBm to the share of packets received above it.
+    """
 
     per_m: float  # packets that the vehicles on one metre of road send in a period
     resources: float  # number of resources in a period (28)
@@ -43,20 +47,20 @@ class Scheduling:
         return self._taken(self.threshold_dbm, 1) / self.resources
 
     def same_by_exclusion(self, apart_m: Floats) -> Floats:
-        """Return the probability that a vehicle `apart_m` away takes the same resource,
-        by Step 2 (23).
+        """Return the probability that a vehicle `apart_m` away takes the same resource by Step 2.
 
-        Both exclude the resources that they sense. The source does not limit them;
-        at most 80 % can be excluded.
+        Both exclude the resources that they sense as taken (Gonzalez-Martin et al. 2019, equation
+        23). The source does not limit them; at most 80 % can be excluded. The shape is that of
+        `apart_m`.
         """
         taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
         return self._same(apart_m, taken, self.threshold_dbm)
 
     def same_by_ranking(self, apart_m: Floats) -> Floats:
-        """Return the same probability if both then keep the fifth of the resources with the least
-        power.
+        """Return the probability that a vehicle `apart_m` away takes the same resource by Step 3.
 
-        Step 3, (31) to (33): as if the threshold had been raised until only these were left.
+        Both keep the fifth of the resources with the least power (Gonzalez-Martin et al. 2019,
+        equations 31 to 33), as if the threshold had been raised until only these were left.
         """
         threshold_dbm = self.threshold_dbm
         while (taken := self._taken(threshold_dbm, 2)) > (1 - LEAST_SHARE) * self.resources:
@@ -91,11 +95,10 @@ class Scheduling:
 
 
 def taken(packets: float, resources: float) -> float:
-    """Return the resources taken by packets (29):
-    half of them do not overlap, the others fall at random.
+    """Return the number of resources that packets take in a period, at most `resources`.
 
-    There are never more than `resources`;
-    the equation does not state that, but it holds in its range.
+    By equation 29 of Gonzalez-Martin et al. (2019), half of the packets do not overlap and the
+    others fall at random. The equation does not state the limit, but it holds in its range.
     """
     half = packets / 2
     free = resources - half

@@ -16,10 +16,10 @@ DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 
 def rows_of(
     path: Path, needed: Collection[str], known: Collection[str]
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Return the columns of a CSV, and its rows, each with the number of its line.
+    """Return the column names of a CSV file, and its rows with their line numbers.
 
-    Raises UserError if it is no table, lacks a column that is `needed`,
-    or has one that is not `known`.
+    Raises UserError if it is no table, lacks a column that is `needed`, or has one that is not
+    `known`.
     """
     shown = printable(path)
     try:
@@ -41,8 +41,9 @@ def rows_of(
 def number_of(
     where: str, row: dict[str, str], column: str, most: float, allowed: str, least: float = 0.0
 ) -> float:
-    """Return the number in a column of a row.
-    Raises UserError, with what is `allowed`, for any other.
+    """Return the number in a column of a row, between `least` and `most`.
+
+    Raises UserError for any other, with `where` and the text `allowed`.
     """
     try:
         value = float(row[column])

@@ -43,7 +43,7 @@ P95 = 0.95
 
 
 class Spread(NamedTuple):
-    """The percentiles of a latency that each message draws."""
+    """Hold the median and 95th percentile of a latency that each message draws."""
 
     p50_s: float  # the median
     p95_s: float  # 95th percentile
@@ -53,7 +53,7 @@ What = Literal["reception", "p50_s", "p95_s"]
 
 
 class Point(NamedTuple):
-    """One row of the table."""
+    """Hold a row of a table of reception: distance, reception, obstacle and latency."""
 
     distance_m: float  # distance between sender and receiver
     reception: float  # share of packets received
@@ -64,7 +64,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A file of receptions."""
+    """Hold the rows of a table of reception, with the file's path and digest."""
 
     file: str  # path of the file
     sha256: str  # its digest
@@ -73,7 +73,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Trace:
-    """A channel with the reception of a table.
+    """Define a channel by a table of reception over distance, such as another simulator's.
 
     The table is averaged over shadowing and for one packet size, so a link's own shadowing and a
     message's bits change nothing, and replies do not wait for each other. A request reaches each
@@ -101,8 +101,9 @@ class Trace:
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Helpers have a request after the latency of their own links;
-        its time on air is not known.
+        """Return a request's times, both NaN: helpers have it after the latency of their own links.
+
+        Its time on air is unknown.
         """
         return Broadcast(math.nan, math.nan)
 
@@ -116,11 +117,14 @@ class Trace:
 
     @property
     def spread(self) -> bool:
-        """Whether the table has two percentiles of latencies."""
+        """Return whether the table has two percentiles of latency."""
         return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
 
     def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:
-        """Return the median and the 95th percentile of a message's latency at these distances."""
+        """Return the median and 95th percentile of a message's latency at these distances, s.
+
+        `sight` is the obstacle, such as `CLEAR`.
+        """
         return self._at(distance_m, sight, "p50_s"), self._at(distance_m, sight, "p95_s")
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
@@ -159,8 +163,9 @@ class Trace:
 
 
 def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
-    """Build the channel of a profile that names a `file` beside it.
-    Raises UserError if it is wrong.
+    """Return the channel of a profile whose parameter `file` names a table in the same folder.
+
+    Raises UserError if the table is missing, elsewhere or wrong.
     """
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
@@ -177,7 +182,8 @@ def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Tra
 
 
 def read(path: Path) -> tuple[Point, ...]:
-    """Read the rows of a table, sorted by sight and distance.
+    """Return the rows of a table of reception, sorted by obstacle and distance.
+
     Raises UserError if the table is wrong.
     """
     shown = printable(path)

@@ -20,7 +20,7 @@ STEP_M, STEP_DB = 10.0, 0.5
 
 @dataclass(frozen=True)
 class Transceiver(Propagation, Physical):
-    """The radio of all vehicles, and background traffic with packets of one size at one rate."""
+    """Model the radio of all vehicles under background traffic of one packet size and rate."""
 
     # background vehicles on one kilometre of road, all lanes and both directions together
     density_per_km: Annotated[float, between(0, 10000)] = 100.0
@@ -40,18 +40,19 @@ class Transceiver(Propagation, Physical):
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Return the seconds from the wish to send until sending begins:
-        the quantiles at these draws.
+        """Return the seconds from the wish to send until sending begins, for uniform draws.
+
+        They are the quantiles of the wait at these draws, of the same shape.
         """
 
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return how long a message of so many bits is on air."""
+        """Return the time on air of a message of so many bits, s."""
 
     @property
     @abstractmethod
     def packet_bits(self) -> int:
-        """Size of a background packet."""
+        """Return the size of a background packet, bits."""
 
     @abstractmethod
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Any:
@@ -77,13 +78,14 @@ class Transceiver(Propagation, Physical):
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost on each link, `(..., H)`;
-        any for absent helpers.
+        """Return the probability that a message is lost on each link, `(..., H)`.
+
+        `shadow` is the link's shadowing, standard normal. Values for absent helpers mean nothing.
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """All helpers have the request after it has waited for its turn and been on air."""
+        """Return when all helpers have the request: after its wait for the medium and airtime."""
         airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
 
