@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin, part_of
-from harness.core.plugins import Plugins
+from harness.core.plugins import Shipped
 
 if TYPE_CHECKING:
     from harness.world.scenario import Scenario
@@ -51,15 +51,7 @@ class Family(Protocol):
         ...
 
 
-class Families(Plugins[Family]):
-    """Hold the families of scenarios by name; all are of extensions that ship."""
-
-    def check(self, name: str, plugin: Family) -> None:
-        """Raise ValueError: names of a package's family would reach code that nobody allowed."""
-        raise ValueError("families of scenarios are the harness's own; register a scenario")
-
-
-FAMILIES = Families("swarmdrive.families", Family, {})
+FAMILIES = Shipped[Family]("swarmdrive.families", Family, {})  # of none but extensions that ship
 
 
 def family_of(text: str) -> Family | None:
