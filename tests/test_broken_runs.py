@@ -207,7 +207,8 @@ def test_settings_that_say_otherwise_than_what_stands_beside_them(
 @pytest.mark.parametrize(
     ("typed", "name", "may_be"),
     [
-        ("env:highway-v0:decisions=3:config={\"a\":1,\"b\":2}", "env:highway-v0:config={\"a\":1}", True),
+        ("env:highway-v0:decisions=3:config={\"a\":1,\"b\":2}", "env:highway-v0:config={\"a\":1,\"b\":2}", True),
+        ("env:highway-v0:config={\"a\":1,\"b\":2}", "env:highway-v0:config={\"a\":1}", False),
         ("env:highway-v0", "env:u-turn-v0", False), ("crossing:ambient=fog", "crossing", True),
         ("crossing:ambient=fog", "merge", False), ("proxy,a/b", "proxy,b", True), ("proxy", "proxy,b", False),
     ],

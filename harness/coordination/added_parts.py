@@ -29,6 +29,8 @@ def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
                 kind = entry.load()
                 _check(what, kind, settings)
                 if not is_ours(entry):
+                    if kind.again is not Part.again:
+                        raise ValueError("it has `again`, which only parts that ship may have")
                     PACKAGES_PARTS[kind] = what
                 kind()  # its defaults are allowed
         except UserError as error:

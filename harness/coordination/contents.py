@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 from harness.coordination.encodings import intent_bits
 from harness.coordination.intents import Intents
 from harness.core.arrays import Floats, Ints
-from harness.core.errors import UserError, printable
+from harness.core.errors import printable
 from harness.core.plugins import Plugins
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
 
 INTENT: Final = "intent"
-PLAN: Final = "plan"
 # The kinds of what a message may hold.
 INTENTS: Final = "intents"  # what helpers intend in the ego's place, by their models
 WORDS: Final = "words"  # what helpers' models say beside an intent, or alone
@@ -120,44 +119,6 @@ class OfIntent(Content):
     holds = frozenset((INTENTS, WORDS))
 
 
-class OfPlan(Content):
-    """The content `plan`: the action probabilities by which the sender, an agent, acts itself."""
-
-    holds = frozenset((PLANS,))
-    needs = (PLANS,)
-
-    def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        if not run.several_decide:
-            return NO_AGENTS
-        return self._unread(run) if point.has_fusion_call else None
-
-    def _unread(self, run: "RunFacts") -> str | None:
-        """Return why an agent cannot be asked again with the plans of others; None if all can."""
-        for agent in run.agents:
-            if not agent.can.language_model:
-                name = printable(agent.card.name)
-                return (
-                    f"{name} is no language model and cannot read plans; use "
-                    "consensus=yield-by-time"
-                )
-            if not agent.prompt.shows_plans:
-                return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
-        if run.device_profile:
-            return "no energy is known of answers to plans; leave --device-profile out"
-        return None
-
-    def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        if intents.plans is None or senders is None:
-            raise UserError(f"condition {printable(point.name)}: {NO_AGENTS}")
-        return intents.planned(senders)
-
-
-NO_AGENTS = (
-    "content plan needs several agents, and here one ego decides; give --agents all with `harness "
-    "drive`, or content=intent"
-)
-
-
 class Contents(Plugins[Content]):
     """Hold all contents of messages by name, those of installed packages included."""
 
@@ -196,7 +157,6 @@ CONTENTS = Contents(
     Content,
     {
         INTENT: OfIntent(),
-        PLAN: OfPlan(),
     },
 )
 

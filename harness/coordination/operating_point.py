@@ -2,11 +2,11 @@
 model.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from itertools import chain
-from typing import Any, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
 import msgspec
 from msgspec import structs
@@ -42,12 +42,10 @@ from harness.coordination.parts import (
     wrong,
 )
 from harness.coordination.parts_of_packages import change_by, prepared, speaker_of
-from harness.coordination.precedence import Precedence
-from harness.coordination.robust import Heads
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
-from harness.coordination.sent import Honest, Speaker
+from harness.coordination.sent import Honest, SentIntents, Speaker
 from harness.core.config import changed, settable, value_of
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import OfExtension, part_of, setting_of_extension
@@ -58,6 +56,10 @@ from harness.radio.networks import Network, network
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
 from harness.radio.roadside import Relay
 from harness.radio.wrapped import AtLoss
+
+if TYPE_CHECKING:
+    from harness.coordination.coordinate import Coordination
+    from harness.coordination.exchange import Exchange
 
 OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 # settings of a roadside unit with a place
@@ -89,8 +91,12 @@ def part_of_settings() -> Mapping[str, str]:
     The order is that of the flat records in manifests and run files.
     """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
+    behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
     for part, kind in more_parts().items():
         after = 1 + [key for key, _ in part_of].index(kind.behind)
+        while after < len(part_of) and part_of[after][1] in behind.get(kind.behind, ()):
+            after += 1
+        behind.setdefault(kind.behind, set()).add(part)
         part_of[after:after] = [(key, part) for key in kind.__struct_fields__]
     return dict(part_of)
 
@@ -220,9 +226,6 @@ class OperatingPoint:
         if self.asks_again and self.radio.edge == FUSION:
             allowed = f"none or relay where {self.asks_twice}: a unit has no model"
             raise wrong("edge", FUSION, allowed)
-        in_a_cloud = self.cloud.round_trip or self.cloud.round_trip_s is not None
-        if self.fusion.rounds > 1 and in_a_cloud:
-            raise wrong("rounds", self.fusion.rounds, "1 where the ego's model runs in a cloud")
 
     def _check_reads(self) -> None:
         """Raise ValueError for a content that holds nothing that its rule reads."""
@@ -443,10 +446,8 @@ class OperatingPoint:
         fuses_none = self.content.holds.isdisjoint((INTENTS, PLANS))
         if setting in OF_INTENTS and fuses_none and not on_demand:
             return f"content {ask.content} holds no intents"
-        if setting == "rounds" and PLANS not in self.content.holds:
-            return f"content {ask.content} holds no plans"
-        weighs_none = consensus == EGO_PROMPT or isinstance(RULES[consensus], Heads | Precedence)
-        if setting in WEIGHING and weighs_none:
+        weighs = consensus != EGO_PROMPT and getattr(RULES[consensus], "by_distance", True)
+        if setting in WEIGHING and not weighs:
             return f"consensus {consensus} weighs no distances"
         counts_rounds = (
             isinstance(self.channel, constant.Radio) and not self.channel.density_coupled
@@ -601,6 +602,20 @@ class OperatingPoint:
             if speaker := speaker_of(part):
                 return speaker
         return Honest()
+
+    def again(
+        self,
+        sent: SentIntents,
+        heard: "Exchange",
+        decide: "Callable[[Exchange, Intents], Coordination]",
+    ) -> "tuple[SentIntents, Exchange]":
+        """Return what is sent and heard after all that vehicles tell each other before they act.
+
+        As `Part.again`, by each part in turn.
+        """
+        for part in self.more:
+            sent, heard = part.again(self, sent, heard, decide)
+        return sent, heard
 
     def _wrong(self, key: str, allowed: str) -> UserError:
         return _error_of(self.name, wrong(key, self.setting(key), allowed))

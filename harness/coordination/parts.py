@@ -14,7 +14,7 @@ from msgspec import Meta, Struct, ValidationError, convert, structs
 
 from harness.coordination.contents import CONTENTS, INTENT, INTENTS, KINDS, PLANS
 from harness.coordination.encodings import ENCODINGS, JSON
-from harness.coordination.rules import EGO_PROMPT, RULES, names
+from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
 from harness.core.config import LONGEST_S, Seconds, description
@@ -26,9 +26,11 @@ from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 
 if TYPE_CHECKING:
+    from harness.coordination.coordinate import Coordination
+    from harness.coordination.exchange import Exchange
     from harness.coordination.intents import Intents
     from harness.coordination.operating_point import OperatingPoint
-    from harness.coordination.sent import Speaker
+    from harness.coordination.sent import SentIntents, Speaker
     from harness.core.arrays import Bools, Floats, Ints
     from harness.world.scene_graph import SceneGraph
 
@@ -36,7 +38,6 @@ FALLBACKS = ("uniform", "brake")
 RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
-MOST_ROUNDS = 3
 
 Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
 Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
@@ -240,6 +241,25 @@ class Part(Struct, frozen=True, kw_only=True):
         """
         return fused
 
+    def again(
+        self,
+        point: "OperatingPoint",
+        sent: "SentIntents",
+        heard: "Exchange",
+        decide: "Callable[[Exchange, Intents], Coordination]",
+    ) -> "tuple[SentIntents, Exchange]":
+        """Return what is sent and heard after all that vehicles tell each other before they act.
+
+        Only a part that ships may say more than the first exchange.
+
+        Args:
+            point: the condition.
+            sent: what n decisions' vehicles have sent so far.
+            heard: the exchange of that.
+            decide: returns the decisions by an exchange and the intents known after it.
+        """
+        return sent, heard
+
     def sources(self, episodes: "Ints", seeds: "Ints") -> "Ints":
         """Return for each of n decisions the index of the decision whose helpers it hears, `(n,)`.
 
@@ -422,20 +442,12 @@ class Fusion(Part, frozen=True, kw_only=True):
     # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
     # on the first action, which is the most conservative one.
     fallback: Text = "uniform"
-    # How often agents tell each other their plans before they act (`harness.evaluate.rounds`).
-    rounds: Annotated[
-        int, Meta(ge=1, le=MOST_ROUNDS, description=f"a whole number from 1 to {MOST_ROUNDS}")
-    ] = 1
 
     def check(self) -> None:
         if self.fallback not in FALLBACKS:
             raise unknown("fallback", self.fallback, FALLBACKS)
         if self.consensus not in RULES and self.consensus != EGO_PROMPT:
-            raise unknown("consensus", self.consensus, names())
-
-    @property
-    def acts_on(self) -> Collection[ActsOn]:
-        return (ActsOn("rounds", self.rounds, (PLANS,), "1"),) if self.rounds > 1 else ()
+            raise _lacking("consensus", self.consensus, RULES, EGO_PROMPT)
 
 
 class Cloud(Part, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ median is taken by itself, one voice can make the second choice of all others th
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,6 +28,8 @@ class Heads(Pool):
     The pool is overruled by the mean intent of a majority that the ego is in, of all voices but
     one.
     """
+
+    by_distance: ClassVar[bool] = False
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
         """Return the pool with equal weights of all heard, or the majority's mean if it departs.

@@ -7,7 +7,6 @@ messages in its prompt (the paper's section III-C).
 
 from harness.coordination.consensus import Pool, Rule, linear_pool, log_pool, median, trimmed_mean
 from harness.coordination.contents import INTENTS, PLANS, WORDS
-from harness.coordination.precedence import PRECEDENCE
 from harness.coordination.robust import HEADS
 from harness.coordination.trust import Trust
 from harness.core.plugins import Plugins
@@ -21,7 +20,7 @@ POOLS = {
 RULES: Plugins[Rule] = Plugins(
     "swarmdrive.rules",
     Rule,
-    {**{name: Pool(pool) for name, pool in POOLS.items()}, **HEADS, "trust": Trust(), **PRECEDENCE},
+    {**{name: Pool(pool) for name, pool in POOLS.items()}, **HEADS, "trust": Trust()},
 )
 EGO_PROMPT = "ego-prompt"
 

@@ -460,7 +460,7 @@ class Asker:
         intents = np.array([a.intent or unknown for a in answers]).reshape(len(ids), len(unknown))
         return intents, fusion_s(self.latency, answers, models)
 
-    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+    def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         return partial(self._of_plans, [scenes[n] for n in at.tolist()], intents)
 
     def _of_plans(

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.coordination.contents import PLAN, WHOLE, Call
+from harness.coordination.contents import WHOLE, Call
 from harness.coordination.contents_of_packages import words
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
@@ -23,6 +23,7 @@ from harness.core.errors import UserError, printable
 from harness.evaluate.repair import as_text
 from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
+OF_AGENT = "plan"  # in a key, before what its sender, an agent, is itself going to do
 FROM = "from:"  # in a key, before the id of the other scene that a message comes from
 
 
@@ -115,7 +116,9 @@ def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools
         number, reaches_s, lost_s = (
             each[row, 1 + h] for each in (plans.vehicle, plans.reaches_s, plans.lost_s)
         )
-        keys.append(f"{helpers[h]}{REWRITTEN}{PLAN}:{number}:{intent}:{reaches_s:.1f}:{lost_s:.1f}")
+        keys.append(
+            f"{helpers[h]}{REWRITTEN}{OF_AGENT}:{number}:{intent}:{reaches_s:.1f}:{lost_s:.1f}"
+        )
     return keys
 
 
@@ -123,7 +126,7 @@ def _plan_of(key: str) -> dict[str, Any] | None:
     """Return the plan of a sender's key as a prompt takes it; None for another message."""
     sender, _, change = key.partition(REWRITTEN)
     name, *parts = change.split(":")
-    if name != PLAN:
+    if name != OF_AGENT:
         return None
     try:
         number, intent, reaches_s, lost_s = parts

@@ -30,7 +30,6 @@ from harness.evaluate.claims import claims
 from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
-from harness.evaluate.rounds import further_rounds
 from harness.evaluate.sharing import listed
 from harness.radio.channel import Draws, Site, Unit
 from harness.world.scenario import Scenario
@@ -190,7 +189,9 @@ class Ask(Protocol[AskedPoint]):
         """
         ...
 
-    def plan_call(self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents) -> FusionCall:
+    def call_of_agents(
+        self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents
+    ) -> FusionCall:
         """Return the fusion call of the agents at the points `at`, `(n,)`.
 
         It asks them again with the plans in `intents`, `(n, ...)`, that each has heard.
@@ -243,16 +244,15 @@ def _steps(
             ties_here = tie_draws(draws, ties)
             fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
         for point, due_here in due.items():
-            if point.fusion.rounds > 1:
-                plan_call = partial(ask.plan_call, decision_points, due_here.at)
-                decides = partial(_decided, point, fusions[point], plan_call)
-                said[point], sent[point] = further_rounds(point, said[point], sent[point], decides)
+            call_of = partial(ask.call_of_agents, decision_points, due_here.at)
+            decide = partial(_decided, point, fusions[point], call_of)
+            said[point], sent[point] = point.again(said[point], sent[point], decide)
         calls = _fusion_calls(due, said, sent, decision_points, ask)
         decided = []
         for point, due_here in due.items():
             call = None
             if point.has_fusion_call and point.content.of_agents:
-                call = ask.plan_call(decision_points, due_here.at, said[point].intents)
+                call = ask.call_of_agents(decision_points, due_here.at, said[point].intents)
             elif point.has_fusion_call:
                 places = places_of(point, due_here, len(decision_points))
                 call = calls[point.rewrites](places, shown(point, said[point]))
@@ -294,11 +294,11 @@ def _with_needs(
 def _decided(
     point: OperatingPoint,
     fusion: FusionInputs,
-    plan_call: Callable[[Intents], FusionCall],
+    call_of: Callable[[Intents], FusionCall],
     heard: Exchange,
     intents: Intents,
 ) -> Coordination:
-    call = plan_call(intents) if point.has_fusion_call else None
+    call = call_of(intents) if point.has_fusion_call else None
     return fuse(point, heard, intents, replace(fusion, call=call))
 
 

@@ -353,12 +353,12 @@ class ReplayedRun:
         with self._writing():
             return self._asker.fusion_call(scenes, codes, rewrites)
 
-    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+    def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         """Return a function that asks agents again with the plans they heard.
 
         Frozen runs, in which only the ego decides, do not use it. `at` has indices of scenes.
         """
-        return self._asker.plan_call(scenes, at, intents)
+        return self._asker.call_of_agents(scenes, at, intents)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -424,8 +424,8 @@ class _Nearest:
     ) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
 
-    def plan_call(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
-        return self._stored.plan_call(scenes, at, intents)
+    def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
+        return self._stored.call_of_agents(scenes, at, intents)
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:

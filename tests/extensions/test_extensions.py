@@ -44,7 +44,7 @@ OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
-NAMED = ("channel_models", "contents", "encodings", "families", "readers", "schedules")
+NAMED = ("channel_models", "contents", "encodings", "families", "readers", "rules", "schedules")
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]
@@ -467,6 +467,7 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "named_point('6g:content=objects'), lambda: named_point('6g:schedule=margin'), "
         "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2'), "
         "lambda: named_point('its-g5'), lambda: named_point('mine'), "
+        "lambda: named_point('6g:consensus=auction'), lambda: named_point('6g:rounds=2'), "
         "lambda: named_point('6g:encoding=etsi')):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
@@ -496,6 +497,8 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
                 (mine, "trace"),
             )
         ],
+        "consensus auction is part of the extension plan, which is not installed",
+        "setting rounds=2 of a condition is part of the extension plan, which is not installed",
         "encoding etsi is part of the extension radio, which is not installed",
     ]
 

@@ -10,6 +10,7 @@ import pytest
 from harness.cli.commands import COMMANDS, GROUPS, OLD
 from harness.coordination.contents import CONTENTS
 from harness.coordination.operating_point import more_parts
+from harness.coordination.rules import RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.core.extensions import Extension, control_settings, extensions
 from harness.extensions.trust.part import DEFENCES
@@ -56,6 +57,7 @@ ORDINARY = {
     "random": "of draws",
     "read-outs": "of a policy from a model's probabilities",
     "risk": "an answer's level, and errors by confidence",
+    "rounds": "of messages on a channel, and of numbers",
     "schedules": "a kind of plug-ins, and the folder of their files",
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
@@ -175,6 +177,7 @@ LOOP = (
 OTHER_THINGS = {
     ("coordination/coordinate.py", "messages"): "what a rule fuses",
     ("coordination/operating_point.py", "objects"): "whether a call shows what is in the graph",
+    ("coordination/operating_point.py", "rounds"): "of helpers, which load a channel",
     ("coordination/operating_point.py", "text"): "of a condition, and of a message's key",
     ("evaluate/asking.py", "text"): "what a model says",
     ("evaluate/spec.py", "always"): "how a card thinks",
@@ -204,14 +207,15 @@ def said_in(tree: ast.AST) -> Iterator[str]:
 
 
 def test_what_plays_a_decision_names_no_part_of_an_extension() -> None:
-    """Neither settings, nor questions to helpers, controls, contents or schedules."""
+    """Neither settings, nor questions to helpers, controls, contents, rules or schedules."""
     kinds = more_parts().values()
     settings = {setting for kind in kinds for setting in kind.__struct_fields__}
     questions = {question.name for kind in kinds for question in kind.questions}
     controls = {setting.partition("=")[2] for setting in control_settings().values()}
     contents = set(CONTENTS) - CONTENTS.built_in.keys()
     schedules = set(SCHEDULES) - SCHEDULES.built_in.keys()
-    theirs = settings | questions | controls | set(DEFENCES) | contents | schedules
+    rules = set(RULES) - RULES.built_in.keys()
+    theirs = settings | questions | controls | set(DEFENCES) | contents | rules | schedules
     named = {
         (path, word)
         for path in LOOP

@@ -171,7 +171,7 @@ class CalibratedWorld:
         """Raise NotImplementedError: all intents are drawn, so no model can be asked."""
         raise NotImplementedError
 
-    helpers = fusion_call = plan_call = others
+    helpers = fusion_call = call_of_agents = others
 
     def due(self, point: OperatingPoint) -> Due:
         """Return the decisions of this step, one in every episode, with the channel's draws."""

@@ -59,7 +59,7 @@ def _defences_on(holds: frozenset[str]) -> list[str]:
 class Guard(Part, frozen=True, kw_only=True):
     """Hold a condition's settings of attacks by helpers and of defences of a fusion call."""
 
-    behind: ClassVar[str] = "rounds"
+    behind: ClassVar[str] = "fallback"
     named: ClassVar = {"attack": lambda: ATTACKS}
     usual: ClassVar = {"attack": ",".join(("none", *USUAL))}
 

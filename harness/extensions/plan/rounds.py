@@ -1,5 +1,5 @@
-"""Further rounds of a negotiation: agents send what they have decided,
-and decide again with what they hear.
+"""The setting `rounds` of a condition: agents send what they have decided, and decide again with
+what they hear.
 
 In seconds from the start of the decision: an agent that has decided by the window asks the same
 others once more. Each replies once it has decided itself, with its policy after the round before.
@@ -8,26 +8,62 @@ is taken at its last word. The agent decides again by its own intent and by what
 fusion call delays what follows it, and who has heard nothing new makes no further one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 
-from harness.coordination.coordinate import Coordination
-from harness.coordination.exchange import Exchange, exchange
-from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.sent import SentIntents
+from harness.coordination.contents import PLANS
+from harness.coordination.parts import ActsOn, Part, wrong
 from harness.core.arrays import any_of, count_of
-from harness.radio.channel import Draws
+
+if TYPE_CHECKING:
+    from harness.coordination.coordinate import Coordination
+    from harness.coordination.exchange import Exchange
+    from harness.coordination.intents import Intents
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.coordination.sent import SentIntents
+    from harness.radio.channel import Draws
+
+MOST_ROUNDS = 3
+
+
+class Negotiated(Part, frozen=True, kw_only=True):
+    """How often agents tell each other their plans before they act."""
+
+    behind: ClassVar[str] = "fallback"
+
+    rounds: Annotated[
+        int, Meta(ge=1, le=MOST_ROUNDS, description=f"a whole number from 1 to {MOST_ROUNDS}")
+    ] = 1
+
+    @property
+    def acts_on(self) -> Collection[ActsOn]:
+        return (ActsOn("rounds", self.rounds, (PLANS,), "1"),) if self.rounds > 1 else ()
+
+    def check_with(self, point: "OperatingPoint") -> None:
+        in_a_cloud = point.cloud.round_trip or point.cloud.round_trip_s is not None
+        if self.rounds > 1 and in_a_cloud:
+            raise wrong("rounds", self.rounds, "1 where the ego's model runs in a cloud")
+
+    def again(
+        self,
+        point: "OperatingPoint",
+        sent: "SentIntents",
+        heard: "Exchange",
+        decide: "Callable[[Exchange, Intents], Coordination]",
+    ) -> "tuple[SentIntents, Exchange]":
+        return further_rounds(point, sent, heard, decide)
 
 
 def further_rounds(
-    point: OperatingPoint,
-    said: SentIntents,
-    heard: Exchange,
-    fused: Callable[[Exchange, Intents], Coordination],
-) -> tuple[SentIntents, Exchange]:
+    point: "OperatingPoint",
+    said: "SentIntents",
+    heard: "Exchange",
+    fused: "Callable[[Exchange, Intents], Coordination]",
+) -> "tuple[SentIntents, Exchange]":
     """Play the negotiation rounds after the first, in which agents exchange revised plans.
 
     Returns the last plans that each agent knows, and one exchange that sums all rounds.
@@ -38,7 +74,9 @@ def further_rounds(
         heard: the exchange of the first round.
         fused: returns the decisions by an exchange and the intents known after it.
     """
-    for number in range(2, point.fusion.rounds + 1):
+    from harness.coordination.exchange import exchange
+
+    for number in range(2, point.setting("rounds") + 1):
         intents, draws = said.intents, said.draws
         assert intents.plans is not None
         senders = intents.plans.row
@@ -68,7 +106,7 @@ def further_rounds(
     return said, heard
 
 
-def _of_round(draws: Draws, number: int) -> Draws:
+def _of_round(draws: "Draws", number: int) -> "Draws":
     """Return a round's draws: links and shadowing stay, each packet is drawn anew."""
     if draws.trips is None:
         return draws
@@ -76,7 +114,7 @@ def _of_round(draws: Draws, number: int) -> Draws:
     return replace(draws, given=trips.uniforms(draws.jitter.shape[-1]))
 
 
-def _together(earlier: Exchange, later: Exchange) -> Exchange:
+def _together(earlier: "Exchange", later: "Exchange") -> "Exchange":
     """Return the exchange of two rounds: what both cost, and who was heard in either."""
     return replace(
         earlier,

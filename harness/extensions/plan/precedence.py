@@ -30,6 +30,7 @@ class Precedence:
     # headway of the two-second rule
     apart_s: float = 2.0
     needs: ClassVar[tuple[str, ...]] = ("plans",)
+    by_distance: ClassVar[bool] = False
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
         """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`."""
@@ -66,8 +67,6 @@ def _by_bid(plans: Plans) -> Floats:
     return -plans.lost_s
 
 
-PRECEDENCE = {
-    "yield-by-time": Precedence(_by_time),  # who reaches the conflict sooner goes on
-    "yield-by-id": Precedence(_by_number),
-    "auction": Precedence(_by_bid),  # each bids the time that it has lost; the highest bid goes on
-}
+BY_TIME = Precedence(_by_time)  # who reaches the conflict sooner goes on
+BY_NUMBER = Precedence(_by_number)
+BY_BID = Precedence(_by_bid)  # each bids the time that it has lost; the highest bid goes on

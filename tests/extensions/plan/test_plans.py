@@ -19,7 +19,7 @@ from harness.coordination.rules import RULES
 from harness.coordination.sent import SentIntents
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource
-from harness.evaluate.rounds import further_rounds
+from harness.extensions.plan.rounds import further_rounds
 from harness.radio.channel import Draws
 from harness.runs import folder
 
