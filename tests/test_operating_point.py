@@ -57,6 +57,7 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ({"tau_nats": -0.1}, "tau_nats is -0.1; it must be a finite number of nats, 0 or more"),
         ({"tau_nats": math.nan}, "tau_nats is nan"),
         ({"tau_nats": math.inf}, "tau_nats is inf"),
+        ({"tau_nats": 1e30}, "nats, 0 or more, and no larger than 9.2e+18"),
         ({"tau_nats": 10**400}, "tau_nats is 1000"),
         ({"tau_nats": True}, "tau_nats is True"),
         ({"tau_nats": "0.7"}, "tau_nats is '0.7'"),

@@ -277,7 +277,8 @@ def test_a_replay_asks_on_as_the_run_was_asked(
             "--temperature -1: give 0, which takes the likeliest token each time, to 2",
         ),
         ({"temperature": float("nan")}, "--temperature nan: give 0"),
-        ({"sampling_seed": 2}, "--sampling-seed 2: give 0 or more, with a --temperature above 0"),
+        ({"sampling_seed": -1}, "--sampling-seed -1 is out of range; give 0 to 2147483647"),
+        ({"sampling_seed": 2}, "--sampling-seed 2: give a --temperature above 0 with it: greedy"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(

@@ -13,8 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.core import resources
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.dataset.select import Selection
+from harness.evaluate.resolve import driven
+from harness.runs.settings import DriveSettings
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +74,12 @@ def test_a_run_says_which_and_its_command_selects_them_again(harness: Callable[.
     again[again.index("a")] = "b"
     assert harness(*again[1:])[0] == 0
     assert Path("a/episodes.csv").read_text() == Path("b/episodes.csv").read_text()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31, 10**30])
+def test_the_seed_of_a_draw_is_one_that_layouts_may_have(seed: int) -> None:
+    said = r"^--sample-seed -?\d{1,31} is out of range; give 0 to 2147483647$"
+    with pytest.raises(UserError, match=said):
+        Selection(sample=1, sample_seed=seed)
+    with pytest.raises(UserError, match=said):
+        driven(DriveSettings(sample=1, sample_seed=seed))

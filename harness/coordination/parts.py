@@ -17,7 +17,7 @@ from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ORACLE, PAPER
-from harness.core.config import LONGEST_S, Seconds, description
+from harness.core.config import LARGEST, LONGEST_S, Seconds, description
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.plugins import Plugins
@@ -168,6 +168,8 @@ class Part(Struct, frozen=True, kw_only=True):
                     raise ValidationError
             except (ValidationError, OverflowError):
                 raise wrong(key, value, str(description(hint))) from None
+            if isinstance(converted, float) and abs(converted) > LARGEST:
+                raise wrong(key, value, f"{description(hint)}, and no larger than {LARGEST:.2g}")
             structs.force_setattr(self, key, converted)
         with telling(self):
             self.check()

@@ -111,5 +111,5 @@ def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserE
 def in_range(option: str, value: float, least: float, most: float) -> None:
     """Raise UserError unless `least` <= `value` <= `most`; `option` names the value."""
     if not least <= value <= most:
-        given = f"{value:g}" if isinstance(value, float) else value
+        given = f"{value:g}" if isinstance(value, float) else printable(value, 40)
         raise UserError(f"{option} {given} is out of range; give {least} to {most}")

@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import TypeVar
 
 from harness.core import noise
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, in_range, printable, unknown
+from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Dataset
 
 T = TypeVar("T")
@@ -28,6 +29,7 @@ class Selection:
     def __post_init__(self) -> None:
         if self.limit is not None and self.limit < 1:
             raise UserError(f"--limit {self.limit}: give 1 or more episodes")
+        in_range("--sample-seed", self.sample_seed, 0, LAST_SEED)
 
     @property
     def given(self) -> dict[str, int | str]:

@@ -78,6 +78,7 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     first_seed = shipped["seed"] if world.first_seed is None else world.first_seed
     in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     in_range("--first-seed", first_seed, 0, LAST_SEED)
+    in_range("--sample-seed", world.sample_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
     enough = until(world.until_width, world.until_decided)
     if enough and world.sample is not None:

@@ -17,7 +17,8 @@ from harness.coordination import contents_of_packages, parts_of_packages
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.schedules import SCHEDULES
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
+from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.costs import Budget
@@ -228,10 +229,11 @@ class Spec:
             raise UserError(
                 f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}"
             )
-        if seed < 0 or (seed and not temperature):
+        in_range("--sampling-seed", seed, 0, LAST_SEED)
+        if seed and not temperature:
             raise UserError(
-                f"--sampling-seed {seed}: give 0 or more, with a --temperature above 0: "
-                "greedy answers are not drawn"
+                f"--sampling-seed {seed}: give a --temperature above 0 with it: greedy answers are "
+                "not drawn"
             )
         if temperature and not any(agent.samples for agent in self.agents):
             name = printable(self.ego.card.name)

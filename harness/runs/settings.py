@@ -17,10 +17,11 @@ from msgspec import Meta, Struct, structs, to_builtins
 
 from harness.core import extensions
 from harness.core.config import convert, toml
-from harness.core.errors import UserError, printable, sayable
+from harness.core.errors import UserError, in_range, printable, sayable
 from harness.core.extensions import Setting
 from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
+from harness.core.seeds import LAST_SEED
 
 FILE = "run.toml"
 COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
@@ -783,4 +784,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             f"--seeds {printable(text)}: give a range such as 0:5, or a list such as 3,7,9, "
             f"of {MOST_SEEDS} seeds at most"
         )
+    for seed in (min(seeds), max(seeds)):
+        in_range("--seeds", seed, 0, LAST_SEED)
     return seeds

@@ -13,9 +13,9 @@ from harness.cli.progress import bar
 from harness.cli.prompt import Version
 from harness.cli.scenario import ready_to_drive
 from harness.core import extras, resources
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.files import write_whole
-from harness.core.seeds import FIRST, purpose, stated
+from harness.core.seeds import FIRST, LAST_SEED, purpose, stated
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -93,10 +93,10 @@ def distill(
     for flag, value, least in (
         ("--batch", batch, 1),
         ("--threads", threads, 1),
-        ("--seed", seed, 0),
     ):
         if value is not None and value < least:
             raise UserError(f"{flag} {value}: give {least} or more")
+    in_range("--seed", seed, 0, LAST_SEED)
     if objective not in OBJECTIVES:
         raise unknown("--objective", objective, OBJECTIVES)
     start, adapt = _base(base, lora, rank, rate, dtype, report)

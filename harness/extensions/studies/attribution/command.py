@@ -8,6 +8,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import echo_answer, show
 from harness.core.errors import in_range, printable
+from harness.core.seeds import LAST_SEED
 
 MOST = 100_000
 USUAL = "6g"
@@ -38,6 +39,7 @@ def command(
     from harness.studies.replayed_run import ReplayedRun
 
     in_range("--sample", sample, 1, MOST)
+    in_range("--sample-seed", sample_seed, 0, LAST_SEED)
     with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
         own = options.cards(model)
         stored = ReplayedRun(run, progress=progress, dataset=dataset, models=own)
