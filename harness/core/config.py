@@ -97,7 +97,11 @@ def loads(text: str, where: str) -> dict[str, Any]:
     if _LONG_KEY.search(text):
         raise UserError(f"{where} is no TOML: a key has more than {_DOTS} dots; fix the file")
     try:
-        return tomllib.loads(text)
+        tables = tomllib.loads(text)
+        repr(
+            tables
+        )  # which fails for a number of thousands of hexadecimal digits, as messages would
+        return tables
     except (ValueError, RecursionError) as error:  # also raised for too many digits or brackets
         mend = "put a text in quotes" if str(error).startswith("Invalid value") else "fix the file"
         raise UserError(f"{where} is no TOML: {printable(error)}; {mend}") from None
