@@ -133,7 +133,13 @@ def test_what_is_no_toml_is_said_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "route.toml"
     file.write_text("a = 1")
     assert toml(file, "r") == {"a": 1}
-    for data in (b"[a", b"\xff", b"a = " + b"9" * 5000, b"a = 0x" + b"f" * 5000, b"a = " + b"[" * 3000):
+    for data in (
+        b"[a",
+        b"\xff",
+        b"a = " + b"9" * 5000,
+        b"a = 0x" + b"f" * 5000,
+        b"a = " + b"[" * 3000,
+    ):
         file.write_bytes(data)
         with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):
             toml(file, "r")

@@ -26,6 +26,7 @@ from harness.world.scenario import Scenario
 
 FOLDER = "calibrations"
 COOLEST, HOTTEST = 0.05, 20.0  # temperatures
+OFF = 2e-4  # of a prior's sum, for each action: the least prior and rounding
 LEAST_PRIOR = 1e-4  # a prior below counts as that: less would let one answer in 10 000 decide all
 OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation", "adapter")
 OF_QUESTION = ("answer", "letters", "image", "sums", "thinking")
@@ -126,6 +127,16 @@ def _read(path: Any) -> Calibration:
             raise UserError(
                 f"{where}: prior has {len(correction.prior)} values; give one an action, or none"
             )
+        if correction.prior and abs(sum(correction.prior) - 1) > OFF * len(correction.prior):
+            raise UserError(
+                f"{where}: prior sums to {sum(correction.prior):g}, not 1; fit it again"
+            )
+        if bool(correction.prior) != ("L0" in found.level):
+            raise UserError(
+                f"{where}: level {found.level} goes with a prior if it has L0; fit it again"
+            )
+        if correction.temperature != 1 and "L1" not in found.level:
+            raise UserError(f"{where}: level {found.level} has no temperature but 1; fit it again")
     return found
 
 
