@@ -71,6 +71,9 @@ def contradictions(run: Run) -> Iterator[str]:
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
+    answered = {answer.scene for answer in answers}
+    if (scene := next((each for each in reached if each not in answered), None)) is not None:
+        yield f"decisions.parquet has scene {printable(scene)!r}, which answers.jsonl has not"
     delays = filter(None, map(run.undeclared_delay, answers))
     if (delay := next(delays, None)) is not None:
         yield f"answers.jsonl has {delay}"
