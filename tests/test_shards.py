@@ -224,6 +224,32 @@ def test_shards_of_other_runs_are_refused(split: Path, harness: Typed, tmp_path:
     assert "is no shard" in refused(harness, [split / "whole"])
 
 
+@pytest.mark.slow
+def test_shards_that_are_forged_alike_are_refused_in_one_line_and_nothing_is_made(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    configs = [shard / ".work/config.json" for shard in shards]
+    stated = [json.loads(config.read_text()) for config in configs]
+    for forged in (
+        {"conditions": 5}, {"model": None}, {"seeds": "zork"}, {"world": []}, {"letters": 5},
+        {"actions": []}, {"batch_size": {}}, {"seeds": [5]},
+    ):  # fmt: skip
+        for config, each in zip(configs, stated, strict=True):
+            settings = {**each["settings"], **forged}
+            config.write_text(json.dumps({**each, "settings": settings}))
+        said = refused(harness, shards)
+        assert "hold no parts of one whole (" in said or "is no shard; give folders" in said
+    for config, each in zip(configs, stated, strict=True):
+        config.write_text(json.dumps(each))
+    part, other = (next((shard / ".work").glob("episodes-*")) for shard in shards[:2])
+    for file in ("answers.jsonl", "episodes.csv", "decisions.parquet"):
+        own = (part / file).read_bytes()
+        shutil.copy(other / file, part / file)
+        assert "hold no parts of one whole (" in refused(harness, shards)
+        (part / file).write_bytes(own)
+
+
 def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
     with alone(shards[0] / ".work/lock"):

@@ -7,10 +7,13 @@ and its config names the shard.
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
+from zipfile import BadZipFile
 
 import msgspec
 
@@ -21,6 +24,9 @@ from harness.core.formats import CONFIG, WORK
 
 T = TypeVar("T")
 MOST = 100_000
+# What taking a shard's values, and a dataset's archives, apart raises where they are forged.
+BROKEN_PARTS = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
+BROKEN_ZIP = (BadZipFile, zlib.error, EOFError, NotImplementedError)
 # Environment variables that number a job's tasks, with the number taken as the first: an array of
 # Slurm has the numbers that it was given, and Kubernetes counts from 0.
 TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
@@ -107,6 +113,25 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
             f"shards {printable(', '.join(missing))} are missing; give the folders of all {total}"
         )
     return configs
+
+
+@contextmanager
+def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
+    """Make a whole of shards, in the folder `out`, of what their files state.
+
+    Raises UserError where that makes none; then `out` is not there if it was not before.
+    """
+    was_there = out.exists()
+    try:
+        yield
+    except (*BROKEN_PARTS, *BROKEN_ZIP) as error:
+        if not was_there:
+            shutil.rmtree(out, ignore_errors=True)
+        named = printable(", ".join(map(str, folders)), 200)
+        reason = f"{type(error).__name__}: {printable(error)}"
+        raise UserError(
+            f"{named} hold no parts of one whole ({reason}); make these shards again"
+        ) from error
 
 
 def _read(folder: Path, kind: type[Start]) -> Start:

@@ -22,12 +22,12 @@ import msgspec
 
 from harness import __version__
 from harness.core import shards, work
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
 from harness.core.files import canonical_json, opened, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
 from harness.core.plugins import Plugins
-from harness.core.seeds import purpose, stated
+from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, stated
 from harness.core.shards import Shard
 from harness.core.strangers import worded
 from harness.dataset.forest import Forest
@@ -177,16 +177,20 @@ def merge(
     """
     begun = shards.read(folders, work.WorkStart)
     config = begun[0].settings
-    episodes = {part_of(e): e for e in range(config["episodes"])}
-    parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
-    if not (out / "manifest.json").exists():
-        whole = work.WorkStart(settings=config)
-        if stopped := work.begun(out, work.WorkStart):
-            work.same(out, whole.settings, stopped.settings)
-        with work.working(out, whole) as place:
-            shards.collect(parts, place)
-    scenario = scenarios.stated(config["scenario"], config["parameters"])
-    return build(scenario, out, config["episodes"], config["seed"], workers, progress, audits, more)
+    with shards.made_whole(folders, out):
+        in_range("episodes of a shard's dataset", config["episodes"], 1, LAST_EPISODE + 1)
+        in_range("seed of a shard's dataset", config["seed"], 0, LAST_SEED)
+        episodes = {part_of(e): e for e in range(config["episodes"])}
+        parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
+        if not (out / "manifest.json").exists():
+            whole = work.WorkStart(settings=config)
+            if stopped := work.begun(out, work.WorkStart):
+                work.same(out, whole.settings, stopped.settings)
+            with work.working(out, whole) as place:
+                shards.collect(parts, place)
+        scenario = scenarios.stated(config["scenario"], config["parameters"])
+        count, seed = config["episodes"], config["seed"]
+        return build(scenario, out, count, seed, workers, progress, audits, more)
 
 
 def _freeze_missing(

@@ -20,12 +20,13 @@ from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
-from harness.core.errors import Unanswered, UserError
+from harness.core.errors import Unanswered, UserError, in_range
 from harness.core.files import write_whole
 from harness.core.formats import WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
+from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
@@ -165,6 +166,12 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     hold different bytes for the same part, or `out` holds something else.
     """
     begun = shards.read(folders, RunStart)
+    with shards.made_whole(folders, out):
+        return _merged(begun, folders, out)
+
+
+def _merged(begun: Sequence[RunStart], folders: Sequence[Path], out: Path) -> Evaluated:
+    """Combine shards, by what they began with."""
     chunks = _chunks_of(begun[0].settings)
     chunk_by_folder = {_folder_name(chunk): chunk for chunk in chunks}
     parts = shards.owners(
@@ -326,7 +333,9 @@ def _begin_driving(
 def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
     """Split a closed-loop run into chunks: the numbers of the episodes that are driven in step."""
     world = msgspec.convert(settings["world"], ClosedLoop)
-    numbers: Sequence[int] = range(world.episodes)
+    most = world.selection.get("of", world.episodes)
+    in_range("episodes of a shard's run", most, 1, LAST_EPISODE + 1)
+    numbers: Sequence[int] = range(min(world.episodes, most))
     if sample := world.selection:
         numbers = drawn(range(sample["of"]), sample["sample"], sample["sample_seed"], sample["of"])
     return _split(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
