@@ -336,6 +336,10 @@ def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness)
     assert "otherwise than the rule here" in " ".join(out.split())
 
 
+def counted(answer: Row) -> None:
+    answer["prompt_tokens"] = 7
+
+
 def failed(answer: Row) -> None:
     answer |= {"status": "no_json", "verdict": "failed", "intent": None}
 
@@ -344,6 +348,7 @@ def failed(answer: Row) -> None:
     ("changed", "said"),
     [
         (failed, "another verdict in 1 answer than its texts say"),
+        (counted, "another prompt_tokens in 1 answer than the rule here"),
         (
             lambda answer: answer.update(repairs=("fence",)),
             "another repairs in 1 answer than its texts say",

@@ -185,7 +185,7 @@ class LacksAnswer(UserError):
 
     def __init__(self, run: Path, question: str) -> None:
         super().__init__(f"{printable(run)} holds no answer for {question}")
-        self.question = question
+        self.question, self.otherwise = question, 0  # answers that the rule here gives otherwise
 
 
 class Kept(Replay):

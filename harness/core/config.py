@@ -44,8 +44,8 @@ from harness.core.files import text_of
 
 Record = TypeVar("Record")
 Count = Annotated[int, msgspec.Meta(ge=1, description="1 or more")]
-Whole = Annotated[int, msgspec.Meta(ge=0, description="a whole number, 0 or more")]
 LARGEST = 2**63 - 1  # of a number in a file, which is what NumPy's and Parquet's integers hold
+Whole = Annotated[int, msgspec.Meta(ge=0, le=LARGEST, description="a whole number, 0 or more")]
 _ANY_NUMBER = f"a finite number, of a size of at most {LARGEST:.2g}"
 LONGEST_S = 3600.0  # the longest time that a model may be declared to take for an answer
 Seconds = Annotated[

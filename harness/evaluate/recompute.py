@@ -98,6 +98,9 @@ def computed(
 
     try:
         evaluate(spec, out, progress, opens=opens)
+    except LacksAnswer as lack:
+        lack.otherwise = sum(each.wrong for each in held)
+        raise
     except KeyboardInterrupt as stop:
         stop.__notes__ = []  # that the folder keeps what is done: it is deleted
         raise
@@ -144,7 +147,7 @@ def differences(
         ours, otherwise = computed(run, spec, out, progress)
     except LacksAnswer as lack:
         lacks = f"answers.jsonl has no answer to {lack.question}, asked by what run.json states"
-        return [*contradictions(run), lacks], []
+        return [*contradictions(run), *_of_rule(lack.otherwise), lacks], []
     wrong = [
         *contradictions(run),
         *_of_manifest(run, ours, stated.ego.card),
@@ -154,11 +157,13 @@ def differences(
     ]
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
-    if otherwise:
-        wrong.append(
-            f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here"
-        )
+    wrong += _of_rule(otherwise)
     return wrong, list(_lacking(run, ours))
+
+
+def _of_rule(otherwise: int) -> Iterator[str]:
+    if otherwise:
+        yield f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here"
 
 
 def _lacking(stated: Run, ours: Run) -> Iterator[str]:
@@ -297,6 +302,10 @@ def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
     of_rules = [(a, b) for a, b in asked if b and stated.agent(a)["model"]["engine"] in RULES]
     if wrong := sum(not close(a.slow_s, b.slow_s) for a, b in of_rules):
         yield f"answers.jsonl has another delay in {amount(wrong, 'answer')} than the rule here"
+    for name in ("prompt_tokens", "completion_tokens", "seconds"):
+        if wrong := sum(getattr(a, name) != getattr(b, name) for a, b in of_rules):
+            answers = amount(wrong, "answer")
+            yield f"answers.jsonl has another {name} in {answers} than the rule here"
     if more := sum(b is None for _, b in asked):
         yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
 
