@@ -203,17 +203,21 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     """One answer is altered by hand, not in what it says: it stays as it was kept."""
-    marked = answers.replace(b'\\"IDLE\\"', b'\\"IDLE\\" ', 1)
+    marked = answers.replace(b'"retries":0', b'"retries":1', 1)
     assert marked != answers
     out = unfinished(spec_of(small), tmp_path / "run", marked)
     run(spec_of(small), out)
-    assert b'\\"IDLE\\" ' in (out / "answers.jsonl").read_bytes()
+    assert b'"retries":1' in (out / "answers.jsonl").read_bytes()
+
+
+SURE = '{"action_distribution": {"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}}'
 
 
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
         ("prompt_sha256", "0" * 64, "answer 00000-0-.* is to another prompt or picture than is"),
+        ("raw", SURE, "answer 00000-0-.* is not what the rule here gives; delete that file"),
         ("slow_s", -0.1, "states a delay of -0.1 s, which no card of this run declares"),
         ("prompt_tokens", -5, r"answers\.jsonl is damaged .*prompt_tokens"),
     ],
@@ -222,7 +226,9 @@ def test_a_kept_answer_is_one_to_what_is_asked(
     name: str, value: object, said: str, answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     first, *others = answers.splitlines(keepends=True)
-    forged = json.dumps({**json.loads(first), name: value}).encode() + first[len(first.rstrip()) :]
+    intent = {"intent": [1.0, 0.0, 0.0]} if name == "raw" else {}
+    stated = {**json.loads(first), **intent, name: value}
+    forged = json.dumps(stated).encode() + first[len(first.rstrip()) :]
     out = unfinished(spec_of(small), tmp_path / "run", b"".join([forged, *others]))
     with pytest.raises(UserError, match=said):
         run(spec_of(small), out)

@@ -205,9 +205,10 @@ class Asker:
             if self._checks_kept:
                 self._unasked |= recalled.keys() - self.answers.keys()
             self.answers = recalled | self.answers
-        for request in asked:
-            if request.id in self._unasked:
-                self._check_kept(request)
+        kept = [request for request in asked if request.id in self._unasked]
+        for request in kept:
+            self._check_kept(request)
+        self._check_rules(kept)
         missing = [request for request in asked if request.id not in self.answers]
         if len(missing) < len(asked):
             self._progress(len(asked) - len(missing))
@@ -261,6 +262,22 @@ class Asker:
                 f"prompt or picture than is asked; {ASKED_AGAIN}"
             )
         self._unasked.remove(request.id)
+
+    def _check_rules(self, kept: Sequence[Request]) -> None:
+        """Raise UserError if an answer was kept that the rule which is here does not give."""
+        agents = self.spec.agents
+        of_rules = [each for each in kept if not agents[each.agent].can.language_model]
+        if not of_rules:
+            return
+        for request, here in zip(of_rules, self._backend().complete(of_rules), strict=True):
+            kept_answer = self.answers[request.id]
+            stated = kept_answer.first or kept_answer  # before a repair turn
+            if (stated.raw, stated.slow_s) != (here.text, here.slow_s):
+                assert self._kept
+                raise UserError(
+                    f"{printable(self._kept.file)}: answer {printable(request.id)} is not what the "
+                    f"rule here gives; {ASKED_AGAIN}"
+                )
 
     def _has(self, name: str) -> bool:
         """Return whether there is an answer to a question that was asked here."""
