@@ -3,8 +3,7 @@
 NVML (GPUs since Volta) and RAPL count energy themselves; RAPL's counter wraps around, and on Linux
 only root may read it. A Jetson reports power, which is sampled and integrated here. All are too
 coarse for one answer: on some GPUs NVML samples the power only a quarter of the time (Yang et al.,
-SC24, arXiv 2312.02741), so a measurement lasts seconds and is repeated (`harness model device
-measure`).
+SC24, arXiv 2312.02741), so a measurement lasts seconds and is repeated.
 """
 
 import time

@@ -110,9 +110,9 @@ def test_a_short_spelling_is_for_good(harness: Callable[..., Said]) -> None:
 
 
 def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[..., Said]) -> None:
-    code, out, err = harness("device", "list", "--json")
+    code, out, err = harness("scenario", "list", "--json")
     assert (code, err.count("\n")) == (0, 1)
-    assert json.loads(out) == json.loads(harness("model", "device", "list", "--json")[1])
+    assert json.loads(out) == json.loads(harness("dataset", "scenario", "list", "--json")[1])
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_what_machines_read_stays_json_under_an_old_spelling(harness: Callable[.
         ("evl", "`harness eval`"), ("pull", "`harness model pull`"), ("sweeps", 
             "`harness study sweep`"),
         ("study swep", "`harness study sweep`"), ("models", "`harness model`"),
-        ("devise", "`harness model device`"),
+        ("scenaro", "`harness dataset scenario`"),
     ],
 )  # fmt: skip
 def test_a_slip_is_answered_with_what_was_meant(

@@ -432,7 +432,7 @@ def test_whatever_is_typed_of_an_extension_that_is_gone_says_what_it_was_part_of
     said = done.stderr.splitlines()
     assert done.stdout.split() == ["2"] * len(said)
     for (command, place), line in zip(ENTRIES[known.COMMANDS].items(), said, strict=True):
-        groups_too = re.match("(benchmark|radio|study schedule)(?= )", command)
+        groups_too = re.match("(benchmark|model device|radio|study schedule)(?= )", command)
         typed = groups_too[0] if groups_too else command
         part = f"is part of the extension {place.rpartition('.')[2]}, which is not installed in "
         assert line.startswith(f"harness: `harness {typed}` {part}")

@@ -34,6 +34,8 @@ ORDINARY = {
     "coverage": "of risk by confidence, and of intervals",
     "deadline": "until when a reply is of use",
     "decide": "what vehicles do",
+    "device": "where an engine runs a model, and what is no file",
+    "devices": "meters' of a machine, and the folder of their files",
     "env": "of highway-env, and a variable of the shell",
     "environment": "one of highway-env, and a variable of the shell",
     "environments": "those of highway-env",
@@ -45,6 +47,7 @@ ORDINARY = {
     "inspect": "Python's module",
     "learn": "a verb",
     "margin": "of pages, pictures and gaps",
+    "measure": "a verb, and what is measured",
     "media": "a rule of style sheets",
     "messages": "what vehicles send each other, and what a model is sent",
     "notes": "what is kept beside a scene, and Python's of an exception",
@@ -73,7 +76,6 @@ ORDINARY = {
 LEADS_ON = {
     ("backends/llama_cpp/backend.py", "model check"),
     ("cli/dataset.py", "study fidelity"),
-    ("cli/device.py", "model doctor"),
     ("cli/starter/README.md", "model doctor"),
     ("cli/starter/models/my-model.toml", "model check"),
     ("coordination/parts.py", "study schedule"),
@@ -84,6 +86,7 @@ LEADS_ON = {
     ("report/compare/pair.py", "study fidelity"),
     ("report/scripts/decision.js", "harness view"),
     ("report/scripts/decision.js", "run video"),
+    ("runs/settings.py", "model device"),
     ("runs/settings.py", "study trust"),
 }
 # Old folders of a study had this file in place of its manifest, and are listed.

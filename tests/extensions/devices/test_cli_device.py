@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
+from harness.extensions.devices.fit import answers_of, declared, fits, held
 from harness.runs import devices, folder
-from harness.studies.device_fit import answers_of, declared, fits, held
 
 Said = tuple[int, str, str]
 

@@ -16,8 +16,8 @@ from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
+    from harness.extensions.devices.fit import Fit
     from harness.runs.devices import Constant, Device, DeviceRow
-    from harness.studies.device_fit import Fit
 
 
 MOST_TOKENS = 1_000_000
@@ -61,9 +61,9 @@ def show(
     It shows their time and energy, too. The time is that of the ego's own answer,
     without any message. Nothing else runs on the computer.
     """
+    from harness.extensions.devices.fit import answers_of, declared, fits
     from harness.runs import devices
     from harness.runs.folder import read
-    from harness.studies.device_fit import answers_of, declared, fits
 
     in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
     in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
@@ -150,10 +150,10 @@ def check(
 
     Run it on the device itself. On another machine, the figures show how far the two are apart.
     """
+    from harness.extensions.devices.fit import held
     from harness.runs import devices
     from harness.runs.folder import read
     from harness.runs.records import role_word
-    from harness.studies.device_fit import held
 
     device, done = devices.load(name), read(run)
     row = devices.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
@@ -201,8 +201,8 @@ def measure(
     from harness.backends.counters import counters
     from harness.cli.progress import bar
     from harness.evaluate.agent import Agent
+    from harness.extensions.devices.power import WINDOWS, measure_agent
     from harness.prompts import versions
-    from harness.studies.device_power import WINDOWS, measure_agent
 
     if not 0.1 <= window_s <= MOST_MS / 1000:
         raise UserError(f"--window-s {window_s:g} is out of range; give 0.1 to {MOST_MS // 1000}")

@@ -1,0 +1,17 @@
+"""Give every vehicle a computer: what an answer takes there in time, energy and memory."""
+
+from harness.core.extensions import Extension
+
+_HERE = "harness.extensions.devices"
+
+EXTENSION = Extension(
+    name="devices",
+    commands={
+        "model device list": f"{_HERE}.commands:list_devices",
+        "model device show": f"{_HERE}.commands:show",
+        "model device check": f"{_HERE}.commands:check",
+        "model device measure": f"{_HERE}.commands:measure",
+    },
+    groups={"model device": "List on-board computers, show or check one, or measure energy."},
+    spellings={"device": "model device"},
+)
