@@ -133,10 +133,6 @@ class RunFacts(Protocol):
     def frozen(self) -> bool:
         """Whether scenes are recorded (`harness eval`), not a simulation that actions change."""
 
-    @property
-    def device_profile(self) -> Any:
-        """The computer by whose profile energy is counted; None if it is not counted."""
-
 
 class Part(Struct, frozen=True, kw_only=True):
     """Base class of a group of an operating point's settings, checked when made.

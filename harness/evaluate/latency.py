@@ -1,8 +1,8 @@
 """Choose the inference times that decide which helpers are heard in time.
 
-They come from the paper, a card, the user or a device profile, or are measured. They are fixed
-before a run, so that its own speed changes none of its rows. The times that its answers took are
-recorded beside them.
+They come from the paper, a card or the user, or are measured, or an extension times each answer
+(`harness.runs.timers`). They are fixed before a run, so that its own speed changes none of its
+rows. The times that its answers took are recorded beside them.
 """
 
 import math
@@ -18,9 +18,9 @@ from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
-from harness.evaluate.device import answer_s
 from harness.runs import percentiles
 from harness.runs.records import Answer, AnswerFacts, Latency, Times
+from harness.runs.timers import options
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
 MEASURED = "measured"
@@ -57,14 +57,14 @@ def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
     """Return the ego's latency with the helpers' times replaced by those of their own models.
 
-    Without helpers' latencies it is the ego's. Raises UserError if one goes by tokens on a device.
+    Without helpers' latencies it is the ego's. Raises UserError if one times each answer.
     """
     if not helpers:
         return ego
     if any(each.speeds for each in (ego, *helpers)):
         raise UserError(
-            "a replay of a run with a device profile has that run's times; give --device-profile "
-            "anew, or --latency"
+            "a replay of a run that timed each answer has that run's times; give "
+            f"{' or '.join(options())} anew, or --latency"
         )
     basis = " + ".join(dict.fromkeys(each.basis for each in helpers))
     return replace(
@@ -126,7 +126,7 @@ def inference_s(
     for n, row in enumerate(answers):
         for place, answer in enumerate(row):
             if answer and latency.speeds:
-                seconds[n, place] = answer_s(latency.speed(places[n][place]), answer)
+                seconds[n, place] = latency.answer_s(places[n][place], answer)
             elif answer:
                 turns[n, place], slow[n, place] = answer.turns, answer.slow_s
     if latency.speeds:
@@ -141,9 +141,7 @@ def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int])
     A vehicle with a helper's model takes as long as for any other answer.
     """
     if latency.speeds:
-        return np.array(
-            [answer_s(latency.speed(n), a) for n, a in zip(places, answers, strict=True)]
-        )
+        return np.array([latency.answer_s(n, a) for n, a in zip(places, answers, strict=True)])
     by_place = [latency.fusion_s, *islice(cycle(latency.helper_times_s()), max(places, default=0))]
     seconds = [cast("float", by_place[n]) for n in places]
     return np.array([s * a.turns + a.slow_s for s, a in zip(seconds, answers, strict=True)])

@@ -38,7 +38,7 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
     manifest = run.manifest
     ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
     settings = deciding(manifest.settings)
-    settings = structs.replace(settings, ask="used", latency=None, device_model=None)
+    settings = structs.replace(settings, ask="used", latency=None)
     return Spec(ego, source, (), manifest.seeds, tuple(helpers), settings=settings)
 
 

@@ -134,15 +134,13 @@ def differences(
         return ["episodes.csv has other episodes than run.json says that were selected"], []
     stated, manifest = spec_of(run, source), run.manifest
     check_prompts(run, stated)
-    profile = manifest.device_profile
+    timer = manifest.timer
     ego = replace(stated.ego, card=card_here(stated.ego.card))
-    latency = latencies.as_declared(manifest.latency) if profile is None else None
+    latency = latencies.as_declared(manifest.latency) if timer is None else None
     said = manifest.settings
-    settings = structs.replace(
-        stated.settings, ask=said.ask, device_model=said.device_model, latency=latency
-    )
+    settings = structs.replace(stated.settings, ask=said.ask, latency=latency)
     points = tuple(points_of(run).values())
-    spec = replace(stated, ego=ego, points=points, device_profile=profile, settings=settings)
+    spec = replace(stated, ego=ego, points=points, timer=timer, settings=settings)
     try:
         ours, otherwise = computed(run, spec, out, progress)
     except LacksAnswer as lack:

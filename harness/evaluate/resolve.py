@@ -22,7 +22,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.looks import until
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
-from harness.runs import devices
+from harness.runs import timers
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
@@ -39,14 +39,13 @@ def spec(settings: Settings, source: Source) -> Spec:
     Raises UserError for a name that there is not, or settings that are not allowed together.
     """
     ego, helpers = agents(settings, source.scenario)
-    profile = settings.device_profile
     return Spec(
         ego=ego,
         helpers=helpers,
         source=source,
         seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
-        device_profile=devices.load(profile) if profile else None,
+        timer=timers.chosen(settings),
         settings=settings,
     )
 

@@ -30,7 +30,7 @@ from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
 from harness.dataset.select import drawn
-from harness.evaluate import costs, device, servers, timing
+from harness.evaluate import costs, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -217,15 +217,9 @@ def _walk(
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.decision_points}
         served += asker.served
         answers, more = asker.asked(), world.columns()
-        if spec.device_profile:
-            more = {**more, "helpers_j": device.decided_helpers_j(asker.latency, decided, answers)}
-        decisions = table(decided, more, spec.actions)
-        if spec.device_profile:
-            joules = device.energy(
-                spec.device_profile, asker.latency, spec.points, decisions, answers
-            )
-            decisions = decisions.replace(**joules)
-        tables.append(decisions.rounded())
+        if spec.timer:
+            more = {**more, **spec.timer.columns(asker.latency, decided, answers)}
+        tables.append(table(decided, more, spec.actions).rounded())
         episodes += world.episodes()
     files = run_parts.part_files(
         of_all_seeds(tables, spec.points), episodes, answers.values(), viewers
@@ -613,8 +607,8 @@ def _latency(spec: Spec, begun: RunStart | None, models: Sequence[Backend]) -> L
     """Return the latency that a resumed run began with, or that of a new run."""
     if begun:
         return begun.latency
-    if spec.device_profile:
-        return device.of_device(spec.device_profile, spec.settings.device_model, spec.agents)
+    if spec.timer:
+        return spec.timer.latency(spec.agents)
     declared = latencies.known(spec.settings.latency, spec.agents, models)
     return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
 

@@ -12,13 +12,12 @@ from harness.core.files import bytes_of
 from harness.evaluate.spec import Spec
 from harness.prompts.answer_schema import ROLES, answer_schema
 from harness.radio.profiles import CHANNELS
-from harness.runs import devices
 
 
 def sources(spec: Spec) -> dict[str, bytes]:
     """Return the files that an evaluation was made from, by path in a project: name to bytes.
 
-    They are prompts, answer schemas, cards, channels, networks, schedules and devices. What is in
+    They are prompts, answer schemas, cards, channels, networks, schedules and a timer's. What is in
     no file, such as the card of a hub id or a package's channel, only `run.json` has.
     """
     texts: dict[str, bytes] = {}
@@ -49,8 +48,7 @@ def sources(spec: Spec) -> dict[str, bytes]:
         paths[f"schedules/{point.ask.schedule}.toml"] = SCHEDULES.file(point.ask.schedule)
     for folder, by_name in kept_of(spec.points).items():
         paths |= {f"{folder}/{name}.toml": kept.file for name, kept in by_name.items()}
-    device = spec.device_profile
-    if device and device.name in resources.names("devices") and devices.load(device.name) == device:
-        paths[f"devices/{device.name}.toml"] = resources.find("devices", f"{device.name}.toml")
+    if spec.timer:
+        paths |= spec.timer.files()
     files = {name: bytes_of(path, "text") for name, path in paths.items() if path}
     return dict(sorted((texts | files).items()))

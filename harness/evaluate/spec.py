@@ -22,13 +22,11 @@ from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.costs import Budget
-from harness.evaluate.device import rows_of
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.looks import Until
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs import formats
-from harness.runs.devices import Device
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
@@ -39,6 +37,7 @@ from harness.runs.settings import (
     Settings,
     of_extensions,
 )
+from harness.runs.timers import Timer
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
@@ -118,9 +117,8 @@ class Spec:
     # the agents that answer for the helpers. Helpers take them in turn, in the order in which they
     # were spawned. Empty if the ego's agent answers for the helpers, too
     helpers: tuple[Agent, ...] = ()
-    # the computer that every vehicle has; it replaces `--latency`: the time of an answer follows
-    # from its own tokens. None for no profile
-    device_profile: Device | None = None
+    # what times each answer by itself, in place of `--latency`; None for the latter
+    timer: Timer | None = None
     # all settings as typed, of which `resolve.spec` makes this evaluation; those that fields above
     # hold opened are rewritten to agree with them
     settings: Settings = USUAL
@@ -170,7 +168,8 @@ class Spec:
                     f"--latency {printable(latency)}: {times} times for {len(self.helpers)} helper "
                     "models; give one, or one each"
                 )
-        self._check_device()
+        if self.timer:
+            self.timer.check(self)
         for point in self.points:
             self._check_point(point)
         if until := self.source.until:
@@ -190,21 +189,6 @@ class Spec:
                     f"{flag} {printable(value)}: {printable(self.ego.card.name)} has no weights "
                     f"here (engines {' and '.join(engines)} have); leave it out"
                 )
-
-    def _check_device(self) -> None:
-        if self.device_profile is None:
-            if self.settings.device_model is not None:
-                shown = printable(self.settings.device_model)
-                raise UserError(
-                    f"--device-model {shown} is a device's row; give --device-profile as well"
-                )
-            return
-        if self.settings.latency is not None:
-            raise UserError(
-                f"--device-profile {printable(self.device_profile.name)} says how long answers "
-                f"take, as --latency {printable(self.settings.latency)} does; give one of the two"
-            )
-        rows_of(self.device_profile, self.settings.device_model, self.agents)
 
     def _check_servers(self) -> None:
         served = {agent.card for agent in self.agents if agent.card.server}
@@ -313,6 +297,8 @@ class Spec:
             return f"{name} is no language model and cannot fuse messages"
         if obstacle := contents_of_packages.obstacle(point, self):
             return obstacle
+        if self.timer and (obstacle := self.timer.obstacle(point)):
+            return obstacle
         for part in point.more:
             if obstacle := parts_of_packages.obstacle(part, point, self):
                 return obstacle
@@ -386,10 +372,10 @@ class Spec:
     def asks_all(self) -> bool:
         """Whether all helpers are asked, not only those whose answers a condition uses.
 
-        It is so with `ask = "all"`, with a device profile, which counts the joules of all, and for
-        a driver (`ego_alone`).
+        It is so with `ask = "all"`, with a timer, which counts what all answers cost, and for a
+        driver (`ego_alone`).
         """
-        return self.settings.ask == "all" or self.ego_alone or self.device_profile is not None
+        return self.settings.ask == "all" or self.ego_alone or self.timer is not None
 
     @property
     def frozen(self) -> bool:
@@ -443,7 +429,7 @@ class Spec:
             "schedules": {name: sha256 for name, sha256 in schedules.items() if sha256},
             "kept": kept,
             "seeds": list(self.seeds),
-            "device_profile": msgspec.to_builtins(self.device_profile),
+            "device_profile": self.timer.record() if self.timer else None,
             **{key: settings[name] for key, name in formats.BESIDE.items()},
             "settings": settings,
         }
@@ -466,7 +452,7 @@ class Spec:
                 answer=self.helpers[0].answer,
                 thinking=None if thinking == self.ego.thinking else thinking,
             )
-        first = self.seeds[0]
+        first, by_timer = self.seeds[0], self.timer.settings() if self.timer else {}
         return {
             "model": argument(self.ego.card),
             "engine": None,
@@ -484,7 +470,9 @@ class Spec:
                 for name in ("answer", "thinking", "image", "flip", "sums")
             },
             "letters": self._letters,
-            "device_profile": self.device_profile.name if self.device_profile else None,
+            "device_profile": None,
+            "device_model": None,
+            **by_timer,
             "ties": self.ties,
             "extensions": {name: its.default for name, its in of_extensions().items()}
             | self.settings.extensions,

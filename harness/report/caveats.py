@@ -295,7 +295,7 @@ def moved_system(run: Run) -> Iterator[str]:
 def on_device(run: Run) -> Iterator[str]:
     """Yield each agent whose times and energy are those of another model on the device profile."""
     manifest = run.manifest
-    if (device := manifest.device_profile) is None:
+    if manifest.device_profile is None:
         return
     agents = (manifest.agent(0), *manifest.helpers)
     for agent, speed in zip(agents, manifest.latency.speeds, strict=True):
@@ -304,7 +304,8 @@ def on_device(run: Run) -> Iterator[str]:
             yield (
                 "Times and energy are conditional: the token counts are those of "
                 f"{printable(name, 30)}, the "
-                f"speed is that of {printable(speed.model)} on {printable(device.name)}."
+                f"speed is that of {printable(speed.model)} on "
+                f"{printable(manifest.device_profile['name'])}."
             )
 
 

@@ -24,7 +24,6 @@ from harness.core.places import text
 from harness.dataset.forest import Forest
 from harness.dataset.load import TREES_AT_ONCE, Scene
 from harness.evaluate.agent import in_mode, shown
-from harness.evaluate.device import answer_s
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
@@ -269,10 +268,8 @@ class Details:
         if run.manifest.helpers:
             names = agent["model"]["name"], agent["prompt"]["version"], agent["answer"]
             fields["agent"] = " · ".join(names)
-        if run.manifest.latency.speeds:
-            fields["took_s"] = None if answer.error else answer_s(run.speed(answer), answer)
-        elif run.manifest.helpers:
-            fields["took_s"] = run.seconds(answer)
+        if run.manifest.latency.speeds or run.manifest.helpers:
+            fields["took_s"] = known(run.seconds(answer))
         return {
             **fields,
             "viewer": answer.key,

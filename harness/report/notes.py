@@ -10,6 +10,7 @@ from harness.runs.folder import Run
 from harness.runs.metrics import ALL, written
 from harness.runs.records import Latency, Score, role_word, roles
 from harness.runs.suite import SuiteRun
+from harness.runs.timers import timer
 
 Shown = Run | SuiteRun
 
@@ -57,8 +58,8 @@ def latency_source(latency: Latency) -> str:
         "card": "stated by the model card, not measured here",
         "paper": "the paper's, not measured here",
         "declared": "declared by the user, not measured here",
-        "device": "computed for each answer from its tokens, on a declared device",
-    }[latency.source]
+    }.get(latency.source)
+    source = source or timer(latency.source).how
     if latency.ego_s is None or latency.fusion_s is None:
         return f"{source} ({printable(latency.basis)})"
     by_role = {

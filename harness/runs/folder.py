@@ -28,7 +28,6 @@ from harness.core.memory import uncollected
 from harness.runs import formats
 from harness.runs.answers import Answered, Answers
 from harness.runs.decisions import Decisions, arrow_file
-from harness.runs.devices import Speed
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
 from harness.runs.leading import ANY_TIME, PAIRED
@@ -175,20 +174,9 @@ class Run:
         name = printable(answer.id)
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
 
-    def speed(self, answer: Answer) -> Speed:
-        """Return the token rates of an answer's model on the run's device profile.
-
-        The run must have one.
-        """
-        return self.manifest.latency.speed(self._viewer_place(answer))
-
-    def seconds(self, answer: Answer) -> float | None:
-        """Return the seconds that an answer takes by the run's latency, a repair turn included.
-
-        None if the latency comes from a device profile.
-        """
-        usual_s = self.manifest.latency.seconds(self._viewer_place(answer))
-        return None if usual_s is None else usual_s * answer.turns + answer.slow_s
+    def seconds(self, answer: Answer) -> float:
+        """Return the seconds that an answer takes by the run's latency (`Latency.answer_s`)."""
+        return self.manifest.latency.answer_s(self._viewer_place(answer), answer)
 
     def _viewer_place(self, answer: Answer) -> int:
         """Return the place of an answer's viewer, the ego at 0;

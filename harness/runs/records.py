@@ -3,16 +3,16 @@
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
-from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field
+from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field, structs
 
 from harness.coordination.operating_point import OperatingPoint, questions
 from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
-from harness.runs.devices import Device, Speed
 from harness.runs.settings import Settings
+from harness.runs.timers import Timer, timer
 from harness.world import scenarios
 from harness.world.parameters import DIALS
 from harness.world.scenario import Scenario
@@ -38,6 +38,8 @@ def role_word(role: str) -> str:
     return "fusion" if role == "merge" else role
 
 
+# What the seconds of a latency come from: a model's card, the user, a measurement, the paper.
+SOURCES = ("card", "declared", "measured", "paper")
 ASKED = "~"  # in the key of an answer, before the name of the question where it is another one
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
 MOST_LETTERS = 300  # of a name
@@ -208,11 +210,10 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     They decide which messages arrive within the decision window.
     """
 
-    # `card`, `paper`, `declared` (by the user), `measured`, or `device`: the time of an answer
-    # follows from its own tokens on a declared computer
-    source: Literal["card", "paper", "declared", "measured", "device"]
+    # one of `SOURCES`, or what times each answer by itself, of `timers.TIMERS`
+    source: str
     basis: str  # where the numbers come from
-    # seconds of one inference of the ego; None if the source is `device`, like the next two
+    # seconds of one inference of the ego; None if each answer is timed, like the next two
     ego_s: Seconds | None = None
     # seconds of one inference of a helper; of the first of several helper models
     helper_s: Seconds | None = None
@@ -220,38 +221,45 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     sample: dict[str, Times] = {}  # times of the answers behind a measured latency, by role
     # seconds of each of several helper models; empty if there is only one
     helpers_s: tuple[Seconds, ...] = ()
-    # the speed of each agent, the ego's first, if the source is `device`; else empty
-    speeds: tuple[Speed, ...] = ()
+    # the speed of each agent, the ego's first, if each answer is timed (`Timer.speed`); else empty
+    speeds: tuple[Any, ...] = ()
 
     def __post_init__(self) -> None:
         has_seconds = None not in (self.ego_s, self.helper_s, self.fusion_s)
-        if has_seconds == (self.source == "device") or bool(self.speeds) != (
-            self.source == "device"
-        ):
-            raise ValueError("latency has speeds where its source is device, and else seconds")
+        if has_seconds != (self.source in SOURCES) or bool(self.speeds) == has_seconds:
+            raise ValueError(
+                f"latency has seconds where its source is {', '.join(SOURCES)}, and else speeds"
+            )
+        if self.speeds:
+            of_source = timer(self.source)
+            speeds = tuple(of_source.speed(stated) for stated in self.speeds)
+            structs.force_setattr(self, "speeds", speeds)
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
         """Return the seconds of each helper model, which are assigned to helpers in turn.
 
-        It is empty if the source is a device profile.
+        It is empty if each answer is timed.
         """
         return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
 
-    def speed(self, place: int) -> Speed:
-        """Return the token rates of the viewer with this index, where 0 is the ego.
+    def speed(self, place: int) -> Any:
+        """Return the speed of the viewer with this index, where 0 is the ego.
 
         Helper models are assigned to helpers in turn.
         """
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
-    def seconds(self, place: int) -> Seconds | None:
+    def answer_s(self, place: int, answer: Answer) -> float:
         """Return the seconds of an answer of the viewer with this index, where 0 is the ego.
 
-        None if the source is a device profile, by which they depend on tokens.
+        A repair turn is included. NaN if the answer was timed and the engine failed.
         """
+        if self.speeds:
+            return timer(self.source).answer_s(self.speed(place), answer)
         helpers = self.helper_times_s()
-        return helpers[(place - 1) % len(helpers)] if place and helpers else self.ego_s
+        usual_s = helpers[(place - 1) % len(helpers)] if place and helpers else self.ego_s
+        return cast(float, usual_s) * answer.turns + answer.slow_s
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
@@ -569,7 +577,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     temperature: float
     sampling_seed: int
     latency_source: str | None
-    device_profile: Device | None
+    device_profile: Any
     device_model: str | None
     settings: Settings
     latency: Latency
@@ -594,7 +602,13 @@ class Manifest(Struct, frozen=True, kw_only=True):
         except UserError as error:
             raise UserError(f"run.json of {printable(self.name)}: {error}") from None
 
+    @property
+    def timer(self) -> Timer | None:
+        """What timed each answer of the run; None for others, and for a replay of such a one."""
+        return timer(self.latency.source).recorded(self) if self.latency.speeds else None
+
     def __post_init__(self) -> None:
+        _ = self.timer  # of what a run states
         of_model, of_prompt = ("name", "engine"), ("version", "sha256")
         tables: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
             ("model", self.model, of_model),

@@ -31,7 +31,6 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
-from harness.evaluate import device
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
@@ -224,23 +223,19 @@ class ReplayedRun:
         Column 0 is the ego's, which is unknown if its model is in a cloud.
         """
         manifest = self.run.manifest
-        if manifest.device_profile is None:
+        if manifest.timer is None:
             return np.full((len(scenes), self.vehicles), np.nan)
-        taken = device.vehicles_j(manifest.latency, scenes, self._asker.answers)
-        if point.cloud.round_trip_s is not None or point.cloud.round_trip:
-            taken[:, 0] = np.nan  # the ego's model is in a cloud
-        return taken
+        return manifest.timer.joules(manifest.latency, point, scenes, self._asker.answers)
 
-    def radio_j(self, point: OperatingPoint, heard: Exchange) -> Floats:
-        """Return the joules of the radios for each decision's messages, (n,); NaN where unknown.
+    def energy_j(self, point: OperatingPoint, heard: Exchange, joules: Floats) -> Floats:
+        """Return the joules of each decision, (n,), with those of its answers; NaN where unknown.
 
-        They are known only for a run with a device profile.
+        `joules`, (n, 1 + H), are those of `joules`, and `heard` is what was sent.
         """
-        profile = self.run.manifest.device_profile
-        if profile is None:
+        timer = self.run.manifest.timer
+        if timer is None:
             return np.full(heard.messages.shape, np.nan)
-        sent = (heard.requests + heard.messages).astype(float)
-        return device.radio_j(profile, point, heard.airtime_s, sent)
+        return timer.energy_j(point, heard, joules)
 
     @property
     def spec(self) -> Spec:

@@ -44,7 +44,16 @@ OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
-NAMED = ("channel_models", "contents", "encodings", "families", "readers", "rules", "schedules")
+NAMED = (
+    "channel_models",
+    "contents",
+    "encodings",
+    "families",
+    "readers",
+    "rules",
+    "schedules",
+    "timers",
+)
 Said = tuple[int, str, str]
 Typed = Callable[..., Said]
 Installed = Callable[..., None]

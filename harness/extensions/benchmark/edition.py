@@ -171,7 +171,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ("seeds", m.seeds, parse_seeds(self.seeds)),
             ("latency", m.settings.latency, self.latency),
             ("ties", m.settings.ties, self.ties),
-            ("device profile", m.device_profile and m.device_profile.name, None),
+            ("timer of answers", m.latency.source if m.latency.speeds else None, None),
             ("sums", m.sums, "refuse"),
             ("image", m.image, "own"),
             ("flip", m.flip, False),
@@ -197,7 +197,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
         own = deciding(m.settings)
-        settings = structs.replace(own, latency=self.latency, ties=self.ties, device_model=None)
+        settings = structs.replace(own, latency=self.latency, ties=self.ties)
         return Spec(ego, source, points, parse_seeds(self.seeds), settings=settings)
 
     def _differs(self, what: str, here: str, stated: str) -> UserError:

@@ -72,11 +72,6 @@ class Controlled(Part, frozen=True, kw_only=True):
             return None
         if not run.frozen:
             return f"messages={SHUFFLED} is for frozen scenes; use harness eval"
-        if point.has_fusion_call and run.device_profile:
-            return (
-                "energy is known of messages of the ego's own layout alone; leave "
-                f"--device-profile out, or messages={SHUFFLED}"
-            )
         return None
 
     @property

@@ -14,4 +14,5 @@ EXTENSION = Extension(
     },
     groups={"model device": "List on-board computers, show or check one, or measure energy."},
     spellings={"device": "model device"},
+    adds={"timers": {"device": f"{_HERE}.timer:TIMER"}},
 )

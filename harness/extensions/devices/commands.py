@@ -17,7 +17,7 @@ from harness.core.figures import Unit, known, shown
 
 if TYPE_CHECKING:
     from harness.extensions.devices.fit import Fit
-    from harness.runs.devices import Constant, Device, DeviceRow
+    from harness.extensions.devices.profiles import Constant, Device, DeviceRow
 
 
 MOST_TOKENS = 1_000_000
@@ -34,13 +34,13 @@ Model = typer.Option(
 
 def list_devices(as_json: options.Json = False) -> None:
     """List the device profiles, which --device-profile takes."""
-    from harness.runs import devices
+    from harness.extensions.devices import profiles
 
     def show(name: str, device: "Device") -> None:
         typer.echo(f"{printable(name)} · {', '.join(printable(row.model) for row in device.rows)}")
         typer.echo(f"  {printable(device.description, 78)}")
 
-    echo_each(resources.each(devices.names(), devices.load), as_json, msgspec.to_builtins, show)
+    echo_each(resources.each(profiles.names(), profiles.load), as_json, msgspec.to_builtins, show)
 
 
 def show(
@@ -61,8 +61,8 @@ def show(
     It shows their time and energy, too. The time is that of the ego's own answer,
     without any message. Nothing else runs on the computer.
     """
+    from harness.extensions.devices import profiles
     from harness.extensions.devices.fit import answers_of, declared, fits
-    from harness.runs import devices
     from harness.runs.folder import read
 
     in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
@@ -71,8 +71,8 @@ def show(
         raise UserError(
             f"--window-ms {window_ms:g} is out of range; give more than 0, to {MOST_MS}"
         )
-    device = devices.load(name)
-    rows = [devices.find_row(device, model)] if model else device.rows
+    device = profiles.load(name)
+    rows = [profiles.find_row(device, model)] if model else device.rows
     answers = answers_of(read(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
@@ -150,13 +150,13 @@ def check(
 
     Run it on the device itself. On another machine, the figures show how far the two are apart.
     """
+    from harness.extensions.devices import profiles
     from harness.extensions.devices.fit import held
-    from harness.runs import devices
     from harness.runs.folder import read
     from harness.runs.records import role_word
 
-    device, done = devices.load(name), read(run)
-    row = devices.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
+    device, done = profiles.load(name), read(run)
+    row = profiles.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
     results = held(device, row, done)
     if as_json:
         echo_json(results)
@@ -242,7 +242,7 @@ def measure(
 
 def _origins(device: "Device", rows: "Sequence[DeviceRow]") -> None:
     """Print what the numbers rest on, each source once."""
-    from harness.runs.devices import APART, JOULES, RATES, constants
+    from harness.extensions.devices.profiles import APART, JOULES, RATES, constants
 
     kinds = {"times": (*RATES, "answer_ms"), "J": tuple(JOULES), "GB": ("memory_gb",)}
     sources: dict[str, dict[str, None]] = {head: {} for head in kinds}

@@ -10,9 +10,10 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.statistics import Estimate, episode_interval, rate_interval
-from harness.evaluate.device import tokens
-from harness.runs import devices, percentiles
-from harness.runs.devices import Device, DeviceRow
+from harness.extensions.devices import profiles
+from harness.extensions.devices.profiles import Device, DeviceRow
+from harness.extensions.devices.timer import tokens
+from harness.runs import percentiles
 from harness.runs.folder import Run
 from harness.runs.records import Answer
 
@@ -90,11 +91,11 @@ def answers_of(run: Run) -> Answers:
 
 
 def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: float) -> Fit:
-    speed = devices.speed(device, row)
+    speed = profiles.speed(device, row)
     output = answers.output.get(kind, np.zeros(len(answers.prompt)))
     pairs = list(zip(answers.prompt.tolist(), output.tolist(), strict=True))
-    seconds = np.array([devices.seconds(speed, *pair) for pair in pairs])
-    joules = np.array([devices.joules(speed, *pair) for pair in pairs])
+    seconds = np.array([profiles.seconds(speed, *pair) for pair in pairs])
+    joules = np.array([profiles.joules(speed, *pair) for pair in pairs])
     hits = np.where(np.isnan(seconds), np.nan, (seconds <= window_s).astype(float))
     if answers.episodes is None:
         in_time = Estimate(float(hits[0]), np.nan, np.nan, 1, 0)
@@ -147,8 +148,8 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
 
 
 def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
-    speed, role = devices.speed(device, row), alone[0].role
-    stated = [devices.seconds(speed, *tokens(answer)) for answer in alone]
+    speed, role = profiles.speed(device, row), alone[0].role
+    stated = [profiles.seconds(speed, *tokens(answer)) for answer in alone]
     measured = _median([(answer.seconds, answer) for answer in alone])
     yield Comparison("seconds", role, measured, float(np.median(stated)))
     read, written = list[tuple[float, Answer]](), list[tuple[float, Answer]]()
@@ -157,7 +158,7 @@ def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[C
             read.append((answer.prompt_tokens / answer.first_token_s, answer))
         if answer.token_s:
             written.append((1 / answer.token_s, answer))
-    for name, pairs in zip(devices.RATES, (read, written), strict=True):
+    for name, pairs in zip(profiles.RATES, (read, written), strict=True):
         if pairs:
             value = getattr(speed, name)
             yield Comparison(name, role, _median(pairs), np.nan if value is None else value)

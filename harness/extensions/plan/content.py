@@ -39,8 +39,6 @@ class OfPlan(Content):
                 )
             if not agent.prompt.shows_plans:
                 return f"prompt {agent.prompt.version} cannot show plans; use --prompt v13"
-        if run.device_profile:
-            return "no energy is known of answers to plans; leave --device-profile out"
         return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:

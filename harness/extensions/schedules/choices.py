@@ -23,7 +23,6 @@ from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
-from harness.evaluate.device import helpers_j
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import as_sent
@@ -239,13 +238,12 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
         messages = exchange(point, intents, draws, schedule)
         result = fuse(point, messages, intents, FusionInputs(ties=ties))
         actions.append(result.action.reshape(shape))
-        energy_j = joules[:, 0] + helpers_j(result.infers, joules) + stored.radio_j(point, result)
         of_set = {
             "messages": result.messages,
             "airtime_ms": 1e3 * result.airtime_s,
             "latency_ms": 1e3 * result.latency_s,
             "decisions": np.ones(len(node)),
-            "energy_j": energy_j,
+            "energy_j": stored.energy_j(point, result, joules),
         }
         stacked = np.stack([of_set[name] for name in COSTS], -1)
         costs.append(stacked.reshape(*shape, len(COSTS)))

@@ -14,8 +14,9 @@ from msgspec.structs import replace
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
+from harness.extensions.devices import profiles
 from harness.extensions.devices.fit import answers_of, declared, fits, held
-from harness.runs import devices, folder
+from harness.runs import folder
 
 Said = tuple[int, str, str]
 
@@ -60,8 +61,8 @@ def test_what_is_not_known_is_said(harness: Callable[..., Said]) -> None:
 
 @pytest.mark.slow
 def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
-    told, device = folder.read(alone), devices.load("agx-orin")
-    row = devices.find_row(device, "qwen3-0.6b")
+    told, device = folder.read(alone), profiles.load("agx-orin")
+    row = profiles.find_row(device, "qwen3-0.6b")
     as_read_out, as_written = fits(device, [row], answers_of(told), 0.2)
     egos = [a for a in told.answers if a.role == "ego"]
     took = [a.prompt_tokens / 17277.3 + a.completion_tokens / 162.5 for a in egos]
@@ -78,7 +79,7 @@ def test_a_runs_own_tokens(alone: Path, harness: Callable[..., Said]) -> None:
 def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Said]) -> None:
     told = folder.read(alone)
     egos = [a for a in told.answers if a.role == "ego"]
-    device = devices.load("laptop-cpu")
+    device = profiles.load("laptop-cpu")
     found = {(each.role, each.what): each for each in held(device, device.rows[0], told)}
     answer = found["ego", "seconds"]
     assert answer.measured.value == pytest.approx(np.median([a.seconds for a in egos]))
@@ -107,15 +108,15 @@ def test_a_profile_is_held_against_a_run(alone: Path, harness: Callable[..., Sai
 def test_every_profile_is_listed(harness: Callable[..., Said]) -> None:
     code, out, _ = harness("model", "device", "list")
     assert code == 0
-    assert [line.split(" ·")[0] for line in out.splitlines()[::2]] == devices.names()
+    assert [line.split(" ·")[0] for line in out.splitlines()[::2]] == profiles.names()
     _, out, _ = harness("model", "device", "list", "--json")
-    assert [each["name"] for each in json.loads(out)] == devices.names()
+    assert [each["name"] for each in json.loads(out)] == profiles.names()
 
 
 def test_a_run_without_times_or_tokens_is_refused(small: Dataset, tmp_path: Path) -> None:
     run(spec_of(small, "proxy", points=(POINTS["single-local"],)), tmp_path / "proxy")
     told = folder.read(tmp_path / "proxy")
-    device = devices.load("laptop-cpu")
+    device = profiles.load("laptop-cpu")
     with pytest.raises(UserError, match="has no token counts"):
         answers_of(told)
     with pytest.raises(
@@ -159,13 +160,13 @@ def test_mistakes_are_one_line(
 
 def test_the_law_of_weights_is_off_by_less_than_a_factor_of_1_6() -> None:
     """Between neighbouring rows of the profiles that declare it."""
-    for device in map(devices.load, devices.names()):
+    for device in map(profiles.load, profiles.names()):
         for one, other in zip(device.rows, device.rows[1:], strict=False):
             if not device.scaling or "vl" in one.model + other.model:
                 continue
             for left, right in ((one, other), (other, one)):
-                scaled = devices.find_row(replace(device, rows=(left,)), f"{right.billions:g}b")
-                for rate in devices.RATES:
+                scaled = profiles.find_row(replace(device, rows=(left,)), f"{right.billions:g}b")
+                for rate in profiles.RATES:
                     off = getattr(scaled, rate).value / getattr(right, rate).value
                     assert 1 / 1.6 < off < 1.6
 

@@ -40,7 +40,6 @@ from harness.extensions.schedules.study import (
     compare,
     in_order,
 )
-from harness.runs import devices
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.success import Success
@@ -499,9 +498,11 @@ def test_the_schedule_that_ships_says_what_it_was_learnt_and_tuned_on():
 @pytest.mark.exhaustive
 def test_joules_of_choices_are_those_of_the_runs_decisions(small: Dataset, tmp_path: Path):
     """Read-outs of the model that ships, at the pace of another on a Jetson."""
+    computers = pytest.importorskip("harness.extensions.devices.timer")
+    orin = computers.Computer(computers.profiles.load("agx-orin"), "qwen3-4b")
     spec = spec_of(
         small, "swarm-tiny", answer="readout", limit=1, points=(SIXG,), seeds=(0,),
-        device_profile=devices.load("agx-orin"), device_model="qwen3-4b",
+        timer=orin,
     )  # fmt: skip
     done = run(spec, tmp_path / "run")
     [energy] = [

@@ -25,10 +25,11 @@ from harness.core.errors import Unanswered, UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
-from harness.evaluate.device import answer_j, answer_s, transmit_watts
+from harness.extensions.devices import profiles
+from harness.extensions.devices.profiles import Constant, Device, DeviceRow, Speed
+from harness.extensions.devices.timer import Computer, answer_j, answer_s, transmit_watts
 from harness.radio.channel import Draws
-from harness.runs import devices, folder
-from harness.runs.devices import Constant, Device, DeviceRow, Speed
+from harness.runs import folder
 
 
 def known(value: float) -> Constant:
@@ -92,7 +93,7 @@ def counted(
         monkeypatch.setattr(
             evaluation, "open_backend", lambda *_, **__: Counted({**lines, **(more or {})})
         )
-        options = {"device_profile": DESK, "points": points, "seeds": (0,), **options}
+        options = {"timer": Computer(DESK), "points": points, "seeds": (0,), **options}
         out = tmp_path / digest([point.name for point in points])[:8]
         run(spec_of(one, "swarm-tiny", **options), out)
         return folder.read(out)
@@ -170,7 +171,8 @@ def test_helpers_that_infer_before_they_are_asked_cost_energy_unasked(
 
 def test_a_message_takes_a_frame_at_least(counted: Callable[..., folder.Run]) -> None:
     radio = named_point("mode4")
-    told = counted(CLEAR, radio, device_profile=msgspec.structs.replace(DESK, frame_ms=known(1.5)))
+    framed = msgspec.structs.replace(DESK, frame_ms=known(1.5))
+    told = counted(CLEAR, radio, timer=Computer(framed))
     d = told.decisions
     mj, airtime_ms = (dict(zip(d.labels("condition"), d[name].tolist(), strict=True))
                       for name in ("radio_mj", "airtime_ms"))  # fmt: skip
@@ -189,14 +191,14 @@ def test_a_runs_summary_has_the_energy_of_a_decision(counted: Callable[..., fold
     assert radio.value / 1000 < 0.001 * told.score("clear", "helpers_j").value
     manifest = told.manifest
     assert manifest.latency.source == "device"
-    assert manifest.device_profile == DESK
+    assert manifest.timer == Computer(DESK)
     assert manifest.latency.speeds == (Speed("swarm-tiny", 1000, 100, 0.01, 1),)
 
 
 def test_without_a_device_profile_nothing_is_said_of_energy(
     counted: Callable[..., folder.Run],
 ) -> None:
-    told = counted(ALONE, CLEAR, device_profile=None)
+    told = counted(ALONE, CLEAR, timer=None)
     assert told.score("clear", "energy_j") is None
     assert not {"inference_j", "radio_mj", "busy_ratio"} & set(
         told.path.joinpath("summary.csv").read_text()
@@ -206,7 +208,7 @@ def test_without_a_device_profile_nothing_is_said_of_energy(
 
 def test_another_models_speed_is_said_plainly(counted: Callable[..., folder.Run]) -> None:
     """100 / 500 + 10 / 10 s; joules from 50 W over the rates: 100 x 0.1 + 10 x 5."""
-    told = counted(ALONE, device_model="big")
+    told = counted(ALONE, timer=Computer(DESK, "big"))
     assert told.manifest.latency.basis.startswith(
         "swarm-tiny's answers at the speed of big on desk (F16"
     )
@@ -226,7 +228,7 @@ def test_tokens_that_nobody_counted_are_refused(small: Dataset, tmp_path: Path,
     with pytest.raises(
         UserError, match=r"/v1 has no token counts, so no device profile can time it; use"
     ):
-        run(spec_of(small, "swarm-tiny", device_profile=DESK, points=(ALONE,)), tmp_path / "run")
+        run(spec_of(small, "swarm-tiny", timer=Computer(DESK), points=(ALONE,)), tmp_path / "run")
 
 
 def test_a_repair_turn_counts_with_its_tokens(counted: Callable[..., folder.Run]) -> None:
@@ -262,7 +264,7 @@ def test_more_tokens_are_never_cheaper_or_sooner(
     longer: int,
 ) -> None:  # fmt: skip
     speed = Speed("m", prefill, decode, prompt_j, output_j)
-    for of in (devices.seconds, devices.joules):
+    for of in (profiles.seconds, profiles.joules):
         assert of(speed, read + more, written + longer) >= of(speed, read, written) >= 0
 
 
@@ -299,8 +301,7 @@ def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
         small,
         "swarm-tiny",
         limit=2,
-        device_profile=devices.load("agx-orin"),
-        device_model="qwen3-4b",
+        timer=Computer(profiles.load("agx-orin"), "qwen3-4b"),
     )
     for batch_size in (1, 8):
         run(spec.changed(batch_size=batch_size), tmp_path / str(batch_size))
@@ -312,9 +313,9 @@ def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
-    device, alone = devices.load("agx-orin"), (ALONE,)
+    orin, alone = Computer(profiles.load("agx-orin"), "qwen3-4b"), (ALONE,)
     spec = spec_of(
-        small, "swarm-tiny", answer="readout", limit=1, device_profile=device, device_model="qwen3-4b",
+        small, "swarm-tiny", answer="readout", limit=1, timer=orin,
         points=alone,
     )  # fmt: skip
     run(spec, tmp_path / "run")
@@ -342,7 +343,7 @@ def test_workers_count_a_models_tokens_as_one_process(
     monkeypatch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
     spec = live_spec_of(
         "swarm-tiny", points=(POINTS["6g"],), seeds=(0,), batch_size=4,
-        device_profile=devices.load("agx-orin"), device_model="qwen3-0.6b",
+        timer=Computer(profiles.load("agx-orin"), "qwen3-0.6b"),
     )  # fmt: skip
     one, other = (tmp_path / workers for workers in "12")
     for out in (one, other):
@@ -384,11 +385,11 @@ def test_workers_change_no_row(tmp_path: Path) -> None:
 # -- files -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", devices.names())
+@pytest.mark.parametrize("name", profiles.names())
 def test_every_profile_that_ships_says_what_each_number_is(name: str) -> None:
-    device = devices.load(name)
+    device = profiles.load(name)
     for row in device.rows:
-        each = dict(devices.constants(device, row))
+        each = dict(profiles.constants(device, row))
         if row.memory_gb and device.memory_gb:
             assert row.memory_gb.value < device.memory_gb.value
         if row.answer_ms:
@@ -406,21 +407,21 @@ def test_every_profile_that_ships_says_what_each_number_is(name: str) -> None:
 
 
 def test_what_nobody_states_is_not_known() -> None:
-    thor = devices.load("thor")
-    speed = devices.speed(thor, devices.find_row(thor, "qwen3-4b"))
-    assert devices.seconds(speed, 300, 1) == pytest.approx(300 / 33029.8 + 1 / 73.4)
-    assert np.isnan(devices.joules(speed, 300, 1))
-    h200 = devices.load("h200")
-    assert np.isnan(devices.seconds(devices.speed(h200, h200.rows[0]), 300, 1))
+    thor = profiles.load("thor")
+    speed = profiles.speed(thor, profiles.find_row(thor, "qwen3-4b"))
+    assert profiles.seconds(speed, 300, 1) == pytest.approx(300 / 33029.8 + 1 / 73.4)
+    assert np.isnan(profiles.joules(speed, 300, 1))
+    h200 = profiles.load("h200")
+    assert np.isnan(profiles.seconds(profiles.speed(h200, h200.rows[0]), 300, 1))
 
 
 def test_a_decision_takes_what_its_maker_states_whatever_its_tokens(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nano = devices.load("orin-nano")
-    speed = devices.speed(nano, devices.find_row(nano, "d1-3b"))
-    assert devices.seconds(speed, 300, 0) == devices.seconds(speed, 3000, 40) == 0.05
-    scaled = devices.find_row(nano, "3b")
+    nano = profiles.load("orin-nano")
+    speed = profiles.speed(nano, profiles.find_row(nano, "d1-3b"))
+    assert profiles.seconds(speed, 300, 0) == profiles.seconds(speed, 3000, 40) == 0.05
+    scaled = profiles.find_row(nano, "3b")
     assert "d1-3b" not in scaled.model
     assert scaled.memory_gb is not None
     assert scaled.memory_gb.value == pytest.approx(3 * 4.25 / 8, rel=0.01)
@@ -428,7 +429,7 @@ def test_a_decision_takes_what_its_maker_states_whatever_its_tokens(
     monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))
     out = tmp_path / "run"
     run(
-        spec_of(small, "swarm-tiny", device_profile=nano, device_model="d1-3b", points=(ALONE,)),
+        spec_of(small, "swarm-tiny", timer=Computer(nano, "d1-3b"), points=(ALONE,)),
         out,
     )
     told = folder.read(out)
@@ -440,19 +441,19 @@ def test_a_row_has_an_answers_time_or_rates(project: Path) -> None:
     stated = 'batch_size = 1\nanswer_ms = { value = 5, status = "cited", source = "me" }'
     (project / "mine.toml").write_text(MINE.replace("batch_size = 1", stated))
     with pytest.raises(UserError, match="row of swarm-tiny: give answer_ms or rates, not both"):
-        devices.load("mine")
+        profiles.load("mine")
 
 
 def test_a_size_is_scaled_from_the_nearest_row_where_the_profile_says_how() -> None:
-    agx = devices.load("agx-orin")
-    row, near = devices.find_row(agx, "5b"), devices.find_row(agx, "qwen3-vl-4b")
+    agx = profiles.load("agx-orin")
+    row, near = profiles.find_row(agx, "5b"), profiles.find_row(agx, "qwen3-vl-4b")
     assert row.model == "5b from qwen3-vl-4b"
     assert row.decode_tokens_per_s.value == pytest.approx(near.decode_tokens_per_s.value * 4.4 / 5)
     assert row.decode_tokens_per_s.status == "modelled"
     with pytest.raises(
         UserError, match="unknown model of device profile desk '5b'; known: big, half, swarm"
     ):
-        devices.find_row(DESK, "5b")
+        profiles.find_row(DESK, "5b")
 
 
 MINE = """
@@ -480,8 +481,8 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
     (project / "mine.toml").write_text(MINE)
-    device = devices.load("mine")
-    assert {"mine", "agx-orin"} <= set(devices.names())
+    device = profiles.load("mine")
+    assert {"mine", "agx-orin"} <= set(profiles.names())
     assert device.rows[0].decode_tokens_per_s == Constant(400, "measured", "my desk, today")
 
 
@@ -507,7 +508,7 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
 def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, project: Path) -> None:
     (project / "mine.toml").write_text(MINE.replace(*change, 1))
     with pytest.raises(UserError) as error:
-        devices.load("mine")
+        profiles.load("mine")
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -1,0 +1,317 @@
+"""Time answers on a declared computer by their own tokens, and say what they cost:
+seconds, and joules of a decision.
+
+Which helpers are in time follows from these seconds, never from the speed of this machine. A prefix
+that two prompts share is counted as read each time.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import msgspec
+import numpy as np
+
+from harness.core import resources
+from harness.core.arrays import Bools, Floats
+from harness.core.errors import UserError, printable
+from harness.evaluate.fusion import key_of
+from harness.extensions.devices import profiles
+from harness.extensions.devices.profiles import Constant, Device, DeviceRow, Speed
+from harness.radio.wrapped import innermost
+from harness.runs.records import Answer, Latency, Manifest
+from harness.runs.settings import Settings
+from harness.runs.timers import Timer
+
+if TYPE_CHECKING:
+    from harness.coordination.exchange import Exchange
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.dataset.load import Scene
+    from harness.evaluate.agent import Agent
+    from harness.evaluate.spec import Spec
+    from harness.evaluate.walk import Decided
+
+Answers = Mapping[str, Answer]  # by request id
+SOURCE = "device"  # of a latency
+
+
+@dataclass(frozen=True)
+class Computer(Timer):
+    """A computer in every vehicle, which times each answer by its tokens."""
+
+    option: ClassVar[str] = "--device-profile"
+    how: ClassVar[str] = "computed for each answer from its tokens, on a declared device"
+
+    device: Device | None = None  # its profile; None where nothing is open
+    model: str | None = None  # whose row times all answers; None for the one that gave each
+
+    @property
+    def profile(self) -> Device:
+        assert self.device is not None
+        return self.device
+
+    def opened(self, settings: Settings) -> "Computer | None":
+        if settings.device_profile:
+            return Computer(profiles.load(settings.device_profile), settings.device_model)
+        if settings.device_model is not None:
+            raise UserError(
+                f"--device-model {printable(settings.device_model)} is a device's row; give "
+                f"{self.option} as well"
+            )
+        return None
+
+    def recorded(self, manifest: Manifest) -> "Computer | None":
+        if manifest.device_profile is None:
+            return None
+        return Computer(
+            msgspec.convert(manifest.device_profile, Device), manifest.settings.device_model
+        )
+
+    def speed(self, stated: Any) -> Speed:
+        return stated if isinstance(stated, Speed) else msgspec.convert(stated, Speed)
+
+    def answer_s(self, speed: Speed, answer: Answer) -> float:
+        return answer_s(speed, answer)
+
+    def check(self, run: "Spec") -> None:
+        if run.settings.latency is not None:
+            raise UserError(
+                f"{self._typed} says how long answers take, as --latency "
+                f"{printable(run.settings.latency)} does; give one of the two"
+            )
+        self.rows_of(run.agents)
+
+    def obstacle(self, point: "OperatingPoint") -> str | None:
+        if point.content.of_agents:
+            return f"no energy is known of answers to plans; leave {self.option} out"
+        if point.has_fusion_call and point.elsewhere:
+            return (
+                "energy is known of messages of the ego's own layout alone; leave "
+                f"{self.option} out, or the control"
+            )
+        return None
+
+    def latency(self, agents: "Sequence[Agent]") -> Latency:
+        device, rows, descriptions = self.profile, self.rows_of(agents), []
+        for agent, row in zip(agents, rows, strict=True):
+            own_row = agent.card.name.partition(":")[0] == row.model
+            answerer = agent.card.name
+            if not own_row:
+                answerer += f"'s answers at the speed of {row.model}"
+            timed = ["answer_ms"] if row.answer_ms else profiles.RATES
+            rates = [cast("Constant", getattr(row, name)) for name in timed]
+            origin = "; ".join(dict.fromkeys(f"{rate.status}: {rate.source}" for rate in rates))
+            joules = set()
+            for name, constant in profiles.constants(device, row):
+                if constant and name in profiles.JOULES:
+                    joules.add(constant.status)
+            descriptions.append(
+                f"{answerer} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
+                f"{' and '.join(sorted(joules)) or 'unknown'}; rates {origin})"
+            )
+        speeds = tuple(profiles.speed(device, row) for row in rows)
+        return Latency(SOURCE, "; ".join(dict.fromkeys(descriptions)), speeds=speeds)
+
+    def rows_of(self, agents: "Sequence[Agent]") -> list[DeviceRow]:
+        """Return for each agent the row of the profile that times its answers.
+
+        That is the row of `model`, or if empty that of the agent's own model. Raises UserError if
+        an agent counts no tokens, or the profile has no such row or no rates in it.
+        """
+        rows = []
+        for agent in agents:
+            name = printable(agent.card.name)
+            if not agent.can.language_model:
+                raise UserError(
+                    f"{self._typed}: {name} is no language model and counts no tokens; leave it out"
+                )
+            row = profiles.find_row(self.profile, self.model or agent.card.name.partition(":")[0])
+            for rate in profiles.RATES if row.answer_ms is None else ():
+                if getattr(row, rate) is None:
+                    raise UserError(
+                        f"{self._typed} states no {rate} of {printable(row.model)}, so it cannot "
+                        "time answers; give another device, or another --device-model"
+                    )
+            rows.append(row)
+        return rows
+
+    @property
+    def _typed(self) -> str:
+        return f"{self.option} {printable(self.profile.name)}"
+
+    def settings(self) -> dict[str, Any]:
+        return {"device_profile": self.profile.name, "device_model": self.model}
+
+    def record(self) -> Any:
+        return msgspec.to_builtins(self.profile)
+
+    def files(self) -> Mapping[str, Path]:
+        name = self.profile.name
+        if name not in profiles.names() or profiles.load(name) != self.profile:
+            return {}
+        return {f"devices/{name}.toml": resources.find("devices", f"{name}.toml")}
+
+    def columns(
+        self, latency: Latency, decided: "Sequence[Decided[Scene]]", answers: Answers
+    ) -> dict[str, Floats]:
+        """Return the energy of each decision; NaN where a part of it is unknown.
+
+        `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call, and
+        `helpers_j` the helpers' alone; `radio_mj` millijoules to send the request and the replies;
+        `waiting_j` joules of the ego's computer while it waits for messages and does not infer.
+        """
+        parts = [self._columns_of(latency, part, answers) for part in decided]
+        columns = {}
+        for name in parts[0]:
+            columns[name] = np.concatenate([part[name] for part in parts])
+        return columns
+
+    def _columns_of(
+        self, latency: Latency, part: "Decided[Scene]", answers: Answers
+    ) -> dict[str, Floats]:
+        point, result, at = part.point, part.result, part.due.at
+        vehicles_j = self.joules(latency, point, part.decision_points, answers)[at]
+        of_helpers_j = helpers_j(result.infers, vehicles_j)
+        ego_s = _egos_s(latency, part.decision_points, answers)[at]
+        if _in_cloud(point):
+            ego_s = np.zeros(len(at))
+        # as the table of decisions has them, in milliseconds
+        airtime_ms, decided_ms = result.airtime_s * 1000, result.latency_s * 1000
+        waits_s = (decided_ms - result.fusion_s * 1000) / 1000 - ego_s
+        idle = self.profile.idle_watts
+        idle_watts = idle.value if idle else math.nan
+        calls_j = _calls_j(latency, part, answers)
+        return {
+            "inference_j": vehicles_j[:, 0] + of_helpers_j + calls_j,
+            "helpers_j": of_helpers_j,
+            "radio_mj": 1000 * self._radio_j(point, result, airtime_ms / 1000),
+            "waiting_j": idle_watts * np.maximum(waits_s, 0.0),
+        }
+
+    def joules(
+        self,
+        latency: Latency,
+        point: "OperatingPoint",
+        scenes: "Sequence[Scene]",
+        answers: Answers,
+    ) -> Floats:
+        """Return the joules of each vehicle's answer in n scenes, `(n, 1+H)`, the ego first.
+
+        `answers` are by request id. NaN for an answer that is missing, has no known tokens, or came
+        from a cloud; 0 where there is no vehicle.
+        """
+        joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
+        for n, scene in enumerate(scenes):
+            for place, viewer in enumerate(scene.viewers):
+                answer = answers.get(f"{scene.id}/{viewer}")
+                joules[n, place] = answer_j(latency.speed(place), answer) if answer else np.nan
+        if _in_cloud(point):
+            joules[:, 0] = np.nan
+        return joules
+
+    def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
+        radio_j = self._radio_j(point, heard, heard.airtime_s)
+        return np.asarray(joules[:, 0] + helpers_j(heard.infers, joules) + radio_j)
+
+    def _radio_j(self, point: "OperatingPoint", heard: "Exchange", airtime_s: Floats) -> Floats:
+        """Return the joules to send the messages of each decision, `(n,)`, by their time on air.
+
+        Where the channel has only bits and a bandwidth, each message takes at least one frame of
+        the device profile. A physical radio counts its own frames, with headers.
+        """
+        frame_ms = self.profile.frame_ms
+        if frame_ms is not None and not point.physical:
+            sent = (heard.requests + heard.messages).astype(float)
+            airtime_s = np.maximum(airtime_s, sent * frame_ms.value / 1000)
+        return transmit_watts(self.profile, point) * airtime_s
+
+
+TIMER = Computer()
+
+
+def answer_s(speed: Speed, answer: Answer) -> float:
+    """Return the seconds of one answer by its tokens, with its repair turn; NaN if it failed.
+
+    Raises UserError if the answer has no token counts and `speed` needs them.
+    """
+    if speed.answer_s is not None:
+        if answer.error is not None:
+            return math.nan
+        return speed.answer_s * answer.turns + answer.slow_s
+    return profiles.seconds(speed, *tokens(answer)) + answer.slow_s
+
+
+def answer_j(speed: Speed, answer: Answer) -> float:
+    """Return the joules of one answer; NaN if it failed, or its time does not go by tokens.
+
+    Raises UserError if the answer has no token counts and `speed` needs them.
+    """
+    return math.nan if speed.answer_s is not None else profiles.joules(speed, *tokens(answer))
+
+
+def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
+    """Return the joules of all helpers that infer for each decision, `(n,)`.
+
+    `infers`, `(n, H)`, says who does; columns beyond the vehicles (an attacker's further voices)
+    run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's answer, the ego first.
+    """
+    count = min(infers.shape[1], vehicles.shape[1] - 1)
+    own = vehicles[:, 1 : 1 + count]
+    return np.asarray(np.sum(np.where(infers[:, :count], own, 0.0), axis=1))
+
+
+def tokens(answer: Answer) -> tuple[float, float]:
+    """Return an answer's prompt and completion tokens, of both turns if it has a repair turn.
+
+    NaN if the engine failed. Raises UserError if the answer has no token counts otherwise.
+    """
+    if answer.prompt_tokens is not None and answer.completion_tokens is not None:
+        return answer.prompt_tokens, answer.completion_tokens
+    if answer.error is None:
+        raise UserError(
+            f"answer {printable(answer.id)} has no token counts, so no device profile can time it; "
+            "use --latency"
+        )
+    return math.nan, math.nan
+
+
+def transmit_watts(device: Device, point: "OperatingPoint") -> float:
+    """Return the electric watts of a sending radio; NaN if the device profile states no power.
+
+    From the channel's transmit power in dBm if it has one, else the profile's, and the amplifier's
+    efficiency.
+    """
+    if device.transmit_dbm is None or device.amplifier_efficiency is None:
+        return math.nan
+    dbm = float(getattr(innermost(point.channel), "power_dbm", device.transmit_dbm.value))
+    return 10 ** ((dbm - 30) / 10) / device.amplifier_efficiency.value
+
+
+def _in_cloud(point: "OperatingPoint") -> bool:
+    """Return whether the ego's model is in a cloud, whose computer nobody declares."""
+    return point.cloud.round_trip_s is not None or bool(point.cloud.round_trip)
+
+
+def _egos_s(latency: Latency, scenes: "Sequence[Scene]", answers: Answers) -> Floats:
+    """Return the seconds of the ego's own answer in each scene, (n,)."""
+    egos = [answers[f"{scene.id}/{scene.viewers[0]}"] for scene in scenes]
+    return np.array([answer_s(latency.speeds[0], ego) for ego in egos])
+
+
+def _calls_j(latency: Latency, part: "Decided[Scene]", answers: Answers) -> Floats:
+    """Return the joules of each decision's fusion call, (n,); 0 without one."""
+    point, heard = part.point, part.result.asked & part.result.on_time
+    joules = np.zeros(len(heard))
+    if not point.has_fusion_call:
+        return joules
+    for row in np.flatnonzero(heard.any(axis=1)).tolist():
+        scene = part.decision_points[part.due.at[row]]
+        senders = []
+        for place in np.flatnonzero(heard[row]).tolist():
+            attacks = bool(part.said.attackers[row, place])
+            senders.append(key_of(scene.viewers[1 + place], point.rewrites, attacks))
+        call = answers["/".join((scene.id, "+".join((scene.viewers[0], *senders))))]
+        joules[row] = answer_j(latency.speeds[0], call)
+    return joules

@@ -1,0 +1,127 @@
+"""What times each answer of a run by itself, in place of `--latency`.
+
+An extension that ships adds one by `adds={"timers": {NAME: "module:TIMER"}}`; NAME is the source of
+the latency of the runs that it times.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
+from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.plugins import Plugins
+
+if TYPE_CHECKING:
+    from harness.coordination.exchange import Exchange
+    from harness.coordination.operating_point import OperatingPoint
+    from harness.runs.records import Answer, Latency, Manifest
+    from harness.runs.settings import Settings
+
+
+class Timer(ABC):
+    """Times each answer of a run, and says what its decisions cost; frozen.
+
+    The one that is registered has nothing open: it opens others, and knows speeds.
+    """
+
+    option: ClassVar[str]  # what is typed to choose it
+    how: ClassVar[str]  # where its times come from, for people
+
+    @abstractmethod
+    def opened(self, settings: "Settings") -> "Timer | None":
+        """Return the one that the settings of a run choose; None if they choose none."""
+
+    @abstractmethod
+    def recorded(self, manifest: "Manifest") -> "Timer | None":
+        """Return the one that a run states; None if it has another's answers, and their times.
+
+        Raises ValueError if it states none that can be read.
+        """
+
+    @abstractmethod
+    def speed(self, stated: Any) -> Any:
+        """Return how fast an agent answers, as a run states it. Raises ValueError for no speed."""
+
+    @abstractmethod
+    def answer_s(self, speed: Any, answer: "Answer") -> float:
+        """Return the seconds of one answer, a repair turn included; NaN if the engine failed.
+
+        Raises UserError if the answer does not say enough.
+        """
+
+    @abstractmethod
+    def check(self, run: Any) -> None:
+        """Raise UserError for what of a run, a `Spec`, it does not go with."""
+
+    @abstractmethod
+    def obstacle(self, point: "OperatingPoint") -> str | None:
+        """Return why a condition cannot be played with it, and what to do; None if it can."""
+
+    @abstractmethod
+    def latency(self, agents: Sequence[Any]) -> "Latency":
+        """Return the latency of a run with these agents, the ego's first."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that choose it, by name."""
+
+    @abstractmethod
+    def record(self) -> Any:
+        """Return what a run keeps of it, as plain values."""
+
+    @abstractmethod
+    def files(self) -> Mapping[str, Path]:
+        """Return the files that it is made of by their path in a project."""
+
+    @abstractmethod
+    def columns(
+        self, latency: "Latency", decided: Sequence[Any], answers: Mapping[str, "Answer"]
+    ) -> dict[str, Floats]:
+        """Return further columns (n,) of decisions (`Decided`), by name and in their order."""
+
+    @abstractmethod
+    def joules(
+        self,
+        latency: "Latency",
+        point: "OperatingPoint",
+        scenes: Sequence[Any],
+        answers: Mapping[str, "Answer"],
+    ) -> Floats:
+        """Return the joules of each vehicle's answer, (n, 1+H), the ego first; NaN if unknown."""
+
+    @abstractmethod
+    def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
+        """Return the joules of decisions, (n,), without those of a fusion call, by these answers'
+        (n, 1+H).
+        """
+
+
+TIMERS = Plugins[Timer]("swarmdrive.timers", Timer, {})
+
+
+def timer(source: str) -> Timer:
+    """Return what times answers, by the source of a latency.
+
+    Raises ValueError if there is none of this name, and UserError if its extension is gone.
+    """
+    if TIMERS.is_ours(source):
+        return TIMERS[source]
+    if owner := owner_of_plugin("timers", source):
+        raise UserError(f"what timed the answers of a run, {source}, is {part_of(owner)}")
+    raise ValueError(f"nothing of the name {printable(source)} times answers")
+
+
+def chosen(settings: "Settings") -> Timer | None:
+    """Return what the settings of a run choose to time its answers; None for its latency."""
+    for name in filter(TIMERS.is_ours, TIMERS):
+        if opened := TIMERS[name].opened(settings):
+            return opened
+    return None
+
+
+def options() -> list[str]:
+    """Return what is typed to choose each timer."""
+    return [TIMERS[name].option for name in TIMERS if TIMERS.is_ours(name)]
