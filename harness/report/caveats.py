@@ -292,23 +292,6 @@ def moved_system(run: Run) -> Iterator[str]:
         )
 
 
-def on_device(run: Run) -> Iterator[str]:
-    """Yield each agent whose times and energy are those of another model on the device profile."""
-    manifest = run.manifest
-    if manifest.device_profile is None:
-        return
-    agents = (manifest.agent(0), *manifest.helpers)
-    for agent, speed in zip(agents, manifest.latency.speeds, strict=True):
-        name = str(agent["model"]["name"])
-        if name.partition(":")[0] != speed.model:
-            yield (
-                "Times and energy are conditional: the token counts are those of "
-                f"{printable(name, 30)}, the "
-                f"speed is that of {printable(speed.model)} on "
-                f"{printable(manifest.device_profile['name'])}."
-            )
-
-
 def beyond_sources(run: Run) -> Iterator[str]:
     """Yield each condition with radio parameters outside its channel model's validated range."""
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):

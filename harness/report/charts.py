@@ -46,7 +46,6 @@ BASE: Spec = {"$schema": "https://vega.github.io/schema/vega-lite/v5.json", "wid
 REACTION_MS = (150, 250)  # the paper's reaction window in an urban intersection
 VERDICTS = {"strict": [GOOD], "recovered": [LATE], "failed": FAILURES}
 REPLIES = {"on time": GOOD, "late": LATE, "lost": BAD}
-ENERGIES = {"ego's inference": ROLES["ego"], "helpers' inference": ROLES["helper"], "radios": BAD}
 TIMES = {
     "inference": PALE,
     "reply on time": GOOD,

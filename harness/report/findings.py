@@ -72,7 +72,6 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
         each(caveats.moved_system),
         each(caveats.by_letter),
         each(caveats.beyond_sources),
-        each(caveats.on_device),
         each(caveats.looked_at),
         each(ignores_input),
         each(unchecked),
@@ -100,7 +99,7 @@ OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
     Kind.PACE: [notes.pace],
     Kind.ORIGIN: [
         notes.latency,
-        notes.energy,
+        notes.of_extensions,
         notes.answer_times,
         notes.cost,
         notes.cached,

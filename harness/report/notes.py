@@ -2,10 +2,11 @@
 `findings` has them in their order.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
-from harness.core.errors import printable
-from harness.core.figures import PLAIN, Unit
+from harness.core.errors import UserError, printable
+from harness.core.figures import Unit
+from harness.core.plugins import Plugins, texts
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, written
 from harness.runs.records import Latency, Score, role_word, roles
@@ -13,6 +14,8 @@ from harness.runs.suite import SuiteRun
 from harness.runs.timers import timer
 
 Shown = Run | SuiteRun
+# What extensions say of a run's or a suite's figures: lines for people.
+NOTES: Plugins[Callable[[Shown], Iterable[str]]] = Plugins("swarmdrive.notes", Callable, {})
 
 
 def pace(run: Shown) -> Iterator[str]:
@@ -74,20 +77,13 @@ def latency_source(latency: Latency) -> str:
     return f"{', '.join(times)}; {source} ({printable(latency.basis)})"
 
 
-def energy(run: Shown) -> Iterator[str]:
-    """Yield a line for each condition on the energy of a decision: in all, of helpers, of radios.
-
-    It yields nothing without a device profile, which states joules a token.
-    """
-    for name in run.conditions:
-        total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
-        radio = run.score(name, "radio_mj")
-        if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
-            joules = PLAIN.interval(total.value, total.low, total.high)
-            yield (
-                f"{printable(name)}: {joules} J per decision, of which the helpers' inference "
-                f"takes {helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
-            )
+def of_extensions(run: Shown) -> Iterator[str]:
+    """Yield what extensions say of the figures; one that fails says so itself."""
+    for name in NOTES:
+        try:
+            yield from NOTES.ask(name, lambda of: texts(of(run)))
+        except UserError as error:
+            yield str(error)
 
 
 def answer_times(run: Shown) -> Iterator[str]:

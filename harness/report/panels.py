@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
+from harness.core.plugins import Plugins
 from harness.core.statistics import rate_interval
 from harness.parsing.status import Status
 from harness.report import charts
@@ -40,6 +41,20 @@ class Panel:
     title: str  # what is drawn over what
     caption: str  # how to read it, and what it is conditional on
     spec: dict[str, Any]  # Vega-Lite
+
+
+@dataclass(frozen=True)
+class AddedPanel:
+    """One chart that an extension which ships adds, as `adds={"panels": ...}`; see `Panel`."""
+
+    part: Part
+    title: str
+    caption: str
+    rows: Callable[[Run], Table]  # what is drawn of a run; nothing to draw if empty
+    spec: Callable[[Table], dict[str, Any]]  # of the rows of all runs
+
+
+PANELS = Plugins[AddedPanel]("swarmdrive.panels", AddedPanel, {})
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
@@ -147,20 +162,10 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )
-    if rows := joined(energies):
-        yield Panel(
-            "energy",
-            "communication",
-            "Energy of a decision",
-            "Joules of inference on the declared device and of the radios, as means over "
-            "decisions; the interval is that of the total, over episodes. All helpers in the "
-            "radius infer from the start, asked or not; with on_demand=true those alone that are "
-            "asked. If the radios' part is too small to see, cooperation costs energy because "
-            "helpers infer, not because they transmit.",
-            charts.stacked(
-                rows, "condition", "part", charts.ENERGIES, "J per decision", amount="joules"
-            ),
-        )
+    for name in filter(PANELS.is_ours, PANELS):
+        added = PANELS[name]
+        if rows := joined(added.rows):
+            yield Panel(name, added.part, added.title, added.caption, added.spec(rows))
     if rows := joined(arrivals):
         yield Panel(
             "arrivals",
@@ -332,32 +337,6 @@ def replies(run: Run) -> Table:
             for reply, n in count.items()
             if n
         ]
-    return rows
-
-
-def energies(run: Run) -> Table:
-    """Return the mean joules of a decision by condition: ego's inference, helpers' and radios.
-
-    Every row has the total with its interval; conditions with an unknown part are left out.
-    """
-    rows = []
-    for condition in run.conditions:
-        total, helpers = run.score(condition, "energy_j"), run.score(condition, "helpers_j")
-        radio = run.score(condition, "radio_mj")
-        if not (total and helpers and radio):
-            continue
-        of_radio, of_helpers = (radio.value or 0.0) / 1000, helpers.value or 0.0
-        of_ego = (total.value or 0.0) - of_helpers - of_radio
-        of_total = {
-            "total_j": total.value,
-            "low": total.low,
-            "high": total.high,
-            "n": total.n,
-            "interval": total.interval,
-        }
-        parts = zip(charts.ENERGIES, (of_ego, of_helpers, of_radio), strict=True)
-        for part, joules in parts:
-            rows.append({"condition": condition, "part": part, "joules": joules, **of_total})
     return rows
 
 

@@ -20,6 +20,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import opened, replacing
 from harness.runs import formats
 from harness.runs.records import Decision, Message
+from harness.runs.timers import added_columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 LABEL = pa.dictionary(pa.int32(), pa.string())
 WHOLE, FLAG, NUMBER = pa.int64(), pa.bool_(), pa.float64()
 # Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
+# What times answers may add some (`timers.added_columns`).
 COLUMNS = {
     "scene": LABEL,
     "episode": WHOLE,
@@ -41,10 +43,6 @@ COLUMNS = {
     "reply_bits": NUMBER,
     "airtime_ms": NUMBER,
     "busy_ratio": NUMBER,
-    "inference_j": NUMBER,
-    "helpers_j": NUMBER,
-    "radio_mj": NUMBER,
-    "waiting_j": NUMBER,
     "own_failed": FLAG,
     "triggered": FLAG,
     "entropy_nats": NUMBER,
@@ -72,13 +70,9 @@ COLUMNS = {
     "agent": LABEL,
     "broke_word": FLAG,
 }
-# A file has no such column if all its values are unknown.
+# A file has no such column, and none that was added, if all its values are unknown.
 OPTIONAL = (
     "busy_ratio",
-    "inference_j",
-    "helpers_j",
-    "radio_mj",
-    "waiting_j",
     "miss",
     "false_alarm",
     "ttc_s",
@@ -110,14 +104,11 @@ DECIMALS = {  # enough for every figure, and few enough to be the same on every 
     "fused": 6,
     "airtime_ms": 6,
     "busy_ratio": 6,
-    "inference_j": 6,
-    "helpers_j": 6,
-    "radio_mj": 6,
-    "waiting_j": 6,
     "arrival_ms": 3,
     "weight": 6,
     "trust": 6,
 }
+DECIMALS_ADDED = 6
 
 # bytes of a cell at most, before compression, and of what all files have
 CELL, SLACK = 256, 1 << 26
@@ -130,7 +121,10 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 
     `helpers` is the greatest number of messages in a decision.
     """
-    columns = list(COLUMNS.items())
+    columns, added = [], added_columns()
+    for name, kind in COLUMNS.items():
+        columns.append((name, kind))
+        columns += [(each, NUMBER) for each, behind in added.items() if behind == name]
     for name, kind in OF_ACTIONS.items():
         columns += [(f"{name}_{action}", kind) for action in actions]
     for n in range(1, helpers + 1):
@@ -306,9 +300,10 @@ class Decisions:
         return Decisions(table, self.actions, self.helpers)
 
     def rounded(self) -> "Decisions":
+        known = {**DECIMALS, **dict.fromkeys(added_columns(), DECIMALS_ADDED)}
         decimals = {
             column: digits
-            for name, digits in DECIMALS.items()
+            for name, digits in known.items()
             for column in self.table.column_names
             if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
         }
@@ -327,7 +322,7 @@ class Decisions:
         return data.getvalue()
 
     def _write(self, target: Path | BytesIO) -> None:
-        unknown = [name for name in OPTIONAL if self.table[name].null_count == len(self)]
+        unknown = [name for name in _optional() if self.table[name].null_count == len(self)]
         _write(target, [self], schema(self.actions, self.helpers), unknown)
 
     @classmethod
@@ -347,9 +342,8 @@ class Decisions:
             helpers = _helpers(there)
             expected = schema(actions, helpers)
             missing = [name for name in expected.names if name not in there]
-            if lacking := [
-                name for name in missing if re.sub(r"_\d+$", "", name) not in formats.COLUMNS
-            ]:
+            may_lack = {*formats.COLUMNS, *added_columns()}
+            if lacking := [name for name in missing if re.sub(r"_\d+$", "", name) not in may_lack]:
                 raise ValueError(f"it lacks {', '.join(lacking)}")
             wanted = [name for name in expected.names if name in there]
             if (
@@ -392,10 +386,15 @@ class DecisionFiles:
         """
         columns = [set(pq.read_schema(arrow_file(file)).names) for file in self.files]
         helpers = max(_helpers(names) for names in columns)
-        unknown = set(OPTIONAL).difference(*columns)
+        unknown = set(_optional()).difference(*columns)
         with replacing(path) as part:
             decisions = (Decisions.read(file, self.actions) for file in self.files)
             _write(part, decisions, schema(self.actions, helpers), unknown)
+
+
+def _optional() -> list[str]:
+    """Return the columns that a file lacks if all their values are unknown."""
+    return [*OPTIONAL, *added_columns()]
 
 
 def _bytes(described: pq.FileMetaData, names: Collection[str]) -> int:

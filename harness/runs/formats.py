@@ -144,10 +144,6 @@ ANSWER: Mapping[str, Added] = {
 COLUMNS: Mapping[str, Added] = {
     "trust": Added("2026-11-23", None, "rules that judge helpers"),
     "attacker": Added("2026-11-23", None, "attacks"),
-    **dict.fromkeys(
-        ("inference_j", "helpers_j", "radio_mj", "waiting_j"),
-        Added("2026-11-23", None, "energy; also missing without a device profile"),
-    ),
     "busy_ratio": Added(
         "2026-11-23", None, "load of the channel; also missing where it is not known"
     ),

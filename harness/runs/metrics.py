@@ -62,7 +62,7 @@ ONE_OPTIMAL = "decisions_one_optimal"
 PERCENTILES = (50, 95, 99)
 ALL = "all"  # the condition of a figure that is the same in all of them
 MS, SECONDS, METRES = Unit("ms"), Unit("s", 2), Unit("m")
-JOULES, NATS = Unit("J", 2), Unit("nats", 3)
+NATS = Unit("nats", 3)
 COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 
@@ -112,6 +112,8 @@ class Metric:
     # whether another has taken its place: tables and, where it is still computed, comparisons keep
     # it, and pages leave it out
     superseded: bool = False
+    # of an extension that ships: the metric behind whose rows its own stand
+    behind: str = ""
 
     def __post_init__(self) -> None:
         if not self.label:
@@ -155,7 +157,17 @@ class Metrics(Plugins[Metric]):
         """
         of_answers = {metric.name: metric for metric in _of_answers(roles())}
         before = takewhile(lambda name: name not in of_answers, self.built_in)
-        return {**{name: self.built_in[name] for name in before}, **of_answers, **self.built_in}
+        core = {**{name: self.built_in[name] for name in before}, **of_answers, **self.built_in}
+        of_extensions = [super(Metrics, self).__getitem__(name) for name in self._shipped()]
+        ordered: dict[str, Metric] = {}
+        for name, metric in core.items():
+            ordered[name] = metric
+            ordered |= {each.name: each for each in of_extensions if each.behind == name}
+        return ordered
+
+    def _shipped(self) -> list[str]:
+        entries = self._entries()
+        return [name for name in entries if self.is_ours(name) and name not in self.built_in]
 
     def __getitem__(self, name: str) -> Metric:
         return self.own[name] if name in self.own else super().__getitem__(name)
@@ -675,43 +687,6 @@ BUILT_IN = (
         optional=True,
     ),
     Metric(
-        "energy_j",
-        "energy of a decision: inference of the ego, of the helpers that infer and of a "
-        "fusion call, and their radios; known only with a device profile",
-        JOULES,
-        "lower",
-        label="energy",
-        decisions=lambda d: d["inference_j"] + d["radio_mj"] / 1000,
-        optional=True,
-    ),
-    Metric(
-        "helpers_j",
-        "energy of a decision: the part of the helpers' inference",
-        JOULES,
-        "lower",
-        label="helpers",
-        decisions=_column("helpers_j"),
-        optional=True,
-    ),
-    Metric(
-        "radio_mj",
-        "energy of a decision: the part of the radios",
-        Unit("mJ", 3),
-        "lower",
-        label="radio",
-        decisions=_column("radio_mj"),
-        optional=True,
-    ),
-    Metric(
-        "waiting_j",
-        "energy that the ego's computer draws while it waits for messages; not part of energy_j",
-        JOULES,
-        "lower",
-        label="waiting",
-        decisions=_column("waiting_j"),
-        optional=True,
-    ),
-    Metric(
         LATENCY,
         "time from the start of a decision to the end of the exchange and of fusion, with all "
         "inference",
@@ -1059,7 +1034,7 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
     """Return a metric's values, (n,). Those of a package that fails are unknown,
     and a line says so.
     """
-    if metric is METRICS.built_in.get(metric.name):
+    if metric is METRICS.own.get(metric.name):
         return values()
     what = f"metric {printable(metric.name)} of a package"
     try:

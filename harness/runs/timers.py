@@ -29,6 +29,9 @@ class Timer(ABC):
 
     option: ClassVar[str]  # what is typed to choose it
     how: ClassVar[str]  # where its times come from, for people
+    # the columns that it adds to a decision, each with the one behind which it stands: numbers,
+    # null where unknown, in a file only where some are known
+    adds: ClassVar[Mapping[str, str]] = {}
 
     @abstractmethod
     def opened(self, settings: "Settings") -> "Timer | None":
@@ -80,7 +83,7 @@ class Timer(ABC):
     def columns(
         self, latency: "Latency", decided: Sequence[Any], answers: Mapping[str, "Answer"]
     ) -> dict[str, Floats]:
-        """Return further columns (n,) of decisions (`Decided`), by name and in their order."""
+        """Return what it `adds` to decisions (`Decided`) in their order, (n,) each."""
 
     @abstractmethod
     def joules(
@@ -116,12 +119,24 @@ def timer(source: str) -> Timer:
 
 def chosen(settings: "Settings") -> Timer | None:
     """Return what the settings of a run choose to time its answers; None for its latency."""
-    for name in filter(TIMERS.is_ours, TIMERS):
-        if opened := TIMERS[name].opened(settings):
+    for each in _timers():
+        if opened := each.opened(settings):
             return opened
     return None
 
 
 def options() -> list[str]:
     """Return what is typed to choose each timer."""
-    return [TIMERS[name].option for name in TIMERS if TIMERS.is_ours(name)]
+    return [each.option for each in _timers()]
+
+
+def added_columns() -> dict[str, str]:
+    """Return the columns that timers add to decisions, each with the one behind which it stands."""
+    columns: dict[str, str] = {}
+    for each in _timers():
+        columns |= each.adds
+    return columns
+
+
+def _timers() -> list[Timer]:
+    return [TIMERS[name] for name in TIMERS if TIMERS.is_ours(name)]

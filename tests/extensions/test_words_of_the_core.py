@@ -36,6 +36,7 @@ ORDINARY = {
     "decide": "what vehicles do",
     "device": "where an engine runs a model, and what is no file",
     "devices": "meters' of a machine, and the folder of their files",
+    "energy": "of a bit, of what meters count, and what a timer may say of decisions",
     "env": "of highway-env, and a variable of the shell",
     "environment": "one of highway-env, and a variable of the shell",
     "environments": "those of highway-env",

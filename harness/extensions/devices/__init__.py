@@ -14,5 +14,16 @@ EXTENSION = Extension(
     },
     groups={"model device": "List on-board computers, show or check one, or measure energy."},
     spellings={"device": "model device"},
-    adds={"timers": {"device": f"{_HERE}.timer:TIMER"}},
+    adds={
+        "timers": {"device": f"{_HERE}.timer:TIMER"},
+        "metrics": {
+            "energy_j": f"{_HERE}.metrics:ENERGY",
+            "helpers_j": f"{_HERE}.metrics:HELPERS",
+            "radio_mj": f"{_HERE}.metrics:RADIO",
+            "waiting_j": f"{_HERE}.metrics:WAITING",
+        },
+        "panels": {"energy": f"{_HERE}.page:PANEL"},
+        "caveats": {"device": f"{_HERE}.page:caveats"},
+        "notes": {"energy": f"{_HERE}.page:notes"},
+    },
 )

@@ -43,6 +43,9 @@ class Computer(Timer):
 
     option: ClassVar[str] = "--device-profile"
     how: ClassVar[str] = "computed for each answer from its tokens, on a declared device"
+    adds: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("inference_j", "helpers_j", "radio_mj", "waiting_j"), "busy_ratio"
+    )
 
     device: Device | None = None  # its profile; None where nothing is open
     model: str | None = None  # whose row times all answers; None for the one that gave each

@@ -30,6 +30,9 @@ from harness.extensions.devices.profiles import Constant, Device, DeviceRow, Spe
 from harness.extensions.devices.timer import Computer, answer_j, answer_s, transmit_watts
 from harness.radio.channel import Draws
 from harness.runs import folder
+from harness.runs.decisions import COLUMNS
+from harness.runs.metrics import METRICS
+from harness.runs.timers import added_columns
 
 
 def known(value: float) -> Constant:
@@ -250,6 +253,20 @@ def test_a_radio_sends_with_the_channels_power_where_it_has_one() -> None:
         assert transmit_watts(DESK, named_point(radio)) == pytest.approx(0.1 / 0.5)
     silent = msgspec.structs.replace(DESK, amplifier_efficiency=None)
     assert np.isnan(transmit_watts(silent, named_point("6g")))
+
+
+def test_energy_that_is_not_known_is_refused_before_anything_is_asked(small: Dataset) -> None:
+    shuffled = AGAIN.changed(messages="shuffled")
+    with pytest.raises(UserError, match="condition again: energy is known of messages of the ego"):
+        spec_of(small, "swarm-tiny", timer=Computer(DESK), points=(shuffled,))
+
+
+def test_columns_and_metrics_of_energy_stand_behind_what_is_there() -> None:
+    assert {*added_columns()} == {"inference_j", "helpers_j", "radio_mj", "waiting_j"}
+    assert {*added_columns().values()} <= {*COLUMNS}
+    names = list(METRICS.own)
+    at = names.index("busy_ratio")
+    assert names[at + 1 : at + 5] == ["energy_j", "helpers_j", "radio_mj", "waiting_j"]
 
 
 # -- what must always hold -------------------------------------------------------------------------

@@ -1,0 +1,91 @@
+"""What a run's page says of a declared computer: a chart of energy, and whose speed it is."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from harness.core.errors import printable
+from harness.core.figures import PLAIN
+from harness.report import charts
+from harness.report.drawing.colours import BAD, ROLES
+from harness.report.notes import Shown
+from harness.report.panels import AddedPanel, Table
+from harness.runs.folder import Run
+from harness.runs.records import Manifest
+
+# Who takes joules, and the colour of each.
+PARTS = {
+    "ego's inference": ROLES["ego"],
+    "helpers' inference": ROLES["helper"],
+    "radios": BAD,
+}
+
+
+def caveats(manifest: Manifest) -> Iterator[str]:
+    """Yield each agent whose times and joules are those of another model."""
+    if manifest.device_profile is None:
+        return
+    agents = (manifest.agent(0), *manifest.helpers)
+    for agent, speed in zip(agents, manifest.latency.speeds, strict=True):
+        name = str(agent["model"]["name"])
+        if name.partition(":")[0] != speed.model:
+            yield (
+                "Times and energy are conditional: the token counts are those of "
+                f"{printable(name, 30)}, the speed is that of {printable(speed.model)} on "
+                f"{printable(manifest.device_profile['name'])}."
+            )
+
+
+def notes(run: Shown) -> Iterator[str]:
+    """Yield what a decision takes in each condition; nothing without a device profile."""
+    for name in run.conditions:
+        total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
+        radio = run.score(name, "radio_mj")
+        if total and helpers and radio and None not in (total.value, helpers.value, radio.value):
+            joules = PLAIN.interval(total.value, total.low, total.high)
+            yield (
+                f"{printable(name)}: {joules} J per decision, of which the helpers' inference "
+                f"takes {helpers.value:.1f} J and the radios {radio.value:.3g} mJ"
+            )
+
+
+def energies(run: Run) -> Table:
+    """Return the joules of a decision, by who takes them, with the total's interval;
+    no condition of which one of them is not known.
+    """
+    rows = []
+    for condition in run.conditions:
+        total, helpers = run.score(condition, "energy_j"), run.score(condition, "helpers_j")
+        radio = run.score(condition, "radio_mj")
+        if not (total and helpers and radio):
+            continue
+        of_radio, of_helpers = (radio.value or 0.0) / 1000, helpers.value or 0.0
+        of_ego = (total.value or 0.0) - of_helpers - of_radio
+        of_total = {
+            "total_j": total.value,
+            "low": total.low,
+            "high": total.high,
+            "n": total.n,
+            "interval": total.interval,
+        }
+        parts = zip(PARTS, (of_ego, of_helpers, of_radio), strict=True)
+        for part, joules in parts:
+            rows.append({"condition": condition, "part": part, "joules": joules, **of_total})
+    return rows
+
+
+def chart(rows: Table) -> dict[str, Any]:
+    """Return the chart of these rows."""
+    return charts.stacked(rows, "condition", "part", PARTS, "J per decision", amount="joules")
+
+
+PANEL = AddedPanel(
+    part="communication",
+    title="Energy of a decision",
+    caption="Joules of inference on the declared device and of the radios, as means over "
+    "decisions; the interval is that of the total, over episodes. All helpers in the "
+    "radius infer from the start, asked or not; with on_demand=true those alone that are "
+    "asked. If the radios' part is too small to see, cooperation costs energy because "
+    "helpers infer, not because they transmit.",
+    rows=energies,
+    spec=chart,
+)
