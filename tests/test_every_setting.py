@@ -16,10 +16,11 @@ from misbehaving import Asked, completion, serving
 from msgspec import structs
 
 from harness.core.errors import UserError
+from harness.core.extensions import extensions
 from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import begin, unfinished
-from harness.runs.formats import BESIDE
+from harness.runs.formats import BESIDE, gathered
 from harness.runs.settings import (
     PLAIN,
     WORLDS,
@@ -75,6 +76,8 @@ RUNS = {
     "{two} --limit 1 --condition single-local "
     "--image blank",
 }
+if "devices" not in extensions():  # whose settings it has
+    del RUNS["device"]
 NEEDS = {"engine": "torch", "picture": "llama_cpp"}
 SCENARIO = "occluded-intersection:limits=1,perception=1,witnesses=any,radio_share=0.0"
 # A run states its conditions by name, and its engine with its model.
@@ -189,7 +192,7 @@ def stated(run: str) -> dict[str, Settings]:
     assert (flag, out) == ("--out", run)
     text = Path(run, "run.toml").read_text()
     return {
-        "run.json": msgspec.convert(manifest["settings"], Settings),
-        "run.toml": msgspec.convert(tomllib.loads(text), Settings),
+        "run.json": msgspec.convert(gathered(manifest["settings"]), Settings),
+        "run.toml": msgspec.convert(gathered(tomllib.loads(text)), Settings),
         "command": of_words(command),
     }

@@ -20,11 +20,11 @@ from harness.dataset.load import Dataset
 from harness.evaluate import resolve
 from harness.evaluate.frozen_world import FrozenSource
 from harness.runs.folder import read as read_run
+from harness.runs.formats import gathered
 from harness.runs.settings import (
     WORLDS,
     DriveSettings,
     FrozenSettings,
-    HelperSettings,
     Settings,
     changed,
     of_words,
@@ -49,20 +49,17 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
 def every_setting(draw: Callable[..., Any]) -> Settings:
     """Settings with any value that their types allow."""
     world = draw(st.sampled_from(list(WORLDS.values())))
-    tables: dict[str, dict[str, Any]] = {"": {}, "helpers": {}, "world": {}}
+    given: dict[str, Any] = {}
     for each in options(world):
         if draw(st.booleans()):
-            *table, key = each.path
-            tables["".join(table)][key] = draw(VALUES[str(each.kind)])
-    return Settings(
-        helpers=HelperSettings(**tables["helpers"]), world=world(**tables["world"]), **tables[""]
-    )
+            given[each.name] = draw(VALUES[str(each.kind)])
+    return changed(Settings(world=world()), given)
 
 
 @given(every_setting())
 def test_settings_are_the_same_as_words_and_as_a_file(settings: Settings) -> None:
     assert of_words(words(settings)) == settings
-    assert msgspec.convert(tomllib.loads(text_of(settings)), Settings) == settings
+    assert msgspec.convert(gathered(tomllib.loads(text_of(settings))), Settings) == settings
 
 
 def test_what_is_no_command_of_a_run_is_refused() -> None:

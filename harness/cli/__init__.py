@@ -19,6 +19,7 @@ from harness import __version__
 from harness.cli import shell
 from harness.core import extras
 from harness.core.errors import EXIT_CODES, UserError, printable
+from harness.core.extensions import extensions, owner_of_plugin, part_of
 from harness.core.process import Stop
 
 app = typer.Typer(
@@ -132,9 +133,17 @@ def _typed() -> None:
         if message.startswith("Usage:"):  # a group without a command shows its help
             print(message)
             sys.exit(2)
+        if gone := _part_of_gone(getattr(error, "option_name", "")):
+            message = f"{error.option_name} is {gone}"
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message.removesuffix('.'), 300)} in `{typed}`; see `{path} --help`")
+
+
+def _part_of_gone(option: str) -> str:
+    """Say what an option of a run is part of that is not installed; empty for any other."""
+    owner = owner_of_plugin("settings", option.lstrip("-").replace("-", "_"))
+    return part_of(owner) if owner and owner not in extensions() else ""
 
 
 def _is_text(word: str) -> bool:

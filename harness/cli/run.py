@@ -228,7 +228,7 @@ def as_mapping(run: "Run") -> dict[str, Any]:
     variant = msgspec.to_builtins(run.manifest.variant)
     return {
         "run": str(run.path),
-        "manifest": msgspec.to_builtins(run.manifest),
+        "manifest": run.manifest.as_file(),
         "caveats": [finding.sentence for finding in findings(run, *FIRST)],
         "notes": [finding.sentence for finding in findings(run, Kind.FIGURE, *LAST)],
         "summary": [{**variant, **msgspec.to_builtins(score)} for score in run.scores],

@@ -28,7 +28,7 @@ COMMANDS, STUDIES, NAMES = "swarmdrive.commands", "swarmdrive.studies", "swarmdr
 SETTINGS = "swarmdrive.settings"
 # And by control, with the setting of a condition that it is in brackets.
 CONTROLS = "swarmdrive.controls"
-# By kind and name, such as `contents text`, the packages of those that conditions name.
+# By kind and name, such as `contents text`, the packages of those that conditions and runs name.
 PLUG_INS = "swarmdrive.plugins"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
@@ -47,6 +47,9 @@ class Setting:
     kind: type  # str, int, float or bool
     default: str | int | float | bool
     help: str  # a sentence for people
+    # of one that ships: the setting of the core behind which files and help have it, null where it
+    # has its default. Empty for the table of all that extensions add
+    behind: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +125,16 @@ def setting_of_extension(name: str) -> OfExtension | None:
         return None
     package, _, idle = str(entry.value).partition(" ")
     return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
+
+
+def beside() -> dict[str, Setting]:
+    """Return the settings of extensions that files have beside those of the core, by name."""
+    declared = entries(GROUP)
+    settings: dict[str, Setting] = {}
+    for name, extension in extensions().items():
+        if is_ours(declared[name]):
+            settings |= {key: each for key, each in extension.settings.items() if each.behind}
+    return settings
 
 
 def owner_of_plugin(kind: str, name: str) -> str | None:

@@ -18,8 +18,9 @@ from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
+from harness.runs.formats import EXTENSIONS
 from harness.runs.records import Latency, Looks, Manifest, Score
-from harness.runs.settings import EXTENSIONS, PLAIN, difference, of_words, words
+from harness.runs.settings import PLAIN, difference, of_words, words
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -205,15 +206,17 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     folder may move between two commands. What is no table, as in a damaged record, is another
     world.
     """
-    world, plain = (_named(settings.get(name)) for name in ("world", "settings"))
+    parts = ("world", "settings", "beside")
+    world, plain, opened = (_named(settings.get(name)) for name in parts)
     return {
         **{
             key: value
             for key, value in settings.items()
-            if key not in ("world", "settings", *formats.BESIDE)
+            if key not in ("world", "settings", "beside", *formats.BESIDE)
         },
         **{key: value for key, value in plain.items() if key in PLAIN},
         **_named(plain.get(EXTENSIONS)),
+        **{f"content of {name}": value for name, value in opened.items()},
         **{f"{key} of the world": value for key, value in world.items() if key != "path"},
     }
 

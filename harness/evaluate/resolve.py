@@ -45,7 +45,7 @@ def spec(settings: Settings, source: Source) -> Spec:
         source=source,
         seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
-        timer=timers.chosen(settings),
+        timer=timers.chosen(settings.extensions),
         settings=settings,
     )
 

@@ -17,6 +17,7 @@ from harness.coordination import contents_of_packages, parts_of_packages
 from harness.coordination.coordinate import TIES
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.schedules import SCHEDULES
+from harness.core import extensions
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Scene
@@ -26,7 +27,7 @@ from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.looks import Until
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
-from harness.runs import formats
+from harness.runs import formats, timers
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Looks
@@ -429,7 +430,7 @@ class Spec:
             "schedules": {name: sha256 for name, sha256 in schedules.items() if sha256},
             "kept": kept,
             "seeds": list(self.seeds),
-            "device_profile": self.timer.record() if self.timer else None,
+            "beside": self.timer.record() if self.timer else {},
             **{key: settings[name] for key, name in formats.BESIDE.items()},
             "settings": settings,
         }
@@ -452,7 +453,7 @@ class Spec:
                 answer=self.helpers[0].answer,
                 thinking=None if thinking == self.ego.thinking else thinking,
             )
-        first, by_timer = self.seeds[0], self.timer.settings() if self.timer else {}
+        first = self.seeds[0]
         return {
             "model": argument(self.ego.card),
             "engine": None,
@@ -470,14 +471,18 @@ class Spec:
                 for name in ("answer", "thinking", "image", "flip", "sums")
             },
             "letters": self._letters,
-            "device_profile": None,
-            "device_model": None,
-            **by_timer,
             "ties": self.ties,
-            "extensions": {name: its.default for name, its in of_extensions().items()}
-            | self.settings.extensions,
+            "extensions": self._of_extensions(),
             "tag": tuple(dict.fromkeys(self.settings.tag)),
         }
+
+    def _of_extensions(self) -> dict[str, Any]:
+        """Return the settings of extensions; those that choose a timer say which is open."""
+        beside = extensions.beside()
+        usual = {name: its.default for name, its in of_extensions().items() if name not in beside}
+        others = timers.without(self.settings.extensions)
+        by_timer = self.timer.settings() if self.timer else {}
+        return {**usual, **others, **by_timer}
 
     @property
     def ties(self) -> str:

@@ -12,10 +12,13 @@ from contextlib import suppress
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
+from harness.core import extensions
 from harness.core.errors import UserError, printable
+from harness.core.extensions import owner_of_plugin, part_of
 from harness.world.families import FAMILIES
 
 NUMBER = 2
+EXTENSIONS = "extensions"  # the table of settings that extensions add
 UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
 FORMAT = f"swarmdrive-run/{NUMBER}"
 # Older formats, and the version of the harness that reads each.
@@ -32,7 +35,6 @@ BESIDE: Mapping[str, str] = {
     "temperature": "temperature",
     "sampling_seed": "sampling_seed",
     "latency_source": "latency",
-    "device_model": "device_model",
 }
 
 # Settings that a user types in several ways, by a name, a path or a URL: a name is held to what it
@@ -61,15 +63,12 @@ MANIFEST: Mapping[str, Added] = {
     "helpers": Added(
         "2026-11-23", (), "agents of their own for helpers; the ego's answered for all"
     ),
-    "device_profile": Added(
-        "2026-11-23", None, "on-board computers that time answers by their tokens"
-    ),
+    "beside": Added("2026-11-29", {}, "what settings of extensions opened; see `upgraded`"),
 }
 # Of its settings that open nothing; the command alone stated servers and a device.
 SETTINGS: Mapping[str, Added] = {
     "temperature": Added("2026-11-23", 0.0, "sampling; all answers were greedy"),
     "sampling_seed": Added("2026-11-23", 0, "sampling"),
-    "device_model": Added("2026-11-23", None, "the row of such a computer"),
     "ask": Added("2026-11-26", "all", "asking only helpers whose answer counts; all were asked"),
     "ties": Added(
         "2026-11-26", "first", "drawing between the likeliest actions; the first was taken"
@@ -194,10 +193,18 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
 
     Values of a wrong type are left as they are, for the reader to refuse. 2026-11-27: a driven
     scenario is named without the settings that were typed after its name, which are among its
-    parameters. 2026-11-29: `kept` has the table `calibrations`, which stood beside it.
+    parameters. 2026-11-29: `kept` has the table `calibrations`, which stood beside it; what became
+    settings of extensions stands where it stood in files (`as_file`), and in tables of theirs here.
     """
     if isinstance(calibrations := stated.get("calibrations"), dict) and "kept" not in stated:
         stated = {**stated, "kept": {"calibrations": calibrations} if calibrations else {}}
+    if "beside" not in stated:
+        theirs = extensions.beside()
+        opened = {name: stated[name] for name in theirs if stated.get(name) is not None}
+        others = {name: value for name, value in stated.items() if name not in theirs}
+        stated = {**_without_gone(others), "beside": opened}
+    if isinstance(table := stated.get("settings"), Mapping):
+        stated = {**stated, "settings": gathered(table)}
     older = {key: SETTINGS[name].absent for key, name in BESIDE.items() if name in SETTINGS}
     settings = _agent(_with(MANIFEST, {**older, **stated}))
     if isinstance(model := settings.get("identity"), dict):
@@ -216,6 +223,64 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
             settings["world"] = {**world, "scenario": driven}
     settings["settings"] = _table(settings)
     return settings
+
+
+def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of settings with those of extensions in a table of theirs,
+    where a file has some beside those of the core; without the latter's nulls.
+
+    Raises UserError for one of an extension that is not installed.
+    """
+    beside = extensions.beside()
+    theirs = {name: settings[name] for name in beside if settings.get(name) is not None}
+    others = {name: value for name, value in settings.items() if name not in beside}
+    table = _without_gone(others)
+    stated = table.get(EXTENSIONS, {})
+    return {**table, EXTENSIONS: {**stated, **theirs} if isinstance(stated, Mapping) else stated}
+
+
+def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table without the nulls of settings whose extension is not installed.
+
+    Raises UserError for one that has a value.
+    """
+    kept = {}
+    for name, value in table.items():
+        owner = owner_of_plugin("settings", name)
+        if owner is None:
+            kept[name] = value
+        elif value is not None:
+            raise UserError(f"setting {name} is {part_of(owner)}")
+    return kept
+
+
+def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of run.json: settings of extensions stand behind those of the core, where
+    their extension says so, and what they opened stands beside the table of settings.
+    """
+    table: dict[str, Any] = {}
+    for name, value in manifest.items():
+        if name != "beside":
+            table[name] = settings_as_file(value) if name == "settings" else value
+            table |= _behind(BESIDE.get(name), manifest["beside"])
+    return table
+
+
+def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of settings as `as_file` has it."""
+    theirs, beside = settings[EXTENSIONS], extensions.beside()
+    table: dict[str, Any] = {}
+    for name, value in settings.items():
+        table[name] = value
+        table |= _behind(name, theirs)
+    table[EXTENSIONS] = {name: value for name, value in theirs.items() if name not in beside}
+    return table
+
+
+def _behind(name: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of extensions' settings that stand behind one of the core, null if not set."""
+    beside = extensions.beside().items()
+    return {each: values.get(each) for each, setting in beside if setting.behind == name}
 
 
 def _table(stated: Mapping[str, Any]) -> Any:
@@ -268,9 +333,9 @@ def _is_called(text: str, name: str) -> bool:
 
 def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that opened what a run states, each as it is called there."""
-    seeds, device, world, helpers = (
-        stated[name] for name in ("seeds", "device_profile", "world", "helpers")
-    )
+    seeds, world, helpers = (stated[name] for name in ("seeds", "world", "helpers"))
+    opened = dict.fromkeys(extensions.beside()) | stated["beside"]
+    theirs = {name: _name_of(value) for name, value in opened.items()}
     scenes = {"kind": world["kind"], "dataset": world.get("path"), **world.get("selection", {})}
     if "scenario" in world:
         scenes |= {"scenario": world["scenario"]["name"], "first_seed": world["first_seed"]}
@@ -280,7 +345,7 @@ def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
         "prompt": stated["prompt"]["version"],
         "seeds": ",".join(map(str, seeds)) if len(seeds) > 1 else f"{seeds[0]}:{seeds[0] + 1}",
         "condition": [point["name"] for point in stated["conditions"]],
-        "device_profile": device["name"] if device else None,
+        EXTENSIONS: {name: value for name, value in theirs.items() if value is not None},
         "world": scenes,
         "helpers": {
             "model": ",".join(helper["model"]["name"] for helper in helpers),
@@ -290,6 +355,11 @@ def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
         if helpers
         else {},
     }
+
+
+def _name_of(opened: Any) -> Any:
+    """Return what a setting says that opened this: its name, or itself where nothing is opened."""
+    return opened["name"] if isinstance(opened, Mapping) else opened
 
 
 def _flat(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,12 +5,13 @@ from contextlib import suppress
 from functools import cache
 from typing import Annotated, Any, Literal, cast
 
-from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field, structs
+from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field, structs, to_builtins
 
 from harness.coordination.operating_point import OperatingPoint, questions
 from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
+from harness.runs import formats
 from harness.runs.settings import Settings
 from harness.runs.timers import Timer, timer
 from harness.world import scenarios
@@ -563,6 +564,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     networks: dict[str, dict[str, Any]]
     schedules: dict[str, str]
     kept: dict[str, dict[str, Any]]
+    beside: dict[str, Any] = field(default_factory=dict)
     seeds: tuple[int, ...]
     ask: Literal["used", "all"]
     ties: Literal["drawn", "first"]
@@ -577,8 +579,6 @@ class Manifest(Struct, frozen=True, kw_only=True):
     temperature: float
     sampling_seed: int
     latency_source: str | None
-    device_profile: Any
-    device_model: str | None
     settings: Settings
     latency: Latency
     answer_times: dict[str, Times] = field(default_factory=dict)
@@ -601,6 +601,10 @@ class Manifest(Struct, frozen=True, kw_only=True):
             return scenarios.stated(record["name"], record["parameters"])
         except UserError as error:
             raise UserError(f"run.json of {printable(self.name)}: {error}") from None
+
+    def as_file(self) -> dict[str, Any]:
+        """Return it as run.json has it, as plain values."""
+        return formats.as_file(to_builtins(self))
 
     @property
     def timer(self) -> Timer | None:

@@ -22,11 +22,12 @@ from harness.core.extensions import Setting
 from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
 from harness.core.seeds import LAST_SEED
+from harness.runs import formats
+from harness.runs.formats import EXTENSIONS
 
 FILE = "run.toml"
 COMMANDS = {"frozen": "eval", "closed-loop": "drive"}  # by the world's kind
 MOST_SEEDS = 1000
-EXTENSIONS = "extensions"  # the table of settings that extensions add
 
 CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
@@ -348,25 +349,6 @@ class Settings(Struct, frozen=True, kw_only=True):
             LATENCY,
         ),
     ] = None
-    device_profile: Annotated[
-        str | None,
-        option(
-            "Computer in every vehicle, such as agx-orin (`harness model device list`). It times "
-            "each answer by its tokens; use it instead of --latency.",
-            LATENCY,
-            same=OPENED,
-            compared=False,
-        ),
-    ] = None
-    device_model: Annotated[
-        str | None,
-        option(
-            "With --device-profile: model whose row of the profile times all answers. Default: "
-            "the model that gave the answer.",
-            LATENCY,
-            compared=False,
-        ),
-    ] = None
     ask: Annotated[
         str,
         option(
@@ -409,6 +391,7 @@ class Option(NamedTuple):
     listed: bool  # whether it may be typed several times, which are joined by commas
     same: str  # what of it is the same when a stopped run resumes
     compared: bool  # whether a comparison of two runs tells it
+    unset: Any = None  # of one that an extension adds: its value where nobody sets it
 
     @property
     def flag(self) -> str:
@@ -420,8 +403,9 @@ class Option(NamedTuple):
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
-        if self.path[0] == EXTENSIONS:
-            return settings.extensions.get(self.name, self.default)
+        if self.unset is not None:
+            value = settings.extensions.get(self.name, self.unset)
+            return self.default if value == self.unset else value
         for name in self.path:
             settings = getattr(settings, name)
         return settings
@@ -435,12 +419,29 @@ class Option(NamedTuple):
 
 
 def options(world: type[Struct]) -> list[Option]:
-    """Return the options of this world's command, in the order of fields; extensions' last."""
-    declared = core_options(world)
+    """Return the options of this world's command, in the order of fields; extensions' last.
+
+    Those of extensions that stand behind one of the core follow it.
+    """
+    declared, last = list[Option](), list[Option]()
+    beside = extensions.beside()
+    for each in core_options(world):
+        declared.append(each)
+        for name, setting in beside.items():
+            if setting.behind == each.name:
+                declared.append(_added(name, setting, (name,), None))
     for name, setting in of_extensions().items():
-        path, shape = (EXTENSIONS, name), (setting.kind, setting.default, setting.help)
-        declared.append(Option(path, name, *shape, "Extensions", False, ITSELF, True))
-    return declared
+        if name not in beside:
+            last.append(_added(name, setting, (EXTENSIONS, name), setting.default))
+    return [*declared, *last]
+
+
+def _added(name: str, setting: Setting, path: tuple[str, ...], default: Any) -> Option:
+    """Return the option of a setting that an extension adds, below the extension's name."""
+    owners = extensions.extensions().values()
+    panel = next(f"Extension {owner.name}" for owner in owners if name in owner.settings)
+    shape = (setting.kind, default, setting.help, panel)
+    return Option(path, name, *shape, False, ITSELF, True, unset=setting.default)
 
 
 def core_options(world: type[Struct]) -> list[Option]:
@@ -519,7 +520,7 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
         if each.name in given:
             table = tables if len(each.path) == 1 else tables[each.path[0]]
             table[each.path[-1]] = given[each.name]
-    return convert(tables, Settings, "settings")
+    return convert(formats.gathered(tables), Settings, "settings")
 
 
 def deciding(settings: Settings) -> Settings:
@@ -633,9 +634,9 @@ def _toml(value: Any) -> str:
 def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     """Return the settings of a `run.toml`, or of a run's folder, with typed options `given` on top.
 
-    A file may come from a stranger, so it may name cards, prompts, devices, datasets and runs to
-    replay, but no other model to open and no server to ask. Raises UserError if it cannot be read,
-    is of another command, or names what only a user may.
+    A file may come from a stranger, so it may name cards, prompts, datasets, what extensions open
+    and runs to replay, but no other model to open and no server to ask. Raises UserError if it
+    cannot be read, is of another command, or names what only a user may.
     """
     sayable("settings", file.name)
     file = file / FILE if file.is_dir() else file
@@ -646,7 +647,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             "which runs have since 0.3; for another, type the command in its run.json"
         )
     tables = _placed(toml(file, where), world, where)
-    stated = convert(tables, Settings, where)
+    stated = convert(formats.gathered(tables), Settings, where)
     settings = changed(_as_driven(stated, file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
@@ -678,7 +679,8 @@ def otherwise(folder: Path, made_with: Settings) -> str | None:
     where = f"settings {printable(file)}"
     try:
         tables = _placed(toml(file, where), type(made_with.world), where)
-        before, now = difference(made_with, convert(tables, Settings, where))
+        stated = convert(formats.gathered(tables), Settings, where)
+        before, now = difference(made_with, stated)
     except UserError as error:
         return f"{error}."
     if before == now:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from harness.coordination.exchange import Exchange
     from harness.coordination.operating_point import OperatingPoint
     from harness.runs.records import Answer, Latency, Manifest
-    from harness.runs.settings import Settings
 
 
 class Timer(ABC):
@@ -28,14 +27,15 @@ class Timer(ABC):
     """
 
     option: ClassVar[str]  # what is typed to choose it
+    chosen_by: ClassVar[tuple[str, ...]]  # the settings of its extension that choose it
     how: ClassVar[str]  # where its times come from, for people
     # the columns that it adds to a decision, each with the one behind which it stands: numbers,
     # null where unknown, in a file only where some are known
     adds: ClassVar[Mapping[str, str]] = {}
 
     @abstractmethod
-    def opened(self, settings: "Settings") -> "Timer | None":
-        """Return the one that the settings of a run choose; None if they choose none."""
+    def opened(self, settings: Mapping[str, Any]) -> "Timer | None":
+        """Return the one that a run's settings of extensions choose; None if they choose none."""
 
     @abstractmethod
     def recorded(self, manifest: "Manifest") -> "Timer | None":
@@ -69,11 +69,13 @@ class Timer(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the settings that choose it, by name."""
+        """Return those of `chosen_by` that choose it, by name."""
 
     @abstractmethod
-    def record(self) -> Any:
-        """Return what a run keeps of it, as plain values."""
+    def record(self) -> dict[str, Any]:
+        """Return what a run states of it beside its settings: by setting, what that opened, as
+        plain values, or its value.
+        """
 
     @abstractmethod
     def files(self) -> Mapping[str, Path]:
@@ -117,8 +119,8 @@ def timer(source: str) -> Timer:
     raise ValueError(f"nothing of the name {printable(source)} times answers")
 
 
-def chosen(settings: "Settings") -> Timer | None:
-    """Return what the settings of a run choose to time its answers; None for its latency."""
+def chosen(settings: Mapping[str, Any]) -> Timer | None:
+    """Return what a run's settings of extensions choose to time answers; None for `--latency`."""
     for each in _timers():
         if opened := each.opened(settings):
             return opened
@@ -128,6 +130,12 @@ def chosen(settings: "Settings") -> Timer | None:
 def options() -> list[str]:
     """Return what is typed to choose each timer."""
     return [each.option for each in _timers()]
+
+
+def without(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of extensions without those that choose a timer."""
+    choosing = {name for each in _timers() for name in each.chosen_by}
+    return {name: value for name, value in settings.items() if name not in choosing}
 
 
 def added_columns() -> dict[str, str]:

@@ -57,7 +57,7 @@ def write(
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     if layouts:
         write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
-    text = msgspec.json.format(_ENCODER.encode(manifest), indent=1)
+    text = msgspec.json.format(_ENCODER.encode(manifest.as_file()), indent=1)
     write_whole(out / "run.json", text + b"\n")
     # a report often follows, which needs memory for its own tables
     pa.default_memory_pool().release_unused()

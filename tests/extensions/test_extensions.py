@@ -351,6 +351,7 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     """They say what a command or study was part of where its folder is gone."""
     extension = known.extensions()[name]
     plug_ins = [f"{kind} {each}" for kind in NAMED for each in extension.adds.get(kind, {})]
+    plug_ins += [f"settings {each}" for each in extension.settings]
     assert ENTRIES[known.GROUP][name] == f"{PACKAGES}{name}:EXTENSION"
     for group, names in (
         (known.COMMANDS, [*extension.commands, *extension.spellings, *extension.short]),
@@ -510,6 +511,37 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "setting rounds=2 of a condition is part of the extension plan, which is not installed",
         "encoding etsi is part of the extension radio, which is not installed",
     ]
+
+
+def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
+    core: Path, tmp_path: Path
+) -> None:
+    """Whether it is typed, in a file of settings, or in a run; a run without it is read."""
+    (tmp_path / "run.toml").write_text('device_profile = "agx-orin"\n')
+    code = (
+        "import sys\nfrom harness.core.errors import UserError\nfrom harness.runs import formats, "
+        "timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
+        "'device_model': None, 'ties': 'drawn'}\nprint(formats.gathered(idle))\n"
+        "print('device_profile' in formats.upgraded({**idle, 'settings': idle}))\n"
+        "for ask in (lambda: formats.upgraded({'device_profile': {'name': 'mine'}}), "
+        "lambda: timers.timer('device')):\n    try:\n        ask()\n"
+        "    except UserError as error:\n        print(error)\n"
+        "for typed in (['--device-profile', 'agx-orin'], ['run.toml']):\n"
+        "    sys.argv = ['harness', 'eval', *typed]\n"
+        "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
+    )
+    done = in_the_core(core, tmp_path, code)
+    gone = "is part of the extension devices, which is not installed"
+    assert done.stdout.splitlines() == [
+        "{'ties': 'drawn', 'extensions': {}}",
+        "False",
+        f"setting device_profile {gone}",
+        f"what timed the answers of a run, device, {gone}",
+        *["2"] * 2,
+    ]
+    typed, stated = done.stderr.splitlines()
+    assert typed.startswith(f"harness: --device-profile {gone} in `harness eval --device-profile ")
+    assert stated == f"harness: setting device_profile {gone}"
 
 
 PART = """

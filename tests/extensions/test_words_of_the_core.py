@@ -87,7 +87,6 @@ LEADS_ON = {
     ("report/compare/pair.py", "study fidelity"),
     ("report/scripts/decision.js", "harness view"),
     ("report/scripts/decision.js", "run video"),
-    ("runs/settings.py", "model device"),
     ("runs/settings.py", "study trust"),
 }
 # Old folders of a study had this file in place of its manifest, and are listed.

@@ -1,6 +1,6 @@
 """Give every vehicle a computer: what an answer takes there in time, energy and memory."""
 
-from harness.core.extensions import Extension
+from harness.core.extensions import Extension, Setting
 
 _HERE = "harness.extensions.devices"
 
@@ -14,6 +14,22 @@ EXTENSION = Extension(
     },
     groups={"model device": "List on-board computers, show or check one, or measure energy."},
     spellings={"device": "model device"},
+    settings={
+        "device_profile": Setting(
+            str,
+            "",
+            "Computer in every vehicle, such as agx-orin (`harness model device list`). It times "
+            "each answer by its tokens; use it instead of --latency.",
+            behind="latency",
+        ),
+        "device_model": Setting(
+            str,
+            "",
+            "With --device-profile: model whose row of the profile times all answers. Default: "
+            "the model that gave the answer.",
+            behind="latency",
+        ),
+    },
     adds={
         "timers": {"device": f"{_HERE}.timer:TIMER"},
         "metrics": {

@@ -5,6 +5,7 @@ from typing import Any
 
 from harness.core.errors import printable
 from harness.core.figures import PLAIN
+from harness.extensions.devices.timer import PROFILE
 from harness.report import charts
 from harness.report.drawing.colours import BAD, ROLES
 from harness.report.notes import Shown
@@ -22,7 +23,7 @@ PARTS = {
 
 def caveats(manifest: Manifest) -> Iterator[str]:
     """Yield each agent whose times and joules are those of another model."""
-    if manifest.device_profile is None:
+    if (device := manifest.beside.get(PROFILE)) is None:
         return
     agents = (manifest.agent(0), *manifest.helpers)
     for agent, speed in zip(agents, manifest.latency.speeds, strict=True):
@@ -31,7 +32,7 @@ def caveats(manifest: Manifest) -> Iterator[str]:
             yield (
                 "Times and energy are conditional: the token counts are those of "
                 f"{printable(name, 30)}, the speed is that of {printable(speed.model)} on "
-                f"{printable(manifest.device_profile['name'])}."
+                f"{printable(device['name'])}."
             )
 
 

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from harness.core import resources
 from harness.core.config import Count, between, convert, toml
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import UserError, printable, sayable, unknown
 
 Rate = Annotated[float, Meta(gt=0, description="a number above 0")]
 Status = Literal["measured", "cited", "modelled", "assumed"]
@@ -23,7 +23,8 @@ RATES = ("prefill_tokens_per_s", "decode_tokens_per_s")
 JOULES = {"joules_per_prompt_token": RATES[0], "joules_per_output_token": RATES[1]}
 APART = ("answer_ms", "memory_gb")  # numbers of a row from which nothing is derived
 MOST = {"amplifier_efficiency": 1.0, "transmit_dbm": 100.0}  # of a device
-_SIZE = re.compile(r"(\d+(?:\.\d+)?)b")
+MOST_BILLIONS, MOST_LETTERS = 1e6, 100  # of a model's weights; of its name
+_SIZE = re.compile(r"(\d{1,7}(?:\.\d{1,9})?)b", re.ASCII)
 
 
 class Speed(Struct, frozen=True):
@@ -51,7 +52,7 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
     model: str  # the model's name; that of a card, if there is one
     # billions of weights
-    billions: Annotated[float, between(1e-9, 1e6)]
+    billions: Annotated[float, between(1e-9, MOST_BILLIONS)]
     precision: str  # number format of the weights
     batch_size: Count  # requests that went through the device together when it was timed
     prefill_tokens_per_s: Constant | None = None  # prompt tokens read in a second
@@ -64,6 +65,15 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
     # the question was
     answer_ms: Constant | None = None
     memory_gb: Constant | None = None  # memory that the model takes, in 10^9 bytes
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.model) <= MOST_LETTERS:
+            shown = printable(self.model, 40)
+            raise ValueError(f"model is {shown!r}; give 1 to {MOST_LETTERS} characters")
+        try:
+            sayable("model", self.model)
+        except UserError as error:
+            raise ValueError(str(error)) from None
 
 
 class Device(Struct, frozen=True, kw_only=True):
@@ -141,7 +151,7 @@ def find_row(device: Device, model: str) -> DeviceRow:
     if model in by_name:
         return by_name[model]
     size = _SIZE.fullmatch(model)
-    if size and float(size[1]) and device.scaling:
+    if size and 0 < float(size[1]) <= MOST_BILLIONS and device.scaling:
         return _scaled(device, float(size[1]))
     hint = "; give one of them as --device-model"
     if device.scaling:

@@ -22,7 +22,6 @@ from harness.extensions.devices import profiles
 from harness.extensions.devices.profiles import Constant, Device, DeviceRow, Speed
 from harness.radio.wrapped import innermost
 from harness.runs.records import Answer, Latency, Manifest
-from harness.runs.settings import Settings
 from harness.runs.timers import Timer
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 
 Answers = Mapping[str, Answer]  # by request id
 SOURCE = "device"  # of a latency
+PROFILE, MODEL = "device_profile", "device_model"  # settings of a run
 
 
 @dataclass(frozen=True)
@@ -42,35 +42,35 @@ class Computer(Timer):
     """A computer in every vehicle, which times each answer by its tokens."""
 
     option: ClassVar[str] = "--device-profile"
+    chosen_by: ClassVar[tuple[str, ...]] = (PROFILE, MODEL)
     how: ClassVar[str] = "computed for each answer from its tokens, on a declared device"
     adds: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("inference_j", "helpers_j", "radio_mj", "waiting_j"), "busy_ratio"
     )
 
     device: Device | None = None  # its profile; None where nothing is open
-    model: str | None = None  # whose row times all answers; None for the one that gave each
+    model: str = ""  # whose row times all answers; empty for the one that gave each
 
     @property
     def profile(self) -> Device:
         assert self.device is not None
         return self.device
 
-    def opened(self, settings: Settings) -> "Computer | None":
-        if settings.device_profile:
-            return Computer(profiles.load(settings.device_profile), settings.device_model)
-        if settings.device_model is not None:
+    def opened(self, settings: Mapping[str, Any]) -> "Computer | None":
+        name, model = settings.get(PROFILE), settings.get(MODEL, "")
+        if name:
+            return Computer(profiles.load(name), model)
+        if model:
             raise UserError(
-                f"--device-model {printable(settings.device_model)} is a device's row; give "
-                f"{self.option} as well"
+                f"--device-model {printable(model)} is a device's row; give {self.option} as well"
             )
         return None
 
     def recorded(self, manifest: Manifest) -> "Computer | None":
-        if manifest.device_profile is None:
+        if (stated := manifest.beside.get(PROFILE)) is None:
             return None
-        return Computer(
-            msgspec.convert(manifest.device_profile, Device), manifest.settings.device_model
-        )
+        model = msgspec.convert(manifest.settings.extensions.get(MODEL, ""), str)
+        return Computer(msgspec.convert(stated, Device), model)
 
     def speed(self, stated: Any) -> Speed:
         return stated if isinstance(stated, Speed) else msgspec.convert(stated, Speed)
@@ -145,10 +145,11 @@ class Computer(Timer):
         return f"{self.option} {printable(self.profile.name)}"
 
     def settings(self) -> dict[str, Any]:
-        return {"device_profile": self.profile.name, "device_model": self.model}
+        named = {PROFILE: self.profile.name, MODEL: self.model}
+        return {name: value for name, value in named.items() if value}
 
-    def record(self) -> Any:
-        return msgspec.to_builtins(self.profile)
+    def record(self) -> dict[str, Any]:
+        return {**self.settings(), PROFILE: msgspec.to_builtins(self.profile)}
 
     def files(self) -> Mapping[str, Path]:
         name = self.profile.name

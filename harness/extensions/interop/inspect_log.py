@@ -63,7 +63,7 @@ def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> lo
     task is named by dataset and prompt version.
     """
     manifest, variant = run.manifest, run.manifest.variant
-    whole = msgspec.to_builtins(manifest)
+    whole = manifest.as_file()
     stated = nameless(whole)
     asked = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
     samples = list(_samples(run, dataset, scenes))

@@ -178,7 +178,7 @@ def pair(a: Path, b: Path) -> Pair:
 
 
 def _side(run: Run) -> Side:
-    manifest = msgspec.json.decode(msgspec.json.encode(run.manifest))
+    manifest = msgspec.json.decode(msgspec.json.encode(run.manifest.as_file()))
     values = {**manifest["settings"], **manifest}  # a model, say, as it was opened
     stated = {name: values[name] for name in SETTINGS}
     if run.world == "closed-loop":

@@ -2,6 +2,7 @@
 who is in time follows from it alone.
 """
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -196,6 +197,58 @@ def test_a_runs_summary_has_the_energy_of_a_decision(counted: Callable[..., fold
     assert manifest.latency.source == "device"
     assert manifest.timer == Computer(DESK)
     assert manifest.latency.speeds == (Speed("swarm-tiny", 1000, 100, 0.01, 1),)
+
+
+def test_a_run_states_its_computer_where_runs_always_did(
+    counted: Callable[..., folder.Run],
+) -> None:
+    """Beside the table of settings and in it, and no table of extensions repeats it."""
+    told = counted(ALONE, timer=Computer(DESK, "big"))
+    stated = json.loads((told.path / "run.json").read_text())
+    at = list(stated).index("latency_source")
+    assert list(stated)[at : at + 4] == [
+        "latency_source",
+        "device_profile",
+        "device_model",
+        "settings",
+    ]
+    table = stated["settings"]
+    assert (stated["device_profile"]["name"], stated["device_model"]) == ("desk", "big")
+    assert (table["device_profile"], table["device_model"]) == ("desk", "big")
+    assert "device_profile" not in table["extensions"]
+    assert msgspec.json.decode(msgspec.json.encode(told.manifest.as_file())) == stated
+    other = {**stated, "settings": {**table, "device_profile": "thor"}}
+    (told.path / "run.json").write_text(json.dumps(other))
+    with pytest.raises(UserError, match=r"have extensions\.device_profile thor, and beside"):
+        folder.read(told.path)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"device_profile": {"name": "desk"}}, "missing required field"),
+        ({"device_profile": {"name": ["desk"]}}, "is broken"),
+        ({"latency": {"source": "device", "basis": "", "speeds": [{"model": "big"}]}}, "missing"),
+        (
+            {"latency": {"source": "sundial", "basis": "", "speeds": [1]}},
+            "nothing of the name sund",
+        ),
+        ({"latency": {"source": "device", "basis": ""}}, "and else speeds"),
+        ({"device_model": 3}, "is broken"),
+    ],
+)
+def test_what_a_stranger_states_of_a_computer_is_held_to_its_types(
+    change: dict[str, Any], says: str, counted: Callable[..., folder.Run]
+) -> None:
+    told = counted(ALONE, timer=Computer(DESK, "big"))
+    stated = json.loads((told.path / "run.json").read_text()) | change
+    for name in {"device_profile", "device_model"} & change.keys():
+        value = change[name]
+        stated["settings"][name] = value["name"] if isinstance(value, dict) else value
+    (told.path / "run.json").write_text(json.dumps(stated))
+    with pytest.raises(UserError, match=says) as error:
+        folder.read(told.path)
+    assert "\n" not in str(error.value)
 
 
 def test_without_a_device_profile_nothing_is_said_of_energy(
@@ -514,6 +567,10 @@ def test_a_projects_profile_lies_beside_those_that_ship(project: Path) -> None:
             "number comes from"),
         (('me = "my desk, today"', "me = 3"), "[sources]: give each source a name and a text"),
         (('model = "swarm-tiny"', 'model = 3'), "model = 3; allowed: a text"),
+        (('model = "swarm-tiny"', 'model = "a\\u001b[2J"'),
+            "model `a\\x1b[2J` has characters that nothing can show; rename it"),
+        (('model = "swarm-tiny"', f'model = "{"a" * 101}"'), "; give 1 to 100 characters"),
+        (('model = "swarm-tiny"', 'model = "a · b"'), "which stands between names; rename it"),
         (("batch_size = 1", "batch_size = 0"), "batch_size = 0; allowed: 1 or more"),
         (
             ("[[rows]]",
@@ -541,6 +598,10 @@ def test_a_mistake_in_a_file_is_one_line(change: tuple[str, str], says: str, pro
             "agx-orin 'swarm-tiny'; known: d"),
         (("--device-profile", "agx-orin", "--device-model", "\x1b[2J"), 
             "unknown model of device profile"),
+        *(
+            (("--device-profile", "agx-orin", "--device-model", size), "unknown model of device profile")
+            for size in ("0" * 400 + "3b", "9999999b", "٣b", "3b\\n", "x" * 10_000)
+        ),
         (("--device-model", "qwen3-4b"), 
             "--device-model qwen3-4b is a "
             "device's row; give --device-pro"),

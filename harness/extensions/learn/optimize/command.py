@@ -22,6 +22,7 @@ from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
 from harness.core.seeds import FIRST
+from harness.runs.formats import settings_as_file
 from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
@@ -134,7 +135,7 @@ def command(
             "prompt_sha256": base.sha256,
             "tune": [source.dataset.sha256 for source in own] or [layouts, first_seed],
             "report": [sha256 for _, sha256 in manifests],
-            "evaluation": to_builtins(settings),
+            "evaluation": settings_as_file(to_builtins(settings)),
         }
     )
     if begun := work.begun(where, work.WorkStart):
