@@ -117,6 +117,8 @@ def phrases(extension: Extension) -> Iterator[str]:
     """Yield what is said of an extension in several words, and the marks of its studies."""
     for command in typed(extension):
         yield command if " " in command else f"harness {command}"
+    for setting in extension.settings:
+        yield from (setting, setting.replace("_", "-"), setting.replace("_", " "))
     for kind in extension.studies:
         yield f"{kind}.json"
     for text in ("extension {}", "extensions.{}", "extensions/{}"):
