@@ -252,10 +252,12 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     register(
         tmp_path,
         "[swarmdrive.channels]\nslow-radio = radios:SLOW\nv2x = radios:SLOW\n"
-        "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\n",
+        "broken = radios:NONE\nodd = radios:ODD\nunmade = radios:Radio\nearly = radios:EARLY\n"
+        "never = radios:NEVER\n",
         radios="from harness.radio.constant import Radio\n"
         "SLOW = Radio(latency_s=0.5, loss=0.0, bandwidth_bps=1e6, access='serial', jitter_s=0.0)\n"
-        "ODD = 7\n",
+        "ODD = 7\nEARLY = Radio(-5.0, 0.0, 1e6, 'serial', 0.0)\n"
+        "NEVER = Radio(float('nan'), 0.0, 1e6, 'serial', 0.0)\n",
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(CHANNELS, "_loaded", dict(CHANNELS.built_in))
@@ -287,6 +289,14 @@ def test_a_package_adds_a_channel_and_replaces_none():
             "odd",
             r"plug-in 'odd' \(swarmdrive.channels\): radios:ODD is of type int and no Channel; "
             r"repair",
+        ),
+        (
+            "early",
+            r"plug-in 'early' \(swarmdrive.channels\) of package .*latency_s",
+        ),
+        (
+            "never",
+            r"plug-in 'never' \(swarmdrive.channels\) of package .*latency_s",
         ),
         (
             "unmade",

@@ -41,6 +41,7 @@ from harness.coordination.parts import (
     worded_part,
     wrong,
 )
+from harness.coordination.parts import is_ours as is_ours_part
 from harness.coordination.parts_of_packages import change_by, prepared, speaker_of
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
@@ -611,10 +612,11 @@ class OperatingPoint:
     ) -> "tuple[SentIntents, Exchange]":
         """Return what is sent and heard after all that vehicles tell each other before they act.
 
-        As `Part.again`, by each part in turn.
+        As `Part.again`, by each part that ships, in turn.
         """
         for part in self.more:
-            sent, heard = part.again(self, sent, heard, decide)
+            if is_ours_part(part):
+                sent, heard = part.again(self, sent, heard, decide)
         return sent, heard
 
     def _wrong(self, key: str, allowed: str) -> UserError:

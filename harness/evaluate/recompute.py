@@ -136,7 +136,7 @@ def differences(
     check_prompts(run, stated)
     timer = manifest.timer
     ego = replace(stated.ego, card=card_here(stated.ego.card))
-    latency = latencies.as_declared(manifest.latency) if timer is None else None
+    latency = None if manifest.latency.speeds else latencies.as_declared(manifest.latency)
     said = manifest.settings
     settings = structs.replace(stated.settings, ask=said.ask, latency=latency)
     points = tuple(points_of(run).values())
@@ -264,7 +264,9 @@ def of_card(run: Run) -> Iterator[str]:
 
 def _of_latency(run: Run) -> Iterator[str]:
     """Yield what a run's latencies are otherwise than the source that it names for them."""
-    latency = run.manifest.latency
+    latency, timer = run.manifest.latency, run.manifest.timer
+    if timer and (change := timer.changed()):
+        yield change
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
     if latency.source in ("card", "paper"):

@@ -4,7 +4,8 @@ operating points and seeds in place of names.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
@@ -23,7 +24,9 @@ from harness.evaluate.looks import until
 from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.runs import timers
+from harness.runs.folder import read
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
+from harness.runs.timers import Timer
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
 
@@ -45,9 +48,18 @@ def spec(settings: Settings, source: Source) -> Spec:
         source=source,
         seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
-        timer=timers.chosen(settings.extensions),
+        timer=timers.chosen(settings.extensions) or _of_replayed(ego, settings),
         settings=settings,
     )
+
+
+def _of_replayed(ego: Agent, settings: Settings) -> Timer | None:
+    """Return what timed the answers of the run that is replayed, unless --latency is given."""
+    if settings.latency is not None or not ego.can.own_latency:
+        return None
+    with suppress(UserError):  # what is no run is refused when it is opened
+        return read(Path(ego.card.weights or "")).manifest.timer
+    return None
 
 
 def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:

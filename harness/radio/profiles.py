@@ -13,6 +13,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from harness.core import strangers
 from harness.core.config import convert, settable, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
@@ -21,7 +22,7 @@ from harness.core.plugins import FilesAndPlugins, Shipped
 from harness.core.strangers import worded
 from harness.radio.channel import Channel
 from harness.radio.constant import Radio
-from harness.radio.wrapped import is_ours
+from harness.radio.wrapped import Wrapped, is_ours
 
 # Models by name: a class, or a function of a file's parameters, its folder and their name in
 # messages. Beside the paper's, only extensions that ship have one.
@@ -46,6 +47,16 @@ class Profiles(FilesAndPlugins[Channel]):
     """Hold the channels of all profiles by name, from files and from packages."""
 
     folder = "channels"
+
+    def check(self, name: str, plugin: Channel) -> None:
+        """Raise an error unless a package's channel of the harness's own model, which acts
+        unchecked, has parameters that a file may have.
+        """
+        if strangers.is_ours(plugin):
+            if isinstance(plugin, Wrapped):
+                raise ValueError("it changes a channel of the harness's; write one of your own")
+            parameters = {each.name: getattr(plugin, each.name) for each in fields(plugin)}
+            convert(parameters, type(plugin), self.of_package(name))
 
     def read(self, file: Path) -> Channel:
         return _read(file)[1]

@@ -644,6 +644,23 @@ class Manifest(Struct, frozen=True, kw_only=True):
         for field_name, values in lists.items():
             if not 0 < len(values) == len(set(values)):
                 raise ValueError(f"{field_name}: none, or one twice")
+        self._check_speeds()
+
+    def _check_speeds(self) -> None:
+        """Raise ValueError unless answers are timed as what times them says."""
+        if not self.latency.speeds:
+            return
+        if (its_timer := self.timer) is None:
+            if self.model["engine"] != "replay":
+                raise ValueError("latency has speeds, and nothing states what timed the answers")
+            return
+        models = [self.model["name"], *(helper["model"]["name"] for helper in self.helpers)]
+        try:
+            speeds = its_timer.speeds(models)
+        except UserError as error:
+            raise ValueError(str(error)) from None
+        if speeds != self.latency.speeds:
+            raise ValueError(f"latency has other speeds than {its_timer.option} makes")
 
     @property
     def variant(self) -> Variant:

@@ -49,6 +49,17 @@ class Timer(ABC):
         """Return how fast an agent answers, as a run states it. Raises ValueError for no speed."""
 
     @abstractmethod
+    def speeds(self, models: Sequence[str]) -> tuple[Any, ...]:
+        """Return how fast the models of a run's agents answer, by name, the ego's first.
+
+        Raises UserError for a model that it cannot time.
+        """
+
+    @abstractmethod
+    def changed(self) -> str | None:
+        """Return what of it, as a run states it, is otherwise here; None if nothing is."""
+
+    @abstractmethod
     def answer_s(self, speed: Any, answer: "Answer") -> float:
         """Return the seconds of one answer, a repair turn included; NaN if the engine failed.
 

@@ -75,6 +75,15 @@ class Computer(Timer):
     def speed(self, stated: Any) -> Speed:
         return stated if isinstance(stated, Speed) else msgspec.convert(stated, Speed)
 
+    def speeds(self, models: Sequence[str]) -> tuple[Speed, ...]:
+        return tuple(profiles.speed(self.profile, self._row_of(model)) for model in models)
+
+    def changed(self) -> str | None:
+        name = self.profile.name
+        if name in profiles.names() and profiles.load(name) == self.profile:
+            return None
+        return f"run.json has device profile {printable(name)} otherwise than it is here"
+
     def answer_s(self, speed: Speed, answer: Answer) -> float:
         return answer_s(speed, answer)
 
@@ -114,7 +123,7 @@ class Computer(Timer):
                 f"{answerer} on {device.name} ({row.precision}, batch {row.batch_size}; joules "
                 f"{' and '.join(sorted(joules)) or 'unknown'}; rates {origin})"
             )
-        speeds = tuple(profiles.speed(device, row) for row in rows)
+        speeds = self.speeds([agent.card.name for agent in agents])
         return Latency(SOURCE, "; ".join(dict.fromkeys(descriptions)), speeds=speeds)
 
     def rows_of(self, agents: "Sequence[Agent]") -> list[DeviceRow]:
@@ -130,15 +139,19 @@ class Computer(Timer):
                 raise UserError(
                     f"{self._typed}: {name} is no language model and counts no tokens; leave it out"
                 )
-            row = profiles.find_row(self.profile, self.model or agent.card.name.partition(":")[0])
-            for rate in profiles.RATES if row.answer_ms is None else ():
-                if getattr(row, rate) is None:
-                    raise UserError(
-                        f"{self._typed} states no {rate} of {printable(row.model)}, so it cannot "
-                        "time answers; give another device, or another --device-model"
-                    )
-            rows.append(row)
+            rows.append(self._row_of(agent.card.name))
         return rows
+
+    def _row_of(self, model: str) -> DeviceRow:
+        """Return the row that times the answers of a model, by its card's name."""
+        row = profiles.find_row(self.profile, self.model or model.partition(":")[0])
+        for rate in profiles.RATES if row.answer_ms is None else ():
+            if getattr(row, rate) is None:
+                raise UserError(
+                    f"{self._typed} states no {rate} of {printable(row.model)}, so it cannot "
+                    "time answers; give another device, or another --device-model"
+                )
+        return row
 
     @property
     def _typed(self) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
-from harness.core.strangers import strangers
+from harness.core.strangers import strangers, watched
 from harness.world.road import Lane
 from harness.world.scenario import KNOWN_ACTIONS
 
@@ -115,7 +115,7 @@ def reset(name: str, seed: int) -> Any:
     env = _create(name)
     _constants().restore()
     try:
-        with strangers(shown(name)):
+        with watched(shown(name)), strangers(shown(name)):
             env.reset(seed=seed)
     except UserError:
         raise
@@ -170,7 +170,7 @@ def _create(name: str) -> Any:
         raise UserError(f"{shown(name)}: give its version too, as in merge-v0")
     _constants().restore()
     try:
-        with strangers(shown(name)):
+        with watched(shown(name)), strangers(shown(name)):
             env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
     except UserError:
         raise

@@ -251,6 +251,34 @@ def test_what_a_stranger_states_of_a_computer_is_held_to_its_types(
     assert "\n" not in str(error.value)
 
 
+def test_answers_take_as_long_as_the_profile_says(counted: Callable[..., folder.Run]) -> None:
+    """Speeds that a file states otherwise, or of a profile that it does not state, are refused."""
+    told = counted(ALONE, timer=Computer(DESK, "big"))
+    stated = json.loads((told.path / "run.json").read_text())
+
+    def reads(**change: Any) -> None:
+        (told.path / "run.json").write_text(json.dumps({**stated, **change}))
+        folder.read(told.path)
+
+    [speed] = stated["latency"]["speeds"]
+    for speeds in ([{**speed, "decode_tokens_per_s": 1e5}], [speed, speed]):
+        with pytest.raises(UserError, match="other speeds than --device-profile makes"):
+            reads(latency={**stated["latency"], "speeds": speeds})
+    gone = {**stated["settings"], "device_profile": None, "device_model": None}
+    with pytest.raises(UserError, match="nothing states what timed the answers"):
+        reads(device_profile=None, device_model=None, settings=gone)
+
+
+def test_a_profile_that_is_otherwise_than_here_is_named() -> None:
+    """Under the name of one that ships a run can state any."""
+    here = profiles.load("agx-orin")
+    assert Computer(here).changed() is None
+    forged = msgspec.structs.replace(here, description="mine")
+    assert Computer(forged).changed() == (
+        "run.json has device profile agx-orin otherwise than it is here"
+    )
+
+
 def test_without_a_device_profile_nothing_is_said_of_energy(
     counted: Callable[..., folder.Run],
 ) -> None:
