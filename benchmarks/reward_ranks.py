@@ -77,7 +77,7 @@ def of_model(model: str, data: Dataset) -> Policy:
     spec = resolve.spec(stated, resolve.frozen(stated.world, stated.world.dataset))
     models = open_each(spec.cards, lambda card: open_backend(card, batch_size=32))
     backend = together(spec.cards, models)
-    taken_as = latency.known("paper", (spec.ego,), models)
+    taken_as = latency.chosen_latency("paper", (spec.ego,), models)
     assert taken_as
     asker = Asker(spec, lambda: backend, taken_as)
 

@@ -134,7 +134,7 @@ def test_a_flipped_question_lists_its_options_in_reverse(wire: str, data: Datase
     question = next(requests(spec, scenes_of(data)[:1]))
     with opened(wire, lambda got: got.reply(answer(wire))) as (there, backend):
         [done] = backend.complete([question])
-        [mirror] = backend.complete([flip.asked(question)])
+        [mirror] = backend.complete([flip.mirror_request(question)])
     listed = [
         list(got.body["questions"]["action"]["criteria"])
         if wire == "systemone"
@@ -143,7 +143,9 @@ def test_a_flipped_question_lists_its_options_in_reverse(wire: str, data: Datase
     ]
     assert listed == [list(question.actions), list(question.actions[::-1])]
     assert (
-        flip.compared(answer_of(question, done), answer_of(flip.asked(question), mirror)).flipped
+        flip.compared(
+            answer_of(question, done), answer_of(flip.mirror_request(question), mirror)
+        ).flipped
         is False
     )
 

@@ -29,7 +29,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
 from harness.evaluate.agent import Agent
-from harness.evaluate.latency import PAPER, as_declared, declared, known, times
+from harness.evaluate.latency import PAPER, as_declared, chosen_latency, declared, times
 from harness.evaluate.timing import IDLE, measured
 from harness.prompts import versions
 from harness.report.notes import pace
@@ -51,16 +51,19 @@ def test_the_paper_counts_unless_a_card_or_the_user_declares_a_time() -> None:
     latency = CardLatency("card", 0.03, "measured: my car, today")
     fast = [Agent(replace(resolve(LANGUAGE_MODEL), latency=latency), prompt)]
     of_card = Latency("card", "measured: my car, today", 0.03, 0.03, 0.03)
-    assert known(None, silent, nobody) == known("paper", silent, nobody) == PAPER
+    assert chosen_latency(None, silent, nobody) == chosen_latency("paper", silent, nobody) == PAPER
     assert (PAPER.ego_s, PAPER.helper_s, PAPER.fusion_s) == (0.145, 0.145, 0.145)
-    assert known(None, fast, nobody) == known("card", fast, nobody) == of_card
+    assert chosen_latency(None, fast, nobody) == chosen_latency("card", fast, nobody) == of_card
     cited = CardLatency("cited", 0.012, "cited: its makers, their computer; never run here")
     elsewhere = [Agent(replace(resolve(LANGUAGE_MODEL), latency=cited), prompt)]
-    assert known(None, elsewhere, nobody) == PAPER  # another computer's time counts by name alone
-    assert known("card", elsewhere, nobody) == Latency("card", cited.basis, 0.012, 0.012, 0.012)
-    assert known("paper", fast, nobody) == PAPER
-    assert known("measured", fast, nobody) is None
-    told = known("ego=0.2,helper=0.1", fast, nobody)
+    # another computer's time counts by name alone
+    assert chosen_latency(None, elsewhere, nobody) == PAPER
+    assert chosen_latency("card", elsewhere, nobody) == Latency(
+        "card", cited.basis, 0.012, 0.012, 0.012
+    )
+    assert chosen_latency("paper", fast, nobody) == PAPER
+    assert chosen_latency("measured", fast, nobody) is None
+    told = chosen_latency("ego=0.2,helper=0.1", fast, nobody)
     assert told == Latency("declared", "declared: --latency ego=0.2,helper=0.1", 0.2, 0.1, 0.2)
 
 

@@ -383,7 +383,7 @@ def test_a_replay_tells_the_turns_apart(small: Dataset, tmp_path: Path) -> None:
     assert (first.text, first.slow_s) == (stored.first.raw, stored.first.slow_s)
     answer = msgspec.structs.replace(stored, raw=stored.first.raw)  # as it was after its first turn
     [second] = backend.complete(
-        [repair.asked(question, answer, spec.ego.prompt, spec.scenario.prompt_words)]
+        [repair.repair_request(question, answer, spec.ego.prompt, spec.scenario.prompt_words)]
     )
     assert second.text == stored.raw
     assert first.slow_s + second.slow_s == stored.slow_s

@@ -216,7 +216,7 @@ class Agent:
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:
         """Return the chat messages before the answer mode changes them; arguments as in `chats`."""
-        return shown(
+        return sent_messages(
             self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE)
         )
 
@@ -234,7 +234,9 @@ class Agent:
         }
 
 
-def shown(image: str, messages: Sequence[Mapping[str, str]]) -> tuple[Mapping[str, str], ...]:
+def sent_messages(
+    image: str, messages: Sequence[Mapping[str, str]]
+) -> tuple[Mapping[str, str], ...]:
     """Return a prompt's chat messages, without their pictures if `image` is `none`."""
     if image != "none":
         return tuple(messages)
@@ -259,8 +261,8 @@ def in_mode(
     nothing.
     """
     if answer == "decision":
-        asked = decision.question(messages, graph, actions, words)
-        return decision.asked(asked, messages, actions)
+        question = decision.question(messages, graph, actions, words)
+        return decision.asked(question, messages, actions)
     if answer != "readout":
         return tuple(messages)
     return readout.asked(messages, actions, example_actions(prompt, graph.role, actions))

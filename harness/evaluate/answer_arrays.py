@@ -44,9 +44,9 @@ def intents_of(
     not_yet = None if spec.asks_all else np.array(unasked, dtype=bool).reshape(shape)
     own_bits, own_text_bytes = None, None
     if any(point.needs("plans") for point in spec.points):
-        own = [row[0] for row in rows]
-        own_bits = np.array(list(map(_bits, scenes, own)), dtype=float)
-        own_text_bytes = np.array(list(map(_text_bytes, own)), dtype=float)
+        ego_answers = [row[0] for row in rows]
+        own_bits = np.array(list(map(_bits, scenes, ego_answers)), dtype=float)
+        own_text_bytes = np.array(list(map(_text_bytes, ego_answers)), dtype=float)
     return Intents(
         intents[:, 0],
         intents[:, 1:],

@@ -193,7 +193,7 @@ class Asker:
         # How many there are while none could be read; None once one could, or it was said.
         self._unread: int | None = None if self.answers else 0
 
-    def ask(self, asked: Sequence[Request]) -> None:
+    def ask(self, requests: Sequence[Request]) -> None:
         """Ask the requests whose answers are missing, each once, and keep each chunk of answers.
 
         Raises Unanswered if a question of the ego or a fusion call got no answer, once all others
@@ -205,13 +205,13 @@ class Asker:
             if self._checks_kept:
                 self._unasked |= recalled.keys() - self.answers.keys()
             self.answers = recalled | self.answers
-        kept = [request for request in asked if request.id in self._unasked]
+        kept = [request for request in requests if request.id in self._unasked]
         for request in kept:
             self._check_kept(request)
         self._check_rules(kept)
-        missing = [request for request in asked if request.id not in self.answers]
-        if len(missing) < len(asked):
-            self._progress(len(asked) - len(missing))
+        missing = [request for request in requests if request.id not in self.answers]
+        if len(missing) < len(requests):
+            self._progress(len(requests) - len(missing))
         if not missing:
             return
         # An answer may depend on the other requests in its batch. Chunks are kept whole or not at
@@ -271,8 +271,8 @@ class Asker:
             return
         for request, here in zip(of_rules, self._backend().complete(of_rules), strict=True):
             kept_answer = self.answers[request.id]
-            stated = kept_answer.first or kept_answer  # before a repair turn
-            if (stated.raw, stated.slow_s) != (here.text, here.slow_s):
+            first_answer = kept_answer.first or kept_answer  # before a repair turn
+            if (first_answer.raw, first_answer.slow_s) != (here.text, here.slow_s):
                 assert self._kept
                 raise UserError(
                     f"{printable(self._kept.file)}: answer {printable(request.id)} is not what the "
@@ -283,7 +283,7 @@ class Asker:
         """Return whether there is an answer to a question that was asked here."""
         return name in self.answers and name not in self._unasked
 
-    def asked(self) -> dict[str, Answer]:
+    def asked_answers(self) -> dict[str, Answer]:
         """Return all answers by request id, except kept ones whose question was not asked here."""
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
@@ -346,11 +346,11 @@ class Asker:
         repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
             if flip.wanted(request, answer):
-                flips[place] = flip.asked(request)
+                flips[place] = flip.mirror_request(request)
             prompt = self.spec.agents[request.agent].prompt
             if repair.wanted(request, answer, prompt):
                 words = (request.scenario or self.spec.scenario).prompt_words
-                repairs[place] = repair.asked(request, answer, prompt, words)
+                repairs[place] = repair.repair_request(request, answer, prompt, words)
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):
             answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
@@ -420,8 +420,8 @@ class Asker:
         # Only the prompts of scenes whose answers were not all given are rendered.
         lacks = list(self._lacking(scenes, self._given.__contains__, question, places))
         scenes = list(compress(scenes, lacks))
-        asked = None if places is None else list(compress(places, lacks))
-        self.answer(list(requests(self.spec, scenes, question, asked)))
+        lacking_places = None if places is None else list(compress(places, lacks))
+        self.answer(list(requests(self.spec, scenes, question, lacking_places)))
 
     def _lacking(
         self,
@@ -431,12 +431,12 @@ class Asker:
         places: Places | None = None,
     ) -> Iterator[bool]:
         first = 0 if question == PLAIN else 1  # only helpers are asked another question
-        for scene, asked in zip(scenes, places or repeat(None), strict=False):
+        for scene, asked_places in zip(scenes, places or repeat(None), strict=False):
             viewers = enumerate(self.spec.viewers(scene))
             yield any(
                 not is_available(request_id(scene, viewer, question))
                 for place, viewer in viewers
-                if place >= first and (asked is None or place in asked)
+                if place >= first and (asked_places is None or place in asked_places)
             )
 
     def laid_out(
@@ -527,9 +527,9 @@ class Asker:
         """Announce requests to `more`, and ask those whose answers are missing; raises as `ask`."""
         # Requests whose answers were kept stay, so that the chunks begin at the same places as
         # before.
-        asked = [request for request in requests if request.id not in self._given]
-        self._more(len(asked))
-        self.ask(asked)
+        requests_to_ask = [request for request in requests if request.id not in self._given]
+        self._more(len(requests_to_ask))
+        self.ask(requests_to_ask)
 
 
 def _answer_chunks(

@@ -73,22 +73,22 @@ def budget(most: float | None, specs: "Sequence[Spec]") -> Iterator[Budget | Non
     if most is None:
         yield None
         return
-    shown = f"--max-cost {most:g}"
+    option = f"--max-cost {most:g}"
     if not (math.isfinite(most) and most > 0):
-        raise UserError(f"{shown}: give an amount above 0, in the currency of the card's [price]")
+        raise UserError(f"{option}: give an amount above 0, in the currency of the card's [price]")
     prices = {card.price for spec in specs for card in spec.cards if card.price}
     if len(currencies := {price.currency for price in prices}) != 1:
         names = ", ".join(sorted({printable(card.name) for spec in specs for card in spec.cards}))
         reason = f"has prices in {' and '.join(sorted(currencies))}" if prices else "has no price"
         raise UserError(
-            f"{shown}: {names} {reason}; give its card a [price] with input, output and currency"
+            f"{option}: {names} {reason}; give its card a [price] with input, output and currency"
         )
     cards = {card.name: card for spec in specs for card in spec.cards}
     if free := sorted(
         printable(name) for name, card in cards.items() if card.server and not card.price
     ):
         print(
-            f"harness: {shown}: {', '.join(free)} has no price and is not counted", file=sys.stderr
+            f"harness: {option}: {', '.join(free)} has no price and is not counted", file=sys.stderr
         )
     with tempfile.TemporaryDirectory(prefix="swarmdrive-") as folder:
         file = Path(folder) / "spent"
@@ -171,8 +171,8 @@ def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]
     for work in works:
         for line in bytes_of(work / FILE, "rows").splitlines() if (work / FILE).is_file() else ():
             with suppress(msgspec.MsgspecError):  # torn, if the run was killed
-                asked = msgspec.structs.asdict(msgspec.json.decode(line, type=Asked))
-                sums.setdefault(asked.pop("model"), Counter()).update(asked)
+                counts = msgspec.structs.asdict(msgspec.json.decode(line, type=Asked))
+                sums.setdefault(counts.pop("model"), Counter()).update(counts)
     return {
         name: Cost(
             prices[name].currency,

@@ -25,14 +25,16 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
-    asked, scenes = Counter[str](), dataset.scenes(dataset.courses())
+    requests_by_role, scenes = Counter[str](), dataset.scenes(dataset.courses())
     intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
     plain = spec.asks_all or any(point.question == PLAIN for point in intents)
-    own = requests(spec, scenes, places=None if plain else [EGO] * len(scenes))
+    plain_requests = requests(spec, scenes, places=None if plain else [EGO] * len(scenes))
     asking = spec.points if spec.asks_all else intents
     others = {point.question for point in asking if point.question != PLAIN}
-    for request in chain(own, *(requests(spec, scenes, question) for question in others)):
-        asked[request.role] += 1
+    for request in chain(
+        plain_requests, *(requests(spec, scenes, question) for question in others)
+    ):
+        requests_by_role[request.role] += 1
         card, tokens = spec.agents[request.agent].card, None
         if tokens_of:
             vision = card.vision if request.image else None
@@ -48,12 +50,12 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
             )
             of["answers"] += card.price.of(0, times * request.max_tokens)
     if calls := sum(1 for scene in scenes for _ in _fusion_calls(spec, scene)):
-        asked["fusion"] = calls
+        requests_by_role["fusion"] = calls
     stats = {role: summarize_counts(n) for role, n in sizes.items()}
     counts = {
         **spec.record(),
-        "requests": asked.total(),
-        "requests_by_role": dict(asked),
+        "requests": requests_by_role.total(),
+        "requests_by_role": dict(requests_by_role),
         "scenes": len(scenes),
         "prompt_tokens": stats or None,
     }
@@ -74,8 +76,8 @@ def lacking(
     )
     for scene in dataset.scenes(scenes):
         viewers = spec.viewers(scene)
-        own = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
-        for role, those in own.items():
+        viewers_by_role = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
+        for role, those in viewers_by_role.items():
             lacks[role] += sum(f"{scene.id}/{viewer}" not in answers for viewer in those)
         lacks["fusion"] += sum(name not in answers for name in _fusion_calls(spec, scene))
     return dict(lacks)

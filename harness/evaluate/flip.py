@@ -21,7 +21,7 @@ def wanted(request: Request, answer: Answer) -> bool:
     return bool(request.flips) and answer.intent is not None and answer.flipped is UNSET
 
 
-def asked(request: Request) -> Request:
+def mirror_request(request: Request) -> Request:
     """Return the request with its list of actions reversed."""
     messages, *orders = request.flips
     return request.alike(

@@ -87,23 +87,25 @@ class FrozenSource:
         )
         return FrozenSource(dataset, selection, until)
 
-    def layouts(self, asked: int) -> list[Layout]:
+    def layouts(self, n_asked: int) -> list[Layout]:
         """Return how hard each layout is, of those asked and of others that might have been asked.
 
-        The first `asked` are the source's own episodes. The list is empty if there are no others,
+        The first `n_asked` are the source's own episodes. The list is empty if there are no others,
         or too few were asked to correct anything.
         """
-        if asked < LEAST:
+        if n_asked < LEAST:
             return []
-        own, pool = self.dataset.episodes[:asked], self.dataset.whole
+        own_episodes, pool = self.dataset.episodes[:n_asked], self.dataset.whole
         pool = replace(self.selection, limit=None, sample=None).of(pool)
-        if len(pool.episodes) <= asked:
+        if len(pool.episodes) <= n_asked:
             return []
-        pool = pool.of_episodes(frozenset((*own, *pool.episodes[: MOST_KNOWN * asked])))
+        pool = pool.of_episodes(frozenset((*own_episodes, *pool.episodes[: MOST_KNOWN * n_asked])))
         success = pool.reference_success()
         dangers = (tree.danger.sector or NONE for tree in pool.trees)
-        known = (success[name].tolist() for name in REFERENCES)
-        return [Layout(*each) for each in zip(pool.episodes, dangers, *known, strict=True)]
+        reference_successes = (success[name].tolist() for name in REFERENCES)
+        return [
+            Layout(*each) for each in zip(pool.episodes, dangers, *reference_successes, strict=True)
+        ]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield the first decision point of each of up to `most` episodes, with all graphs."""
@@ -264,9 +266,11 @@ class FrozenWorld(SceneWorld):
             ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
         )
         ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
-        known = {name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()}
+        ends_or_nan = {
+            name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()
+        }
         dangerous = np.array([danger is not None for danger in self._forest.dangers])
-        return {**known, **by_danger(known["success_rate"], dangerous)}
+        return {**ends_or_nan, **by_danger(ends_or_nan["success_rate"], dangerous)}
 
     def episodes(self) -> list[Episode]:
         forest = self._forest

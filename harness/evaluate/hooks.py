@@ -172,8 +172,8 @@ class Followers:
                     caller.call(method, deepcopy(arguments), patience_s or PATIENCE_S)
             except Exception as error:  # a stranger's code
                 who = f"tracker {printable(name)}"
-                shown = one_line(error).removeprefix(f"{who} ") or type(error).__name__
-                print(f"harness: {who}: {shown}; the run goes on without it", file=sys.stderr)
+                reason = one_line(error).removeprefix(f"{who} ") or type(error).__name__
+                print(f"harness: {who}: {reason}; the run goes on without it", file=sys.stderr)
                 del self._callers[name]
 
 

@@ -28,7 +28,7 @@ NAMES = ("card", MEASURED, "paper")
 EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 
 
-def known(
+def chosen_latency(
     choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]
 ) -> Latency | None:
     """Return the latency that `--latency` chooses for agents, the ego's first; None to measure it.

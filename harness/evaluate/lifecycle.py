@@ -65,16 +65,16 @@ class Evaluated:
 def begin(
     spec: Spec,
     out: Path,
-    begun: RunStart | None,
+    run_start: RunStart | None,
     identity: dict[str, Any],
     latency: Latency,
     shard: str = "",
 ) -> RunStart:
-    """Return the record of a run that begins, or `begun` if it resumes.
+    """Return the record of a run that begins, or `run_start` if it resumes.
 
     Raises UserError if the run was begun with a model of another identity.
     """
-    if begun is None:
+    if run_start is None:
         return RunStart(
             settings=spec.record(),
             shard=shard,
@@ -85,12 +85,12 @@ def begin(
             latency=latency,
             versions=versions(),
         )
-    if not same_model(begun.identity, identity):
+    if not same_model(run_start.identity, identity):
         raise UserError(
             f"--out {printable(out)} was begun with {another_model(spec)}; delete it, or choose "
             "another folder"
         )
-    return begun
+    return run_start
 
 
 def another_model(spec: Spec) -> str:
@@ -99,19 +99,19 @@ def another_model(spec: Spec) -> str:
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
-def as_finished(spec: Spec, begun: RunStart, looks: Looks | None = None) -> RunStart:
+def as_finished(spec: Spec, run_start: RunStart, looks: Looks | None = None) -> RunStart:
     """Return the record of a run as it finishes, to write into its manifest.
 
     It has the tags of all commands, the dataset's present path, and measured times as declared
     ones. A run that stopped early (`looks`) also states after how many layouts.
     """
-    spec = spec.changed(tag=tuple(dict.fromkeys((*begun.tags, *spec.settings.tag))))
+    spec = spec.changed(tag=tuple(dict.fromkeys((*run_start.tags, *spec.settings.tag))))
     # A repeat must not measure: other times would make other rows.
     if spec.settings.latency == latencies.MEASURED:
-        spec = spec.changed(latency=latencies.as_declared(begun.latency))
+        spec = spec.changed(latency=latencies.as_declared(run_start.latency))
     record = {**_stopped(spec, looks).record(), "settings": msgspec.to_builtins(spec.settings)}
     return msgspec.structs.replace(
-        begun,
+        run_start,
         settings=record,
         tags=spec.settings.tag,
         command=words(spec.settings),
@@ -128,13 +128,13 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
 
     Raises UserError if it is a run with other settings.
     """
-    begun = work.begun(out, RunStart)
-    if begun:
+    run_start = work.begun(out, RunStart)
+    if run_start:
         now = {**_comparable(spec.record()), "shard": shard}
-        stored = {**_comparable(begun.settings), "shard": begun.shard}
-        work.same(out, now, stored, partial(_options, spec, shlex.join(begun.command)))
-        work.same(out, _rules(versions()), _rules(begun.versions))
-    return begun
+        stored = {**_comparable(run_start.settings), "shard": run_start.shard}
+        work.same(out, now, stored, partial(_options, spec, shlex.join(run_start.command)))
+        work.same(out, _rules(versions()), _rules(run_start.versions))
+    return run_start
 
 
 def _options(spec: Spec, command: str) -> str:

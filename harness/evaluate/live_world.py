@@ -391,12 +391,12 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
     `alone_s` has when each would clear alone.
     """
     world = trajectory.world
-    journeys, its = world.journeys, ends(world, alone_s)
+    journeys, ends_of_agents = world.journeys, ends(world, alone_s)
     failing = gravest(journeys)
     worst = None if failing is None else journeys[failing].outcome
-    lost_s = {end.agent: end.lost_s for end in its if end.lost_s is not None}
+    lost_s = {end.agent: end.lost_s for end in ends_of_agents if end.lost_s is not None}
     most = max(lost_s, key=lost_s.__getitem__, default=None)
-    time_s = worst.time_s if worst else max(end.time_s or 0.0 for end in its)
+    time_s = worst.time_s if worst else max(end.time_s or 0.0 for end in ends_of_agents)
     failure = worst.result if worst else ""
     return Episode(
         condition=course.point.name,
@@ -415,11 +415,11 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
         hard_brakings=sum(journey.hard_brakings for journey in journeys.values()),
         other_crashes=world.outcome.other_crashes,
         skipped=course.skipped,
-        agents=len(its),
+        agents=len(ends_of_agents),
         arrived=len(lost_s),
-        met=sum(end.met for end in its),
+        met=sum(end.met for end in ends_of_agents),
         agents_lost_s=round(sum(lost_s.values()), 3) if lost_s else None,
         most_lost_s=None if most is None else lost_s[most],
         gave_way=most if most is not None and lost_s[most] > 0 else None,
-        journeys=msgspec.json.encode(its).decode(),
+        journeys=msgspec.json.encode(ends_of_agents).decode(),
     )

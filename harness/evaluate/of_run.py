@@ -36,7 +36,7 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
     Raises UserError if a prompt of it is not installed here.
     """
     manifest = run.manifest
-    ego, *helpers = (_agent(run, stated) for stated in (manifest.agent(0), *manifest.helpers))
+    ego, *helpers = (_agent(run, record) for record in (manifest.agent(0), *manifest.helpers))
     settings = deciding(manifest.settings)
     settings = structs.replace(settings, ask="used", latency=None)
     return Spec(ego, source, (), manifest.seeds, tuple(helpers), settings=settings)
@@ -55,7 +55,7 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     manifest = run.manifest
     points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
     kept = kept_of(points.values())
-    stated: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
+    records_by_kind: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
         "channel profile": (manifest.channels, CHANNELS.unchanged),
         "network": (manifest.networks, lambda name, then: _same(asdict(network(name)), then)),
         "schedule": (
@@ -65,8 +65,8 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     }
     for folder, recorded_there in manifest.kept.items():
         is_kept = partial(_is_kept, kept.get(folder, {}))
-        stated[printable(folder.removesuffix("s"))] = recorded_there, is_kept
-    for what, (by_name, unchanged) in stated.items():
+        records_by_kind[printable(folder.removesuffix("s"))] = recorded_there, is_kept
+    for what, (by_name, unchanged) in records_by_kind.items():
         for name, recorded in by_name.items():
             if not unchanged(name, recorded):
                 raise UserError(
@@ -78,8 +78,8 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
 
 def check_prompts(run: Run, spec: Spec) -> None:
     """Raise UserError if a prompt's files here differ from those that the run was made with."""
-    stated = (run.manifest.agent(0), *run.manifest.helpers)
-    for agent, each in zip(spec.agents, stated, strict=True):
+    agent_records = (run.manifest.agent(0), *run.manifest.helpers)
+    for agent, each in zip(spec.agents, agent_records, strict=True):
         if agent.prompt.sha256 != each["prompt"]["sha256"]:
             version = printable(agent.prompt.version)
             raise UserError(
@@ -95,27 +95,27 @@ def _same(now: Any, recorded: Any) -> bool:
     return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
 
 
-def _agent(run: Run, stated: Mapping[str, Any]) -> Agent:
-    card = convert(stated["model"], Card, f"{printable(run.path)}: its model")
-    if (version := stated["prompt"]["version"]) not in versions.names():
+def _agent(run: Run, agent_record: Mapping[str, Any]) -> Agent:
+    card = convert(agent_record["model"], Card, f"{printable(run.path)}: its model")
+    if (version := agent_record["prompt"]["version"]) not in versions.names():
         raise UserError(
             f"{printable(run.path)}: prompt {printable(version)} is not here; "
-            f"{_restore(run, stated)}"
+            f"{_restore(run, agent_record)}"
         )
     return Agent(
         card,
         versions.load(version),
-        cast("AnswerMode", stated["answer"]),
-        stated["thinking"],
-        cast("ImageMode", stated["image"]),
-        cast("Letters", stated["letters"]),
-        cast("Sums", stated["sums"]),
+        cast("AnswerMode", agent_record["answer"]),
+        agent_record["thinking"],
+        cast("ImageMode", agent_record["image"]),
+        cast("Letters", agent_record["letters"]),
+        cast("Sums", agent_record["sums"]),
     )
 
 
-def _restore(run: Run, stated: Mapping[str, Any]) -> str:
+def _restore(run: Run, agent_record: Mapping[str, Any]) -> str:
     """What to do if a prompt is not here as it was: nothing is asked with a run's prompts."""
-    if prompt_of(run, stated["prompt"]) is None:
+    if prompt_of(run, agent_record["prompt"]) is None:
         return "restore it or run again"
-    kept = run.path / SOURCES / PROMPTS / stated["prompt"]["version"]
+    kept = run.path / SOURCES / PROMPTS / agent_record["prompt"]["version"]
     return f"copy {printable(kept)} to prompts/, or run again"

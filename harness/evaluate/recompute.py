@@ -69,8 +69,8 @@ class Held:
         self._rule, self._kept, self.wrong = rule, kept, 0
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        stated, here = self._kept.complete(requests), self._rule.complete(requests)
-        self.wrong += sum(a.text != b.text for a, b in zip(stated, here, strict=True))
+        kept_completions, here = self._kept.complete(requests), self._rule.complete(requests)
+        self.wrong += sum(a.text != b.text for a, b in zip(kept_completions, here, strict=True))
         return here
 
     def identity(self) -> dict[str, Any]:
@@ -80,15 +80,13 @@ class Held:
         return self._kept.latency()
 
 
-def computed(
-    stated: Run, spec: Spec, out: Path, progress: Callable[[int], None]
-) -> tuple[Run, int]:
+def computed(run: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -> tuple[Run, int]:
     """Compute a run again from its stored answers into folder `out`.
 
     Returns the new run, and how many stored answers differ from those of the rule-based model
     installed here; 0 for other models. `progress` gets the number of answers.
     """
-    kept, held = Kept(stated), list[Held]()
+    kept, held = Kept(run), list[Held]()
 
     def opens(card: Card, **options: Any) -> Backend:
         if card.engine not in RULES:
@@ -132,15 +130,15 @@ def differences(
     source = FrozenSource(selection.of(dataset), selection)
     if source.dataset.episodes != run.grid.episodes:
         return ["episodes.csv has other episodes than run.json says that were selected"], []
-    stated, manifest = spec_of(run, source), run.manifest
-    check_prompts(run, stated)
+    stored_spec, manifest = spec_of(run, source), run.manifest
+    check_prompts(run, stored_spec)
     timer = manifest.timer
-    ego = replace(stated.ego, card=card_here(stated.ego.card))
+    ego = replace(stored_spec.ego, card=card_here(stored_spec.ego.card))
     latency = None if manifest.latency.speeds else latencies.as_declared(manifest.latency)
-    said = manifest.settings
-    settings = structs.replace(stated.settings, ask=said.ask, latency=latency)
+    stored_settings = manifest.settings
+    settings = structs.replace(stored_spec.settings, ask=stored_settings.ask, latency=latency)
     points = tuple(points_of(run).values())
-    spec = replace(stated, ego=ego, points=points, timer=timer, settings=settings)
+    spec = replace(stored_spec, ego=ego, points=points, timer=timer, settings=settings)
     try:
         ours, otherwise = computed(run, spec, out, progress)
     except LacksAnswer as lack:
@@ -148,7 +146,7 @@ def differences(
         return [*contradictions(run), *_of_rule(lack.otherwise), lacks], []
     wrong = [
         *contradictions(run),
-        *_of_manifest(run, ours, stated.ego.card),
+        *_of_manifest(run, ours, stored_spec.ego.card),
         *_of_episodes(run, ours),
         *_of_decisions(run, ours),
         *_of_answers(run, ours),
@@ -164,20 +162,20 @@ def _of_rule(otherwise: int) -> Iterator[str]:
         yield f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here"
 
 
-def _lacking(stated: Run, ours: Run) -> Iterator[str]:
+def _lacking(run: Run, ours: Run) -> Iterator[str]:
     """Yield, in a sentence, the columns that are empty in a run by older rules,
     and are not here.
     """
-    if current(stated):
+    if current(run):
         return
-    theirs, here = stated.decisions.table, ours.decisions.table
+    table, here = run.decisions.table, ours.decisions.table
     names = [
         *(
             name
             for name in Episode.__struct_fields__
-            if _empty(stated, name) and not _empty(ours, name)
+            if _empty(run, name) and not _empty(ours, name)
         ),
-        *(name for name in here.column_names if _null(theirs, name) and not _null(here, name)),
+        *(name for name in here.column_names if _null(table, name) and not _null(here, name)),
     ]
     if names := list(dict.fromkeys(names)):
         yield (
@@ -203,31 +201,31 @@ def driven_otherwise(run: Run) -> Iterator[str]:
     from harness.evaluate.replay import driven_again, played
 
     yield from _of_latency(run)
-    for stated in spot_check(run.episodes, sha256_file(run.path / "episodes.csv"), AGAIN):
-        here = driven_again(played(run, stated.episode, stated.condition, stated.seed))
-        for name, _ in differing([stated], [here]):
-            if name in OF_ENDS and (current(run) or getattr(stated, name) is not None):
+    for row in spot_check(run.episodes, sha256_file(run.path / "episodes.csv"), AGAIN):
+        here = driven_again(played(run, row.episode, row.condition, row.seed))
+        for name, _ in differing([row], [here]):
+            if name in OF_ENDS and (current(run) or getattr(row, name) is not None):
                 yield (
-                    f"episodes.csv has another {name} of episode {stated.episode} in "
-                    f"{printable(stated.condition)}, seed {stated.seed}, than its actions lead to"
+                    f"episodes.csv has another {name} of episode {row.episode} in "
+                    f"{printable(row.condition)}, seed {row.seed}, than its actions lead to"
                 )
 
 
-def _of_manifest(stated: Run, ours: Run, card: Card) -> Iterator[str]:
+def _of_manifest(run: Run, ours: Run, card: Card) -> Iterator[str]:
     """Yield what run.json, with this card, says otherwise of scenes, conditions,
     latency and model.
     """
-    world, here = (to_builtins(run.manifest.world) for run in (stated, ours))
+    world, here = (to_builtins(each.manifest.world) for each in (run, ours))
     for name in here.keys() - {"path", "looks"}:
         if world.get(name) != here[name]:
             yield f"run.json has another {name} of its scenes than the dataset"
-    latency, card_s = stated.manifest.latency, card.latency.inference_s
+    latency, card_s = run.manifest.latency, card.latency.inference_s
     if card.engine == REPLAY:  # its answers took as long as in the run that it replays
-        card_s = asked_card(stated).latency.inference_s
+        card_s = asked_card(run).latency.inference_s
     if latency.source == "card" and card_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
-    yield from _of_latency(stated)
-    if stated.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
+    yield from _of_latency(run)
+    if run.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
         yield "run.json says of a driver that it sees other than it does"
 
 
@@ -277,52 +275,51 @@ def _of_latency(run: Run) -> Iterator[str]:
             yield f"run.json has another latency of {whose} than of the ego, whose source it names"
 
 
-def _of_episodes(stated: Run, ours: Run) -> Iterator[str]:
+def _of_episodes(run: Run, ours: Run) -> Iterator[str]:
     """Yield which columns of episodes.csv differ; a column that an older run lacks does not."""
-    for name, wrong in differing(stated.episodes, ours.episodes):
-        if current(stated) or not _empty(stated, name):
+    for name, wrong in differing(run.episodes, ours.episodes):
+        if current(run) or not _empty(run, name):
             yield f"episodes.csv has another {name} in {amount(wrong, 'row')} than its answers make"
 
 
-def _of_answers(stated: Run, ours: Run) -> Iterator[str]:
+def _of_answers(run: Run, ours: Run) -> Iterator[str]:
     """Yield what answers.jsonl says otherwise of its texts,
     from which the rates of parsing follow.
     """
     here = {(each.scene, each.viewer, each.heard, each.role): each for each in ours.answers}
-    asked = [
-        (each, here.get((each.scene, each.viewer, each.heard, each.role)))
-        for each in stated.answers
+    answer_pairs = [
+        (each, here.get((each.scene, each.viewer, each.heard, each.role))) for each in run.answers
     ]
     for name in OF_TEXTS:
-        wrong = sum(b is not None and not same(name, a, b) for a, b in asked)
+        wrong = sum(b is not None and not same(name, a, b) for a, b in answer_pairs)
         if wrong:
             yield (
                 f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
             )
-    of_rules = [(a, b) for a, b in asked if b and stated.agent(a)["model"]["engine"] in RULES]
+    of_rules = [(a, b) for a, b in answer_pairs if b and run.agent(a)["model"]["engine"] in RULES]
     if wrong := sum(not close(a.slow_s, b.slow_s) for a, b in of_rules):
         yield f"answers.jsonl has another delay in {amount(wrong, 'answer')} than the rule here"
     for name in ("prompt_tokens", "completion_tokens", "seconds"):
         if wrong := sum(getattr(a, name) != getattr(b, name) for a, b in of_rules):
             answers = amount(wrong, "answer")
             yield f"answers.jsonl has another {name} in {answers} than the rule here"
-    if more := sum(b is None for _, b in asked):
+    if more := sum(b is None for _, b in answer_pairs):
         yield f"answers.jsonl has {amount(more, 'answer')} to questions that nobody asked"
 
 
-def _of_decisions(stated: Run, ours: Run) -> Iterator[str]:
+def _of_decisions(run: Run, ours: Run) -> Iterator[str]:
     """Yield which columns of decisions.parquet differ."""
-    if len(stated.decisions) != len(ours.decisions):
+    if len(run.decisions) != len(ours.decisions):
         yield (
-            f"decisions.parquet has {amount(len(stated.decisions), 'row')}, and its answers make "
+            f"decisions.parquet has {amount(len(run.decisions), 'row')}, and its answers make "
             f"{len(ours.decisions)}"
         )
         return
-    theirs, here = stated.decisions.table, ours.decisions.table
-    for name in (name for name in here.column_names if name in theirs.column_names):
-        if theirs[name].equals(here[name]) or (_null(theirs, name) and not current(stated)):
+    table, here = run.decisions.table, ours.decisions.table
+    for name in (name for name in here.column_names if name in table.column_names):
+        if table[name].equals(here[name]) or (_null(table, name) and not current(run)):
             continue
-        pairs = zip(theirs[name].to_pylist(), here[name].to_pylist(), strict=True)
+        pairs = zip(table[name].to_pylist(), here[name].to_pylist(), strict=True)
         if wrong := sum(not close(a, b) for a, b in pairs):
             yield (
                 f"decisions.parquet has another {name} in {amount(wrong, 'row')} than its answers "

@@ -33,7 +33,9 @@ def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
     )
 
 
-def asked(request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]) -> Request:
+def repair_request(
+    request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]
+) -> Request:
     """Return the request of the repair turn: the chat so far, the answer, and what was wrong."""
     correction = prompt.repair(
         request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words

@@ -42,13 +42,15 @@ def requests(
         any(agent.sees for agent in agents),
     )
     blank = cache(partial(_blank, spec))
-    for scene, asked in zip(scenes, places or repeat(None), strict=False):
+    for scene, asked_places in zip(scenes, places or repeat(None), strict=False):
         scenario = spec.scenario_of(scene)
         words = scenario.prompt_words
         truth = truth_graph(scenario, scene.state) if privileged else None
         for place, viewer in enumerate(spec.viewers(scene)):
             of_ego = not place
-            if (of_ego and question != PLAIN) or (asked is not None and place not in asked):
+            if (of_ego and question != PLAIN) or (
+                asked_places is not None and place not in asked_places
+            ):
                 continue
             graph, index = shown(question, scene.graphs[viewer]), spec.agent(scene.place(place))
             agent = agents[index]

@@ -121,7 +121,7 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
 
     Raises UserError for models, prompts or answer modes that do not exist or do not fit.
     """
-    own, version = settings.helpers, settings.prompt or scenario.prompt
+    helpers, version = settings.helpers, settings.prompt or scenario.prompt
     card = cards.resolve(settings.model, settings.engine)
     # Agent checks the modes.
     how = (
@@ -133,26 +133,31 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
         settings.flip,
     )
     ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
-    prompt, mode = versions.load(own.prompt or version), own.answer or settings.answer
+    prompt, mode = (
+        versions.load(helpers.prompt or version),
+        helpers.answer or settings.answer,
+    )
     if settings.letters and not {settings.answer, mode} & {*BARE}:
         raise UserError(
             f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; "
             "leave it out, or give --answer readout"
         )
     helper_cards = (
-        [cards.resolve(name.strip()) for name in own.model.split(",")] if own.model else [card]
+        [cards.resolve(name.strip()) for name in helpers.model.split(",")]
+        if helpers.model
+        else [card]
     )
-    with helper_options({"--answer": own.answer, "--thinking": own.thinking}):
-        theirs = (
+    with helper_options({"--answer": helpers.answer, "--thinking": helpers.thinking}):
+        helper_arguments = (
             prompt,
             mode,
-            settings.thinking if own.thinking is None else own.thinking,
+            settings.thinking if helpers.thinking is None else helpers.thinking,
             settings.image if prompt.image else "own",
             settings.letters if mode in BARE else None,
             settings.sums if mode == "json" else "refuse",
             settings.flip and mode in BARE,
         )
-        return ego, tuple(Agent(helper_card, *theirs) for helper_card in helper_cards)  # type: ignore[arg-type]
+        return ego, tuple(Agent(helper_card, *helper_arguments) for helper_card in helper_cards)  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -182,11 +187,11 @@ def points(
     Raises UserError for an unknown name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
-    known = {**NO_MESSAGES, **control_settings()} if controls else {}
-    if wrong := [control for control in controls if control not in known]:
-        raise unknown("--control", wrong[0], known)
+    settings_by_control = {**NO_MESSAGES, **control_settings()} if controls else {}
+    if wrong := [control for control in controls if control not in settings_by_control]:
+        raise unknown("--control", wrong[0], settings_by_control)
     beside = dict.fromkeys(
-        (*(known[control] for control in controls), *(f"attack={a}" for a in attacks))
+        (*(settings_by_control[control] for control in controls), *(f"attack={a}" for a in attacks))
     )
     derived = [
         named_point(point.name + ("," if ":" in point.name else ":") + setting)

@@ -115,21 +115,23 @@ def evaluate(
         return finished(spec, out)
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
-    begun = unfinished(spec, out)
-    if not begun and spec.settings.latency == latencies.MEASURED:
+    run_start = unfinished(spec, out)
+    if not run_start and spec.settings.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(spec, spec.source, out, begun, progress, cache, more, opens, given, workers)
+        return _frozen(
+            spec, spec.source, out, run_start, progress, cache, more, opens, given, workers
+        )
     made_of = sources(spec)
-    begun, chunks = _begin_driving(spec, out, begun, workers)
-    with work.working(out, begun, "run.json") as place:
+    run_start, chunks = _begin_driving(spec, out, run_start, workers)
+    with work.working(out, run_start, "run.json") as place:
         seen, looked = _walked(
             spec,
             chunks,
             place,
-            lambda some: _drive(spec, begun, some, place, progress, cache, workers),
+            lambda some: _drive(spec, run_start, some, place, progress, cache, workers),
         )
-        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of)
+        return _gather(out, as_finished(spec, run_start, looked), seen, place, made_of)
 
 
 def evaluate_shard(
@@ -146,13 +148,13 @@ def evaluate_shard(
     if spec.source.until:
         raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")
     made_of = sources(spec)
-    begun, chunks = _begin_driving(
+    run_start, chunks = _begin_driving(
         spec, out, unfinished(spec, out, str(shard)), workers, str(shard)
     )
     own_chunks = shard.part(chunks)
     progress.more(sum(map(len, own_chunks)))
-    with work.working(out, begun, "run.json") as place:
-        _drive(spec, begun, own_chunks, place, progress, None, workers)
+    with work.working(out, run_start, "run.json") as place:
+        _drive(spec, run_start, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
         _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)))
@@ -165,24 +167,24 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two
     hold different bytes for the same part, or `out` holds something else.
     """
-    begun = shards.read(folders, RunStart)
+    run_starts = shards.read(folders, RunStart)
     with shards.made_whole(folders, out):
-        return _merged(begun, folders, out)
+        return _merged(run_starts, folders, out)
 
 
-def _merged(begun: Sequence[RunStart], folders: Sequence[Path], out: Path) -> Evaluated:
+def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) -> Evaluated:
     """Combine shards, by what they began with."""
-    chunks = _chunks_of(begun[0].settings)
+    chunks = _chunks_of(run_starts[0].settings)
     chunk_by_folder = {_folder_name(chunk): chunk for chunk in chunks}
     parts = shards.owners(
-        folders, begun, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part])
+        folders, run_starts, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part])
     )
     if (out / "run.json").exists() and (out / WORK).is_dir():
-        return finished_with(begun[0].settings, out)
+        return finished_with(run_starts[0].settings, out)
     refuse_finished(out)
-    tags = tuple(dict.fromkeys(tag for each in begun for tag in each.tags))
-    created = min(each.created for each in begun)
-    whole = msgspec.structs.replace(begun[0], shard="", tags=tags, created=created)
+    tags = tuple(dict.fromkeys(tag for each in run_starts for tag in each.tags))
+    created = min(each.created for each in run_starts)
+    whole = msgspec.structs.replace(run_starts[0], shard="", tags=tags, created=created)
     if stopped := work.begun(out, RunStart):
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
@@ -216,7 +218,7 @@ def _walk(
         decided = list(chain.from_iterable(walk(world, spec.points, asker, spec.ties)))
         viewers |= {scene.id: scene.viewers for part in decided for scene in part.decision_points}
         served += asker.served
-        answers, more = asker.asked(), world.columns()
+        answers, more = asker.asked_answers(), world.columns()
         if spec.timer:
             more = {**more, **spec.timer.columns(asker.latency, decided, answers)}
         tables.append(table(decided, more, spec.actions).rounded())
@@ -231,7 +233,7 @@ def _frozen(
     spec: Spec,
     source: FrozenSource,
     out: Path,
-    begun: RunStart | None,
+    run_start: RunStart | None,
     progress: Callable[[int], None],
     cache: Path | None,
     more: Callable[[int], None],
@@ -244,12 +246,15 @@ def _frozen(
     spread_over = 1 if here else spreadable(spec, workers)
     if in_workers := spread_over != 1:
         models = list[Backend]()
-        identity, latency = _stated_in_worker(spec, begun, spread_over)
+        identity, latency = _stated_in_worker(spec, run_start, spread_over)
     else:
         models = open_each(spec.cards, partial(opens or open_backend, **spec.opening))
-        identity, latency = together(spec.cards, models).identity(), _latency(spec, begun, models)
-    begun = begin(spec, out, begun, identity, latency)
-    with work.working(out, begun, "run.json") as place:
+        identity, latency = (
+            together(spec.cards, models).identity(),
+            _latency(spec, run_start, models),
+        )
+    run_start = begin(spec, out, run_start, identity, latency)
+    with work.working(out, run_start, "run.json") as place:
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
             before = read_kept(_answered_file(place, chunk))
@@ -274,7 +279,7 @@ def _frozen(
             if in_workers:
                 _hand_over(place, some)
                 walk_chunk = partial(
-                    _walk_chunk, spec, begun, *_files(spec, cache, place, spread_over)
+                    _walk_chunk, spec, run_start, *_files(spec, cache, place, spread_over)
                 )
                 _walk_missing(some, place, walk_chunk, report_kept, report_kept, spread_over)
             else:
@@ -286,7 +291,9 @@ def _frozen(
             )
         seen, looked = _walked(spec, chunks, place, walk_all)
         layouts = source.layouts(sum(map(len, seen)))
-        return _gather(out, as_finished(spec, begun, looked), seen, place, made_of, layouts=layouts)
+        return _gather(
+            out, as_finished(spec, run_start, looked), seen, place, made_of, layouts=layouts
+        )
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
@@ -312,7 +319,7 @@ def _hand_over(place: Path, chunks: Sequence[Sequence[int]]) -> None:
 
 
 def _begin_driving(
-    spec: Spec, out: Path, begun: RunStart | None, workers: Workers, shard: str = ""
+    spec: Spec, out: Path, run_start: RunStart | None, workers: Workers, shard: str = ""
 ) -> tuple[RunStart, list[Sequence[int]]]:
     """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
     if spec.settings.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
@@ -320,8 +327,8 @@ def _begin_driving(
             f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; "
             "measure on one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
-    identity, latency = _stated_in_worker(spec, begun, workers)
-    return begin(spec, out, begun, identity, latency, shard), _chunks_of(spec.record())
+    identity, latency = _stated_in_worker(spec, run_start, workers)
+    return begin(spec, out, run_start, identity, latency, shard), _chunks_of(spec.record())
 
 
 def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
@@ -406,7 +413,7 @@ def _walked(
 
 def _drive(
     spec: Spec,
-    begun: RunStart,
+    run_start: RunStart,
     chunks: Sequence[Sequence[int]],
     place: Path,
     progress: Callable[[int], None],
@@ -417,7 +424,7 @@ def _drive(
     def report(chunk: Sequence[int]) -> None:
         progress(len(chunk))
 
-    walk_chunk = partial(_walk_chunk, spec, begun, *_files(spec, cache, place, workers))
+    walk_chunk = partial(_walk_chunk, spec, run_start, *_files(spec, cache, place, workers))
     _walk_missing(chunks, place, walk_chunk, report, report, workers, _reproducible(spec))
 
 
@@ -468,7 +475,7 @@ def _reproducible(spec: Spec) -> bool:
 
 
 def _walk_chunk(
-    spec: Spec, begun: RunStart, cache: Path | None, place: Path | None, chunk: Sequence[int]
+    spec: Spec, run_start: RunStart, cache: Path | None, place: Path | None, chunk: Sequence[int]
 ) -> dict[str, bytes]:
     """Walk a chunk in a worker process and return its files by name;
     `place` keeps its answers until then.
@@ -478,14 +485,14 @@ def _walk_chunk(
     def backend() -> Backend:
         models = costs.metered(spec.cards, _open_all(spec), place, spec.budget)
         combined = together(spec.cards, models, cache)
-        if not same_model(begun.identity, combined.identity()):
+        if not same_model(run_start.identity, combined.identity()):
             raise UserError(
                 f"a worker opens {another_model(spec)} than this run began with; give it the same"
             )
         return combined
 
     def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
-        return Asker(spec, backend, begun.latency, kept, so_far, checks_kept=True)
+        return Asker(spec, backend, run_start.latency, kept, so_far, checks_kept=True)
 
     return _walk(spec, chunk, asker_of)
 
@@ -502,7 +509,7 @@ def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "Frozen
 
 def _gather(
     out: Path,
-    begun: RunStart,
+    run_start: RunStart,
     chunks: Sequence[Sequence[int]],
     place: Path,
     made_of: Mapping[str, bytes],
@@ -515,8 +522,8 @@ def _gather(
     `place` is the working folder, `made_of` has the sources by name, `folders` are folders that the
     run is merged from, and `layouts` those that its own are a part of.
     """
-    settings, parts = begun.settings, [place / _folder_name(chunk) for chunk in chunks]
-    typed = {**settings["settings"], "tag": begun.tags}
+    settings, parts = run_start.settings, [place / _folder_name(chunk) for chunk in chunks]
+    typed = {**settings["settings"], "tag": run_start.tags}
     works = [place, *(shard / WORK for shard in folders)]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
@@ -551,18 +558,18 @@ def _gather(
             {
                 "format": FORMAT,
                 "name": out.name,
-                "created": begun.created,
-                "command": shlex.join([*begun.command, "--out", str(out)]),
-                "tags": begun.tags,
+                "created": run_start.created,
+                "command": shlex.join([*run_start.command, "--out", str(out)]),
+                "tags": run_start.tags,
                 **settings,
                 "settings": typed,
-                "latency": msgspec.to_builtins(begun.latency),
+                "latency": msgspec.to_builtins(run_start.latency),
                 "answer_times": msgspec.to_builtins(latencies.times(answers)),
-                "identity": begun.identity,
+                "identity": run_start.identity,
                 "cached_answers": sum(answer.cached for answer in answers),
                 "engine_errors": sum(answer.error is not None for answer in answers),
                 "retries": sum(answer.retries for answer in answers),
-                "versions": begun.versions,
+                "versions": run_start.versions,
             },
             Manifest,
         )
@@ -570,7 +577,7 @@ def _gather(
             manifest = msgspec.structs.replace(manifest, cost=cost)
         kept_sources.write(out, made_of, place)
         with suppress(UserError):  # a stranger's shard may state any command
-            write_whole(out / FILE, text_of(of_words(begun.command)))
+            write_whole(out / FILE, text_of(of_words(run_start.command)))
         servers.write(out, works)
         decisions_of_all = run_parts.decisions_of(parts, settings["actions"])
         writer.write(
@@ -580,13 +587,13 @@ def _gather(
 
 
 def _stated_in_worker(
-    spec: Spec, begun: RunStart | None, workers: Workers
+    spec: Spec, run_start: RunStart | None, workers: Workers
 ) -> tuple[dict[str, Any], Latency]:
     """Return what `_identity_and_latency` does, in a worker:
     a forked one inherits no engine's threads.
     """
-    state, exact = partial(_identity_and_latency, begun=begun), _reproducible(spec)
-    [stated] = spread(
+    state, exact = partial(_identity_and_latency, run_start=run_start), _reproducible(spec)
+    [identity_and_latency] = spread(
         state,
         [spec],
         workers,
@@ -594,22 +601,22 @@ def _stated_in_worker(
         lambda each: f"the model {each.ego.card.name}",
         exact,
     )
-    return stated
+    return identity_and_latency
 
 
-def _identity_and_latency(spec: Spec, begun: RunStart | None) -> tuple[dict[str, Any], Latency]:
+def _identity_and_latency(spec: Spec, run_start: RunStart | None) -> tuple[dict[str, Any], Latency]:
     """Open a run's models; return their identity and the latency of their decisions."""
     models = _open_all(spec)
-    return together(spec.cards, models).identity(), _latency(spec, begun, models)
+    return together(spec.cards, models).identity(), _latency(spec, run_start, models)
 
 
-def _latency(spec: Spec, begun: RunStart | None, models: Sequence[Backend]) -> Latency:
+def _latency(spec: Spec, run_start: RunStart | None, models: Sequence[Backend]) -> Latency:
     """Return the latency that a resumed run began with, or that of a new run."""
-    if begun:
-        return begun.latency
+    if run_start:
+        return run_start.latency
     if spec.timer:
         return spec.timer.latency(spec.agents)
-    declared = latencies.known(spec.settings.latency, spec.agents, models)
+    declared = latencies.chosen_latency(spec.settings.latency, spec.agents, models)
     return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
 
 

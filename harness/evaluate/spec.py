@@ -209,10 +209,10 @@ class Spec:
 
     def _check_sampling(self) -> None:
         temperature, seed = self.settings.temperature, self.settings.sampling_seed
-        shown = f"--temperature {temperature:g}"
+        option = f"--temperature {temperature:g}"
         if not 0 <= temperature <= HOTTEST:
             raise UserError(
-                f"{shown}: give 0, which takes the likeliest token each time, to {HOTTEST:g}"
+                f"{option}: give 0, which takes the likeliest token each time, to {HOTTEST:g}"
             )
         in_range("--sampling-seed", seed, 0, LAST_SEED)
         if seed and not temperature:
@@ -231,7 +231,7 @@ class Spec:
                     f"a {self.ego.answer} is a distribution already; use --answer json or "
                     "constrained"
                 )
-            raise UserError(f"{shown}: {reason}")
+            raise UserError(f"{option}: {reason}")
 
     def _check(self, agent: Agent) -> None:
         name, version = printable(agent.card.name), agent.prompt.version
@@ -250,18 +250,18 @@ class Spec:
                 "it replays"
             )
         latency = self.settings.latency
-        shown = f"--latency {printable(latency)}"
+        option = f"--latency {printable(latency)}"
         if latency not in NAMES:
             return
         if agent.can.own_latency and latency != "paper":
             raise UserError(
-                f"{shown}: a replay has the times of its run; use paper, or leave it out"
+                f"{option}: a replay has the times of its run; use paper, or leave it out"
             )
         elif latency == MEASURED and not agent.can.language_model:
-            raise UserError(f"{shown}: {name} is no language model; use card or paper")
+            raise UserError(f"{option}: {name} is no language model; use card or paper")
         elif latency == "card" and agent.card.latency.inference_s is None:
             raise UserError(
-                f"{shown}: the card of {name} declares no inference time; "
+                f"{option}: the card of {name} declares no inference time; "
                 "use paper or measured, or add inference_s to the card"
             )
 
@@ -271,25 +271,25 @@ class Spec:
         """
         if prompt.examples is None:
             return
-        if shown := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
+        if shared_seeds := sorted(prompt.examples.seeds.intersection(self.source.layout_seeds)):
             raise UserError(
-                f"--prompt {prompt.version} has an example of layout seed {shown[0]}, which is "
-                "evaluated; leave that episode out, or draw the examples anew: `harness prompt "
-                "examples --first-seed`"
+                f"--prompt {prompt.version} has an example of layout seed {shared_seeds[0]}, "
+                "which is evaluated; leave that episode out, or draw the examples anew: "
+                "`harness prompt examples --first-seed`"
             )
         for role in ROLES:
             example_actions(prompt, role, self.actions)
 
     def _check_point(self, point: OperatingPoint) -> None:
-        shown, ego = f"condition {printable(point.name)}", self.ego
+        condition, ego = f"condition {printable(point.name)}", self.ego
         reads = point.has_fusion_call and point.shows_words
         if obstacle := self._obstacle(point, reads):
-            raise UserError(f"{shown}: {obstacle}")
+            raise UserError(f"{condition}: {obstacle}")
         call = point.content.call
         if point.has_fusion_call and call and call.in_graph and ego.can.language_model:
-            self._check_shows_objects(shown)
+            self._check_shows_objects(condition)
         if reads and point.content.asks_helpers and self.fusion_obstacle:
-            raise UserError(f"{shown}: {self.fusion_obstacle}")
+            raise UserError(f"{condition}: {self.fusion_obstacle}")
 
     def _obstacle(self, point: OperatingPoint, reads: bool) -> str | None:
         """Return why a condition, whose ego `reads` messages, cannot be played; None if it can."""
@@ -305,7 +305,7 @@ class Spec:
                 return obstacle
         return None
 
-    def _check_shows_objects(self, shown: str) -> None:
+    def _check_shows_objects(self, condition: str) -> None:
         """Raise UserError if the ego's prompt is the same whatever is around;
         it is tried on some scenes.
         """
@@ -318,8 +318,8 @@ class Spec:
             if full != empty:
                 return
         raise UserError(
-            f"{shown}: prompt {self.ego.prompt.version} shows no objects in its text, so the ego "
-            "would be asked the same question again; give another --prompt"
+            f"{condition}: prompt {self.ego.prompt.version} shows no objects in its text, so the "
+            "ego would be asked the same question again; give another --prompt"
         )
 
     @property
@@ -479,7 +479,9 @@ class Spec:
     def _of_extensions(self) -> dict[str, Any]:
         """Return the settings of extensions; those that choose a timer say which is open."""
         beside = extensions.beside()
-        usual = {name: its.default for name, its in of_extensions().items() if name not in beside}
+        usual = {
+            name: setting.default for name, setting in of_extensions().items() if name not in beside
+        }
         others = timers.without(self.settings.extensions)
         by_timer = self.timer.settings() if self.timer else {}
         return {**usual, **others, **by_timer}
@@ -503,5 +505,7 @@ class Spec:
     def _letters(self) -> str | None:
         """The option that reads the letters as here; None if it is the cards' own choice."""
         reads = [agent for agent in self.agents if agent.answer == "readout"]
-        own = all(agent.letters == replace(agent, letters=None).letters for agent in reads)
-        return None if own else reads[0].letters
+        is_cards_choice = all(
+            agent.letters == replace(agent, letters=None).letters for agent in reads
+        )
+        return None if is_cards_choice else reads[0].letters

@@ -83,7 +83,7 @@ def table(
         return widened(getattr(part.result, name) for part in decided)
 
     numbers = [columns(part) for part in decided]
-    asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
+    is_asked, arrival_s = of_messages("asked"), of_messages("arrival_s")
     sent = {
         "delivered": of_messages("delivered"),
         "on_time": of_messages("on_time"),
@@ -100,7 +100,7 @@ def table(
         senders.append([*scene.viewers[1:], *absent, *voices])
     of_messages_by_column: dict[str, Any] = {}
     for name, messages in sent.items():
-        of_messages_by_column |= by_message(name, np.where(asked, messages, np.nan))
+        of_messages_by_column |= by_message(name, np.where(is_asked, messages, np.nan))
     episode = of_scenes(scene.record.episode for scene in scenes)
     step = of_scenes(scene.record.step for scene in scenes)
     ids = [scene.id for scene in scenes]
@@ -127,7 +127,7 @@ def table(
         "action": Labels(np.concatenate([part.result.action for part in decided]), actions),
     }
     for h in range(helpers):
-        labels[f"helper_{h + 1}"] = _labels([row[h] for row in senders], at, asked[:, h])
+        labels[f"helper_{h + 1}"] = _labels([row[h] for row in senders], at, is_asked[:, h])
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 

@@ -60,21 +60,21 @@ def refuse_other_kept(
         divides = agent.sums == "divide"
         readers.append(_Reader(agent.prompt, actions, agent.answer, agent.thinking, divides))
     for answer in answers:
-        stated = f"{printable(file)}: answer {printable(answer.id)} states"
+        prefix = f"{printable(file)}: answer {printable(answer.id)} states"
         if not any(answer.may_take_longer(agent.card.slow_s) for agent in agents):
             raise UserError(
-                f"{stated} a delay of {answer.slow_s:g} s, which no card of this run declares; "
+                f"{prefix} a delay of {answer.slow_s:g} s, which no card of this run declares; "
                 f"{ASKED_AGAIN}"
             )
         # Which vehicle of its scene answered only the dataset knows.
         others = [_other(answer, reader.read(answer)) for reader in readers]
         if all(others):
-            raise UserError(f"{stated} another {others[0]} than its text says; {ASKED_AGAIN}")
+            raise UserError(f"{prefix} another {others[0]} than its text says; {ASKED_AGAIN}")
 
 
-def same(name: str, stated: Answer, here: Answer | Parsed) -> bool:
+def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
     """Return whether a stated and a newly parsed answer agree in a field of `OF_TEXTS`."""
-    a, b = getattr(stated, name), getattr(here, name)
+    a, b = getattr(stated_answer, name), getattr(here, name)
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(close, a, b))
     return close(a, b)
@@ -114,9 +114,9 @@ def _other(answer: Answer, here: Parsed) -> str | None:
 
 
 def _contradicts(run: Run, answer: Answer, field: str) -> UserError:
-    version, shown = run.manifest.versions.get("parser", "1"), printable(run.path)
+    version, path = run.manifest.versions.get("parser", "1"), printable(run.path)
     older = "" if version == str(PARSER) else f" (read by parser {printable(version)})"
     return UserError(
-        f"{shown}: answer {printable(answer.id)} states another {field} than its text says{older}; "
-        f"`harness eval --model replay:{shown}` reads all of its texts again"
+        f"{path}: answer {printable(answer.id)} states another {field} than its text says{older}; "
+        f"`harness eval --model replay:{path}` reads all of its texts again"
     )

@@ -232,34 +232,34 @@ def _steps(
         due = _due(world, points)
         intents = _with_needs(world, due, intents)
         others = _others(ask, decision_points, due)
-        answers = _asked(ask, decision_points, due, {PLAIN: intents, **others})
-        said: dict[OperatingPoint, SentIntents] = {}
+        answers = _answers_of_helpers(ask, decision_points, due, {PLAIN: intents, **others})
+        broadcasts: dict[OperatingPoint, SentIntents] = {}
         sent: dict[OperatingPoint, Exchange] = {}
         fusions: dict[OperatingPoint, FusionInputs] = {}
         for point, due_here in due.items():
-            own = heard(point, answers, due_here)
+            intents_here = heard(point, answers, due_here)
             speaker, draws = speakers[point], due_here.draws
-            said[point] = speaker.said(own, draws, due_here.episode, due_here.seed)
-            sent[point] = exchange(point, said[point].intents, said[point].draws)
+            broadcasts[point] = speaker.said(intents_here, draws, due_here.episode, due_here.seed)
+            sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
             ties_here = tie_draws(draws, ties)
             fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
         for point, due_here in due.items():
             call_of = partial(ask.call_of_agents, decision_points, due_here.at)
             decide = partial(_decided, point, fusions[point], call_of)
-            said[point], sent[point] = point.again(said[point], sent[point], decide)
-        calls = _fusion_calls(due, said, sent, decision_points, ask)
+            broadcasts[point], sent[point] = point.again(broadcasts[point], sent[point], decide)
+        calls = _fusion_calls(due, broadcasts, sent, decision_points, ask)
         decided = []
         for point, due_here in due.items():
             call = None
             if point.has_fusion_call and point.content.of_agents:
-                call = ask.call_of_agents(decision_points, due_here.at, said[point].intents)
+                call = ask.call_of_agents(decision_points, due_here.at, broadcasts[point].intents)
             elif point.has_fusion_call:
                 places = places_of(point, due_here, len(decision_points))
-                call = calls[point.rewrites](places, shown(point, said[point]))
+                call = calls[point.rewrites](places, shown_attackers(point, broadcasts[point]))
             fusion = replace(fusions[point], call=call)
-            result = fuse(point, sent[point], said[point].intents, fusion)
+            result = fuse(point, sent[point], broadcasts[point].intents, fusion)
             memories[point].keep(due_here, result.state)
-            decided.append(Decided(point, decision_points, due_here, result, said[point]))
+            decided.append(Decided(point, decision_points, due_here, result, broadcasts[point]))
         yield decided
         world.step(decided)
 
@@ -318,7 +318,7 @@ def _others(
     }
 
 
-def _asked(
+def _answers_of_helpers(
     ask: Ask[DecisionPoint],
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
@@ -356,29 +356,29 @@ def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) 
     another question, or come from another decision's scene; who has no other to hear from hears
     nobody. Distances and inference times stay the decision's own.
     """
-    own = _able(point, answers[PLAIN], due)
+    intents = _able(point, answers[PLAIN], due)
     if point.question != PLAIN:
         source = _able(point, answers[point.question], due)
-        own = _with_helpers(own, source, source.valid)
+        intents = _with_helpers(intents, source, source.valid)
     elif point.elsewhere:
         places = _sources(point, due)
-        source, alone = own.take(places), places == np.arange(len(places))
-        own = _with_helpers(own, source, source.valid & ~alone[:, None])
-    return as_sent(point, own) if point.asks else own
+        source, alone = intents.take(places), places == np.arange(len(places))
+        intents = _with_helpers(intents, source, source.valid & ~alone[:, None])
+    return as_sent(point, intents) if point.asks else intents
 
 
-def _with_helpers(own: Intents, source: Intents, valid: Bools) -> Intents:
+def _with_helpers(intents: Intents, source: Intents, valid: Bools) -> Intents:
     names = ("helpers", "payload_bits", "text_bytes", "unasked", "objects", "object_bits")
     sent = {name: getattr(source, name) for name in names}
-    known = {name: array for name, array in sent.items() if array is not None}
-    return replace(own, valid=valid, **known)
+    arrays = {name: array for name, array in sent.items() if array is not None}
+    return replace(intents, valid=valid, **arrays)
 
 
 def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
     """Return the intents of the decisions that are due, of helpers that can send the content."""
     every = np.array_equal(due.at, np.arange(len(intents.own)))
-    own = point.prepared(intents if every else intents.take(due.at))
-    return able(point, own, due.senders)
+    prepared_intents = point.prepared(intents if every else intents.take(due.at))
+    return able(point, prepared_intents, due.senders)
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
@@ -450,7 +450,7 @@ def heard_codes(
         if point.has_fusion_call:
             on_time = sent[point].on_time
             codes_here = codes_of(
-                on_time, places_of(point, due_here, n), shown(point, broadcasts[point])
+                on_time, places_of(point, due_here, n), shown_attackers(point, broadcasts[point])
             )
             codes.append(codes_here[on_time.any(axis=1)])
     return np.unique(np.concatenate(codes))
@@ -465,6 +465,6 @@ def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
     return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
 
-def shown(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
+def shown_attackers(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
     """Return who attacks, `(n, H)`, if the prompt of a fusion call depends on it; else None."""
     return broadcast.attackers if point.rewrites.changes.of_attackers else None

@@ -23,7 +23,7 @@ from harness.core.image import Image
 from harness.core.places import text
 from harness.dataset.forest import Forest
 from harness.dataset.load import TREES_AT_ONCE, Scene
-from harness.evaluate.agent import in_mode, shown
+from harness.evaluate.agent import in_mode, sent_messages
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
@@ -126,7 +126,7 @@ def prompts_of(run: Run) -> Sent | None:
         try:
             letter = agent["answer"] in BARE
             rendered = prompt.render(graph, run.actions, heard, words, letter)
-            messages = shown(agent["image"], rendered)
+            messages = sent_messages(agent["image"], rendered)
             return in_mode(agent["answer"], prompt, messages, graph, run.actions, words)
         except UserError:  # a stranger's, which no run can have used
             failed.add(prompt.version)

@@ -13,7 +13,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS, OperatingPoint
 from harness.evaluate.asking import Asker
-from harness.evaluate.latency import known
+from harness.evaluate.latency import chosen_latency
 from harness.evaluate.live_world import LiveSource, LiveWorld
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import table
@@ -91,7 +91,7 @@ def driven(
     """
     assert isinstance(of.source, LiveSource)
     opened = backend or open_backend(of.ego.card, batch_size=of.settings.batch_size)
-    latency = known(of.settings.latency, of.agents, [opened])
+    latency = chosen_latency(of.settings.latency, of.agents, [opened])
     if isinstance(infers, Latency):
         latency = infers
     elif infers is not None:

@@ -111,7 +111,7 @@ def search(
     opens = cache(opens)
     first = plan.tune[0]
     models = open_each(first.cards, partial(opens, **first.opening))
-    latency = latencies.known(first.settings.latency, first.agents, models)
+    latency = latencies.chosen_latency(first.settings.latency, first.agents, models)
     assert latency  # it is not to be measured
     backend = together(first.cards, models, cache_file)
     base = chosen(plan.base)

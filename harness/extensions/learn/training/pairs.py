@@ -18,7 +18,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, purpose, stated
 from harness.dataset import rebuilt
-from harness.evaluate.agent import in_mode, shown
+from harness.evaluate.agent import in_mode, sent_messages
 from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.evaluate.texts import refuse_others
@@ -174,7 +174,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
             messages = messages_of(messages_by_key, stored.heard, run.actions)
             asked_with = as_asked(dataset.scenario, scene, stored, source)
             q = question(lessons, asked_with, stored.viewer, prompt, messages)
-            texts = shown(agent["image"], q.messages)
+            texts = sent_messages(agent["image"], q.messages)
             words = dataset.scenario.prompt_words
             sent = in_mode(agent["answer"], prompt, texts, q.graph, q.actions, words)
             completion = answer(prompt, q.graph, q.label, q.actions)

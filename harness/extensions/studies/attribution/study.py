@@ -28,7 +28,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.requests import requests
-from harness.evaluate.walk import Decided, Memory, places_of, shown, walk
+from harness.evaluate.walk import Decided, Memory, places_of, shown_attackers, walk
 from harness.extensions.studies.attribution.record import FILE, Attribution, LeftOut
 from harness.extensions.studies.twins.scoring import distance
 from harness.prompts.versions import listed as listing
@@ -216,7 +216,7 @@ def _messages(
     rest = whole.on_time & (np.arange(whole.on_time.shape[1]) != helpers[:, None])
     call = None
     if point.has_fusion_call:
-        attackers = shown(point, broadcast)
+        attackers = shown_attackers(point, broadcast)
         codes = np.unique(codes_of(rest, places, attackers)[rest.any(axis=1)])
         call = stored.fusion_call(points, codes, point.rewrites)(places, attackers)
     fusion = FusionInputs(call, None if state is None else state[decisions])
