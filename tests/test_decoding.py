@@ -375,7 +375,7 @@ def test_the_spellings_of_a_letter_are_found_in_any_vocabulary(
     "encode", [lambda text: [1] * len(text), lambda text: list(text.encode("utf-16"))]
 )
 def test_letters_that_are_no_single_tokens_are_refused(encode: Any) -> None:
-    engine: Any = SimpleNamespace(chat=SimpleNamespace(shown="model 'odd'", encode=encode))
+    engine: Any = SimpleNamespace(chat=SimpleNamespace(subject="model 'odd'", encode=encode))
     with pytest.raises(
         UserError, match=r"'odd'.* no single token for each of the letters ABC; use --answer"
     ):

@@ -29,7 +29,7 @@ class Encoder:
     """What a skeleton asks of a chat: its name, and texts in tokens."""
 
     def __init__(self, name: str, encode: Callable[[str], list[int]]) -> None:
-        self.shown, self.encode = f"model {name!r}", encode
+        self.subject, self.encode = f"model {name!r}", encode
 
 
 def characters(text: str) -> list[int]:

@@ -30,10 +30,10 @@ _MORE = (
 )
 
 
-def read_config(folder: Path, shown: str) -> dict[str, Any]:
+def read_config(folder: Path, subject: str) -> dict[str, Any]:
     """Return the configuration of a LoRA adapter's folder, as its `adapter_config.json` states it.
 
-    `shown` names the model in messages. Raises UserError if it cannot be read, or the adapter is
+    `subject` names the model in messages. Raises UserError if it cannot be read, or the adapter is
     more than plain LoRA of linear layers.
     """
     try:
@@ -43,7 +43,7 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
             raise ValueError(f"lora_alpha is {config['lora_alpha']}")
     except BROKEN as error:
         raise UserError(
-            f"{shown}: {printable(folder / CONFIG)} cannot be read "
+            f"{subject}: {printable(folder / CONFIG)} cannot be read "
             f"({printable(repr(error), 120)}); give the "
             "folder of a LoRA adapter in peft's format"
         ) from None
@@ -55,7 +55,8 @@ def read_config(folder: Path, shown: str) -> dict[str, Any]:
             else f"peft_type {printable(kind)}, r {rank}, bias {printable(config.get('bias'))}"
         )
         raise UserError(
-            f"{shown}: its adapter has {odd}; allowed: plain LoRA of linear layers, without biases"
+            f"{subject}: its adapter has {odd}; allowed: plain LoRA of linear layers, without "
+            "biases"
         )
     return config
 
@@ -76,18 +77,18 @@ def find_adapter(card: Card) -> Path | None:
     return folder
 
 
-def find_tensors(folder: Path, shown: str) -> Path:
+def find_tensors(folder: Path, subject: str) -> Path:
     """Return the safetensors file of an adapter's folder. Raises UserError if there is none."""
     if not (file := folder / TENSORS).is_file():
-        raise UserError(f"{shown}: its adapter in {printable(folder)} has no file {TENSORS}")
+        raise UserError(f"{subject}: its adapter in {printable(folder)} has no file {TENSORS}")
     return file
 
 
-def foreign(shown: str, file: Path, reason: str) -> UserError:
+def foreign(subject: str, file: Path, reason: str) -> UserError:
     """Return the error for an adapter in `file` that does not fit its model, for `reason`."""
     return UserError(
-        f"{shown}: {printable(file)} is no adapter of this model: {reason}; give the adapter that "
-        "was trained on it"
+        f"{subject}: {printable(file)} is no adapter of this model: {reason}; give the adapter "
+        "that was trained on it"
     )
 
 

@@ -164,8 +164,8 @@ class Completion:
 
     def __post_init__(self) -> None:
         for name in ("text", "error"):
-            if (said := getattr(self, name)) and not said.isascii():
-                object.__setattr__(self, name, said.encode("utf-8", "replace").decode())
+            if (text := getattr(self, name)) and not text.isascii():
+                object.__setattr__(self, name, text.encode("utf-8", "replace").decode())
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
@@ -216,13 +216,13 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
     identity = {key: value for key, value in now.items() if key != "states" or key in stored}
     if "answers" in stored:
         identity.setdefault("answers", 1)  # of an engine from outside that states none
-    helpers, theirs = identity.get("helpers"), stored.get("helpers")
+    helpers, stored_helpers = identity.get("helpers"), stored.get("helpers")
     if (
         isinstance(helpers, list | tuple)
-        and isinstance(theirs, list | tuple)
-        and len(helpers) == len(theirs)
+        and isinstance(stored_helpers, list | tuple)
+        and len(helpers) == len(stored_helpers)
     ):
-        pairs = zip(helpers, theirs, strict=True)
+        pairs = zip(helpers, stored_helpers, strict=True)
         identity["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
     return identity
 

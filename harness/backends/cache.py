@@ -100,9 +100,11 @@ def key(
     and `batch_size` for quantised and 16-bit weights, where other requests in a batch move an
     answer by rounding. For float32 weights that is None.
     """
-    asked = {f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY}
-    asked["image"] = request.image_sha256
-    parts = {"identity": identity, "prompt": prompt, "asked": asked}
+    request_fields = {
+        f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY
+    }
+    request_fields["image"] = request.image_sha256
+    parts = {"identity": identity, "prompt": prompt, "asked": request_fields}
     return digest(parts if batch_size is None else {**parts, "batch_size": batch_size})
 
 
@@ -173,10 +175,10 @@ def _completion(kept: dict[str, Any]) -> Completion:
         done.label_mass,
         done.letter_share,
     )
-    known = kept.keys() <= set(_KEPT) and done.finish_reason != "error"
+    has_only_kept_keys = kept.keys() <= set(_KEPT) and done.finish_reason != "error"
     counted = all(0 <= count <= _MOST for count in counts if count is not None)
     timed = 0 <= done.slow_s <= LONGEST_S
-    if not (known and counted and timed):
+    if not (has_only_kept_keys and counted and timed):
         raise ValueError("no engine gives such a one")
     return done
 
@@ -235,12 +237,14 @@ class Cached:
         prompts = self.backend.rendered(requests)
         keys = [self._keys(prompt, r) for prompt, r in zip(prompts, requests, strict=True)]
         every = [key for by_source in keys for key in by_source.values()]
-        known = self._try(lambda file: file.find(every)) or {}
-        if known and self._doubt:
+        kept_completions = self._try(lambda file: file.find(every)) or {}
+        if kept_completions and self._doubt:
             _say_once(f"harness: {self._doubt}", digest(self._identity))
         stored: list[Completion | None] = []
         for by_source in keys:
-            matches = [known[key] for key in by_source.values() if key in known]
+            matches = [
+                kept_completions[key] for key in by_source.values() if key in kept_completions
+            ]
             stored.append(matches[0] if matches else None)
         missing = [r for r, match in zip(requests, stored, strict=True) if match is None]
         answers = iter(self.backend.complete(missing) if missing else [])

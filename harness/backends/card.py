@@ -244,9 +244,9 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
     for key in _ENGINE_KEYS:
         lacking = key in engine.required_keys and key not in table
         if lacking or (key in table and key not in engine.allowed_keys):
-            shown = f"[{key}]" if key in ("server", "failures", "vision", "price") else key
+            shown_key = f"[{key}]" if key in ("server", "failures", "vision", "price") else key
             takers = " or ".join(_engines_with(key))
-            raise UserError(f"{where}: {shown} goes with engine = {takers}, and only with it")
+            raise UserError(f"{where}: {shown_key} goes with engine = {takers}, and only with it")
     if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):
         raise UserError(
             f"{where}: [vision] and projector go together on {card.engine}: give the name of its "

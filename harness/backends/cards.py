@@ -121,24 +121,24 @@ def argument(card: Card) -> str:
     return card.adapter or card.weights or card.name
 
 
-def find_own(stated: Card, given: Sequence[Card], where: str, hint: str) -> Card:
+def find_own(stated_card: Card, given: Sequence[Card], where: str, hint: str) -> Card:
     """Return the user's own card of the model that a run states, so that the run opens nothing.
 
     Only the stated name is looked up, first in `given`, then in the card files; all else is
     compared. Raises UserError, with `where` and `hint` in the message, if there is no such card or
     it differs in what decides answers.
     """
-    name = printable(stated.name)
-    card = next((card for card in given if card.name == stated.name), None)
+    name = printable(stated_card.name)
+    card = next((card for card in given if card.name == stated_card.name), None)
     if card is None:
-        if stated.name.partition(":")[0] not in names():
+        if stated_card.name.partition(":")[0] not in names():
             lost = (
-                resources.card_to_copy(stated.name)
+                resources.card_to_copy(stated_card.name)
                 or f"its model {name} is none of your cards; {hint}"
             )
             raise UserError(f"{where}: {lost}")
-        card = load(stated.name)
-    if differing := _differing(card, stated):
+        card = load(stated_card.name)
+    if differing := _differing(card, stated_card):
         raise UserError(
             f"{where}: its model {name} is not what it was ({', '.join(differing)} of your card "
             "differs); restore the card, or run again"
@@ -152,22 +152,22 @@ def _no_card(model: str, hint: str = "") -> UserError:
     return UserError(lost) if lost else unknown("model", model, names(), hint)
 
 
-def _differing(card: Card, stated: Card) -> list[str]:
+def _differing(card: Card, stated_card: Card) -> list[str]:
     """Return the keys in which two cards of a model differ so that answers may differ.
 
     Where it lies and what people read may change:
     the identity of the opened model says what answers.
     """
     for part in ("server", "vision"):
-        if bool(getattr(card, part)) != bool(getattr(stated, part)):
+        if bool(getattr(card, part)) != bool(getattr(stated_card, part)):
             return [f"[{part}]"]
-    same = {key: getattr(stated, key) for key in _PLACE}
-    if card.server and stated.server:
+    same = {key: getattr(stated_card, key) for key in _PLACE}
+    if card.server and stated_card.server:
         same["server"] = replace(
-            card.server, **{key: getattr(stated.server, key) for key in _SERVER_PLACE}
+            card.server, **{key: getattr(stated_card.server, key) for key in _SERVER_PLACE}
         )
     card = replace(card, **same)
-    return [f.name for f in fields(Card) if getattr(card, f.name) != getattr(stated, f.name)]
+    return [f.name for f in fields(Card) if getattr(card, f.name) != getattr(stated_card, f.name)]
 
 
 def _local_card(text: str, engine: str | None) -> Card | None:
@@ -217,16 +217,16 @@ def _new_card(name: str, engine: str, weights: str, description: str, **settings
 
 def _run_card(run: Path) -> Card:
     """Return the card of a run's answers; an unreadable run fails only when it is opened."""
-    stated: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     vision: Vision | None = None
     letters: Letters = "raw"
     with suppress(OSError, ValueError, UserError):
-        stated = json.loads(text_of(run / "run.json", "record"))
+        record = json.loads(text_of(run / "run.json", "record"))
     with suppress(TypeError, ValueError, LookupError, UserError):
-        table = stated["model"]["vision"]
+        table = record["model"]["vision"]
         vision = table and convert(table, Vision, "vision")
     with suppress(AttributeError):
-        letters = "cyclic" if stated.get("letters") == "cyclic" else "raw"
+        letters = "cyclic" if record.get("letters") == "cyclic" else "raw"
     name = f"replay:{run.name}"
     return _new_card(name, "replay", str(run), "Answers of a run", vision=vision, letters=letters)
 
@@ -258,16 +258,16 @@ def _directory_card(text: str, where: Path, engine: str | None) -> Card:
     )
 
 
-def _adapted(shown: str, where: Path, engine: str | None) -> Card:
+def _adapted(subject: str, where: Path, engine: str | None) -> Card:
     """Return the card of the model that an adapter names as its base, with the adapter."""
-    named = adapters.read_config(where, shown).get("base_model_name_or_path")
+    named = adapters.read_config(where, subject).get("base_model_name_or_path")
     path = _path(str(named))
     if path and path.is_dir() and (path / adapters.CONFIG).is_file():
-        raise UserError(f"{shown} is an adapter of an adapter; give one of a whole model")
+        raise UserError(f"{subject} is an adapter of an adapter; give one of a whole model")
     base = resolve(str(named), engine)
     if base.adapter or not registration(base.engine).capabilities.has_weights:
         raise UserError(
-            f"{shown} is an adapter of {printable(named)!r}, which is no model with weights alone"
+            f"{subject} is an adapter of {printable(named)!r}, which is no model with weights alone"
         )
     _, _, other = base.name.partition(":")
     return replace(
@@ -284,10 +284,10 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
 
     On llama-cpp the projector beside it goes with it, which has the same name behind its prefix.
     """
-    stated = read_facts(file)
-    if stated.decision:
+    facts = read_facts(file)
+    if facts.decision:
         raise UserError(
-            f"model {printable(text)!r} is a decision model ({printable(stated.decision, 30)}), "
+            f"model {printable(text)!r} is a decision model ({printable(facts.decision, 30)}), "
             "which no engine opens here; serve it by llama-server, and copy "
             "models/systemone-example.toml"
         )
@@ -298,10 +298,10 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
         file.stem,
         engine,
         str(file),
-        f"Local GGUF file{f': {printable(stated.name)}' if stated.name else ''}",
-        thinking="switch" if _SWITCH in (stated.template or "").encode() else "none",
-        licence=stated.licence and printable(stated.licence),
-        system=_system(stated.template),
+        f"Local GGUF file{f': {printable(facts.name)}' if facts.name else ''}",
+        thinking="switch" if _SWITCH in (facts.template or "").encode() else "none",
+        licence=facts.licence and printable(facts.licence),
+        system=_system(facts.template),
         letters=_letters(file.parent),
         vision=vision,
         projector=projector.name if vision else None,

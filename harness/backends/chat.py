@@ -111,7 +111,7 @@ class Chat:
         self._compiled = ChatTemplate(name, self.template)
 
     @property
-    def shown(self) -> str:
+    def subject(self) -> str:
         return f"model {printable(self.name)!r}"
 
     @property
@@ -130,7 +130,9 @@ class Chat:
     def turn_end(self) -> int | None:
         """Id of the token that the template writes after an answer; None if there is none."""
         with suppress(UserError):
-            text = self._apply(self._shown(_TURN), thinking=False, add_generation_prompt=False)
+            text = self._apply(
+                self._template_messages(_TURN), thinking=False, add_generation_prompt=False
+            )
             _, answer, rest = text.rpartition(_ANSWER)
             tokens = self.encode(rest.lstrip()) if answer else []
             # A mark that is a token of its own stands for no text, or is at least written like one.
@@ -150,23 +152,24 @@ class Chat:
         A picture stands as `image_token`. Raises UserError if the template refuses the messages, or
         leaves out a text of them.
         """
-        shown = self._shown(with_system(messages, self.system))
+        template_messages = self._template_messages(with_system(messages, self.system))
         try:
-            prompt = self._apply(shown, thinking=thinking)
+            prompt = self._apply(template_messages, thinking=thinking)
         except Refused as error:
             raise UserError(f"{error}; {self._way_out(messages, thinking)}") from None
-        if (lacking := lost_message(shown, prompt)) is not None:
-            turn = next(n for n, message in enumerate(shown, 1) if message is lacking)
+        if (lacking := lost_message(template_messages, prompt)) is not None:
+            turn = next(n for n, message in enumerate(template_messages, 1) if message is lacking)
             raise UserError(
-                f"{self.shown}: its chat template leaves out or changes the text of message {turn} "
-                f"of {len(shown)}, the {printable(lacking['role'])}'s, or moves it; the model "
-                f"would not read what it is asked; {self._way_out(messages, thinking)}"
+                f"{self.subject}: its chat template leaves out or changes the text of message "
+                f"{turn} of {len(template_messages)}, the {printable(lacking['role'])}'s, or moves "
+                f"it; the model would not read what it is asked; "
+                f"{self._way_out(messages, thinking)}"
             )
         return prompt
 
     def _way_out(self, messages: Sequence[Mapping[str, str]], thinking: bool) -> str:
         """Return what helps where a template has no place for one of the messages."""
-        joined = self._shown(with_system(messages, FIRST_USER))
+        joined = self._template_messages(with_system(messages, FIRST_USER))
         if len(joined) < len(messages) and not self.system:
             with suppress(UserError):
                 if lost_message(joined, self._apply(joined, thinking=thinking)) is None:
@@ -176,7 +179,7 @@ class Chat:
                     )
         return "use a prompt with roles that it knows, or a model with another template"
 
-    def _shown(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
+    def _template_messages(self, messages: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
         """Convert messages for the template.
         A picture's token written inside a text is broken up.
         """

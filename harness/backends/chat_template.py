@@ -85,16 +85,19 @@ def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
 
 def needs_first_user(text: str) -> bool:
     """Return whether a template refuses a system message, but takes its text in the user's."""
-    asked = ({"role": "system", "content": "Be brief."}, {"role": "user", "content": "Where to?"})
+    messages = (
+        {"role": "system", "content": "Be brief."},
+        {"role": "user", "content": "Where to?"},
+    )
     empty = {"bos_token": "", "eos_token": ""}
     try:
         template = ChatTemplate("", text)
-        joined = with_system(asked, FIRST_USER)
+        joined = with_system(messages, FIRST_USER)
         takes = lost_message(joined, template.render(joined, **empty)) is None
     except UserError:
         return False
     try:
-        template.render(asked, **empty)
+        template.render(messages, **empty)
     except UserError:
         return takes
     return False

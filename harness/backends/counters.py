@@ -56,14 +56,14 @@ def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
             before = now
 
     sampling = Thread(target=sample, daemon=True)
-    begun = {meter.name: meter.joules() for meter in meters if meter.joules}
+    joules_before = {meter.name: meter.joules() for meter in meters if meter.joules}
     sampling.start()
     try:
         yield spent
     finally:
         ended.set()
         sampling.join()
-        spent |= sums | {m.name: m.joules() - begun[m.name] for m in meters if m.joules}
+        spent |= sums | {m.name: m.joules() - joules_before[m.name] for m in meters if m.joules}
 
 
 def _nvml() -> Iterator[Counter]:

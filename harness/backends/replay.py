@@ -82,7 +82,7 @@ class Replay:
         """Open the model that answered in a role.
         Raises UserError if it cannot be asked these requests.
         """
-        manifest, shown = self._run.manifest, printable(self._run.path)
+        manifest, run_path = self._run.manifest, printable(self._run.path)
         agent = manifest.agent(0 if role == "ego" else 1)
         for request in requests:
             # A run answers the first step of each of its episodes; only those to other questions
@@ -95,8 +95,8 @@ class Replay:
             foreign = first_step or _episode(request.id) not in self._episodes or "+" in request.id
             if (foreign and not again) or (role == "helper" and len(manifest.helpers) > 1):
                 raise UserError(
-                    f"{shown} holds no answer for {request.id}; replay a run of the same dataset "
-                    "and limit"
+                    f"{run_path} holds no answer for {request.id}; replay a run of the same "
+                    "dataset and limit"
                     + (
                         ", whose conditions delivered the same messages"
                         if "+" in request.id
@@ -106,9 +106,11 @@ class Replay:
                 )
             self._check(request, agent)
         if role not in self._models:
-            stated = convert(agent["model"], Card, f"{shown}: its model")
-            lacking = f"{shown} holds no answer for {requests[0].id}"
-            card = find_own(stated, (), lacking, "write one of that name, or make the run again")
+            stated_card = convert(agent["model"], Card, f"{run_path}: its model")
+            lacking = f"{run_path} holds no answer for {requests[0].id}"
+            card = find_own(
+                stated_card, (), lacking, "write one of that name, or make the run again"
+            )
             model = open_backend(
                 card, dtype=manifest.settings.dtype, batch_size=manifest.settings.batch_size
             )
@@ -134,23 +136,23 @@ class Replay:
         )
 
     def _check(self, request: Request, agent: Mapping[str, Any]) -> None:
-        shown = printable(self._run.path)
+        run_path = printable(self._run.path)
         # The prompt's digest cannot tell: free and constrained answers have the same prompt.
         if agent["answer"] != request.answer:
             raise UserError(
-                f"{shown} was run with --answer {agent['answer']}; replay it with the same"
+                f"{run_path} was run with --answer {agent['answer']}; replay it with the same"
             )
         if bool(request.orders) != (agent["answer"] in BARE and agent["letters"] == "cyclic"):
             raise UserError(
-                f"{shown} was run with --letters {agent['letters']}; replay it with the same"
+                f"{run_path} was run with --letters {agent['letters']}; replay it with the same"
             )
         if request.flips and not agent["flip"]:
             raise UserError(
-                f"{shown} was run without --flip; leave it out, or make the run again with it"
+                f"{run_path} was run without --flip; leave it out, or make the run again with it"
             )
         if request.thinking != agent["thinking"]:
             how = "off; leave --thinking out" if request.thinking else "on; add --thinking"
-            raise UserError(f"{shown} was run with thinking {how}")
+            raise UserError(f"{run_path} was run with thinking {how}")
 
     def _completion(self, request: Request, answer: Answer) -> Completion:
         agent = self._run.agent(answer)
@@ -159,8 +161,8 @@ class Replay:
         if self._run.actions != request.actions == self._run.actions[::-1]:
             return failed(request, "the run has no such answer")
         again = request.id.endswith(AGAIN)
-        asked = digest(request.messages[: -2 if again else None]), request.image_sha256
-        if asked != (answer.prompt_sha256, answer.image_sha256 or None):
+        digests = digest(request.messages[: -2 if again else None]), request.image_sha256
+        if digests != (answer.prompt_sha256, answer.image_sha256 or None):
             raise UserError(
                 f"{printable(self._run.path)} was asked {request.id} with another prompt or "
                 "dataset; replay it with that run's --prompt, --image and --dataset"

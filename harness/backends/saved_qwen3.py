@@ -47,10 +47,10 @@ class Saved(NamedTuple):
     vision: dict[str, Any] | None = None
 
 
-def read(checkpoint: Path, shown: str) -> Saved:
+def read(checkpoint: Path, subject: str) -> Saved:
     """Return what the small files of a Qwen3 or Qwen3-VL checkpoint say.
 
-    `shown` names it in messages. Raises UserError if a file is missing, or says what llama.cpp
+    `subject` names it in messages. Raises UserError if a file is missing, or says what llama.cpp
     would take otherwise.
     """
     texts = {
@@ -67,7 +67,7 @@ def read(checkpoint: Path, shown: str) -> Saved:
     for name in ("config.json", "tokenizer.json", "model.safetensors"):
         if not (checkpoint / name).is_file():
             raise UserError(
-                f"{shown} has no {name}; give the folder of a saved model with its tokenizer"
+                f"{subject} has no {name}; give the folder of a saved model with its tokenizer"
             )
     config, tokenizer = json.loads(texts["config.json"]), json.loads(texts["tokenizer.json"])
     template = texts.get("chat_template.jinja") or json.loads(
@@ -75,47 +75,47 @@ def read(checkpoint: Path, shown: str) -> Saved:
     ).get("chat_template")
     if not isinstance(template, str):
         raise UserError(
-            f"{shown} has no chat template; put a chat_template.jinja beside its config.json"
+            f"{subject} has no chat template; put a chat_template.jinja beside its config.json"
         )
     vision = None
     if config["architectures"] == ["Qwen3VLForConditionalGeneration"]:
         if _PIXELS not in texts:
-            raise UserError(f"{shown} has no {_PIXELS}; save its image processor as well")
+            raise UserError(f"{subject} has no {_PIXELS}; save its image processor as well")
         processor = json.loads(texts[_PIXELS])
         vision = config["vision_config"] | {
             key: processor[key] for key in ("image_mean", "image_std")
         }
         config = {**config["text_config"], "tie_word_embeddings": config["tie_word_embeddings"]}
-        _check(vision, _SEEN, f"{shown} [vision_config]")
+        _check(vision, _SEEN, f"{subject} [vision_config]")
         sections, half = rope(config)["mrope_section"], config["head_dim"] // 2
         # Frequencies go to time, height and width in turn. One past its turn is time's to
         # transformers, and not turned at all by llama.cpp.
         if any(i >= 3 * sections[i % 3] for i in range(half)):
             whole = [-(-(half - axis) // 3) for axis in range(3)]
             raise UserError(
-                f"{shown}: mrope_section = {printable(sections)}; only {whole} can be exported"
+                f"{subject}: mrope_section = {printable(sections)}; only {whole} can be exported"
             )
     elif config["architectures"] != ["Qwen3ForCausalLM"]:
         given = printable(config["architectures"])
         raise UserError(
-            f"{shown} is a {given}; only Qwen3ForCausalLM and Qwen3VLForConditionalGeneration can "
-            "be exported"
+            f"{subject} is a {given}; only Qwen3ForCausalLM and Qwen3VLForConditionalGeneration "
+            "can be exported"
         )
-    _check(config, _ONE_VALUE, shown)
+    _check(config, _ONE_VALUE, subject)
     scaling = rope(config).get("rope_type", "default")
     if scaling != "default" or config.get("rope_scaling"):
         raise UserError(
-            f"{shown} scales its rope ({printable(scaling)}); only the default can be exported"
+            f"{subject} scales its rope ({printable(scaling)}); only the default can be exported"
         )
-    _check_tokenizer(tokenizer, shown)
+    _check_tokenizer(tokenizer, subject)
     return Saved(config, tokenizer, template, vision)
 
 
-def _check(config: Mapping[str, Any], only: Mapping[str, Any], shown: str) -> None:
+def _check(config: Mapping[str, Any], only: Mapping[str, Any], subject: str) -> None:
     for key, value in only.items():
         if config.get(key, value) != value:
             raise UserError(
-                f"{shown}: {key} = {printable(config[key])}; only {value} can be exported"
+                f"{subject}: {key} = {printable(config[key])}; only {value} can be exported"
             )
 
 
@@ -125,13 +125,13 @@ def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
     return parameters
 
 
-def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
+def _check_tokenizer(tokenizer: Mapping[str, Any], subject: str) -> None:
     """Raise UserError unless llama.cpp would read the same tokens by a GGUF file's tokenizer."""
     model, pre = tokenizer["model"], tokenizer["pre_tokenizer"] or {}
     steps = pre.get("pretokenizers", ())
     known_parts = []
-    for step, known in zip(steps, (_SPLIT, _BYTES), strict=False):
-        known_parts.append({key: step.get(key) for key in known})
+    for step, known_part in zip(steps, (_SPLIT, _BYTES), strict=False):
+        known_parts.append({key: step.get(key) for key in known_part})
     odd = [
         token["content"]
         for token in tokenizer["added_tokens"]
@@ -147,7 +147,7 @@ def _check_tokenizer(tokenizer: Mapping[str, Any], shown: str) -> None:
         what = f"takes spaces or whole words with {printable(odd[0])}"
     else:
         return
-    raise UserError(f"{shown}: its tokenizer {what}; llama.cpp would silently read other tokens")
+    raise UserError(f"{subject}: its tokenizer {what}; llama.cpp would silently read other tokens")
 
 
 def numbers(tensor: Any) -> NDArray[np.float32]:

@@ -230,12 +230,12 @@ def readable(variable: str) -> bool:
 
 def meant(address: str) -> str | None:
     """Return the base URL that is meant by an address without `http://`; None if unclear."""
-    found = _ADDRESS.fullmatch(address)
-    if found is None or address.startswith(("http://", "https://")):
+    match = _ADDRESS.fullmatch(address)
+    if match is None or address.startswith(("http://", "https://")):
         return None
-    scheme = "https" if (found["scheme"] or "").lower().startswith("https") else "http"
-    path = (found["path"] or "").rstrip("/") or "/v1"
-    return f"{scheme}://{found['host']}{path}"
+    scheme = "https" if (match["scheme"] or "").lower().startswith("https") else "http"
+    path = (match["path"] or "").rstrip("/") or "/v1"
+    return f"{scheme}://{match['host']}{path}"
 
 
 def _fault(url: str) -> str | None:

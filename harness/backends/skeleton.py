@@ -169,7 +169,7 @@ class Skeleton:
             by_tokens = sorted(leg.tokens for leg in legs)
             if any(longer[: len(tokens)] == tokens for tokens, longer in pairwise(by_tokens)):
                 raise UserError(
-                    f"{self._chat.shown}: its tokenizer cannot tell the choices of a "
+                    f"{self._chat.subject}: its tokenizer cannot tell the choices of a "
                     "constrained answer apart; use --answer json"
                 )
         return self._legs[point, before]

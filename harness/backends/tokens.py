@@ -112,8 +112,8 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
             f"{printable(file)} has the pre-tokeniser {printable(pre)}, which is not known here; "
             "give the model's tokenizer.json, or run it on llama-cpp"
         )
-    architecture, stated, _ = gguf.get_gguf_tokenizer(str(file))
-    built, _ = gguf.convert_gguf_tokenizer(architecture, stated)
+    architecture, tokenizer_fields, _ = gguf.get_gguf_tokenizer(str(file))
+    built, _ = gguf.convert_gguf_tokenizer(architecture, tokenizer_fields)
     return built
 
 

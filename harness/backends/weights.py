@@ -14,8 +14,8 @@ from harness.backends.adapters import find_adapter
 from harness.backends.card import Card
 from harness.backends.gguf import ModelFacts, read_facts
 from harness.backends.registry import (
-    asked,
     capabilities,
+    engine_answer,
     locate,
     missing_package,
     registration,
@@ -81,7 +81,7 @@ def find_gguf(card: Card) -> Path:
     if wanted := packages.find_packaged(card):
         if not wanted.place.is_file():
             raise UserError(
-                f"{wanted.shown} is not fetched yet; run `harness model pull "
+                f"{wanted.subject} is not fetched yet; run `harness model pull "
                 f"{printable(card.name)}`"
             )
         return wanted.place
@@ -138,21 +138,17 @@ def contradictions(card: Card) -> Iterator[str]:
     UserError if the weights are not found.
     """
     where = locate(card)
-    stated = (
+    facts = (
         read_facts(where) if where.is_file() else ModelFacts(context_tokens=_context_tokens(where))
     )
-    if card.licence and stated.licence and card.licence.casefold() != stated.licence.casefold():
+    if card.licence and facts.licence and card.licence.casefold() != facts.licence.casefold():
         yield (
-            f"licence {printable(card.licence)} by its card, {printable(stated.licence)} by its "
+            f"licence {printable(card.licence)} by its card, {printable(facts.licence)} by its "
             "file; correct the card, or ask who made the file"
         )
-    if (
-        card.context_tokens
-        and stated.context_tokens
-        and card.context_tokens > stated.context_tokens
-    ):
+    if card.context_tokens and facts.context_tokens and card.context_tokens > facts.context_tokens:
         yield (
-            f"context of {card.context_tokens} tokens by its card, {stated.context_tokens} by its "
+            f"context of {card.context_tokens} tokens by its card, {facts.context_tokens} by its "
             "weights: what is longer was never trained; lower context_tokens"
         )
 
@@ -184,7 +180,7 @@ def pull(card: Card) -> Path:
     engine, where = registration(card.engine), locate(card)
     check_digest(card, where if where.is_file() else where / "model.safetensors")
     if engine.prepares and missing_package(card.engine) is None:
-        asked(card, engine.prepares)
+        engine_answer(card, engine.prepares)
     return where
 
 

@@ -25,12 +25,12 @@ def find(card: Card) -> Path:
     Raises UserError if there is none.
     """
     weights = card.weights or ""
-    if (own := Path(weights).expanduser()).suffix == SUFFIX:
-        if not own.is_file():
+    if (path := Path(weights).expanduser()).suffix == SUFFIX:
+        if not path.is_file():
             raise UserError(
                 f"{card.shown}: weights {printable(weights)} is no file; give one that is there"
             )
-        return own
+        return path
     # an import would take NumPy, and lists only look for weights
     package = find_spec("sparrow_decider")
     assert package

@@ -64,19 +64,19 @@ def _decisions(
         parts = [picture, {"type": "input_text", "text": question.state}]
         content = [{"role": "user", "content": parts}]
     meant = {action: question.meanings[action] for action in request.actions}
-    asked: dict[str, Any] = {"name": NAME, "instructions": question.instructions}
+    entry: dict[str, Any] = {"name": NAME, "instructions": question.instructions}
     if question.kind == "choice":
         choices = [{"value": a, "description": m} if m else {"value": a} for a, m in meant.items()]
-        asked |= {"type": "choice", "choices": choices}
+        entry |= {"type": "choice", "choices": choices}
     elif question.kind == "score":
-        asked |= {"type": "score", "levels": [{"label": m or a} for a, m in meant.items()]}
+        entry |= {"type": "score", "levels": [{"label": m or a} for a, m in meant.items()]}
     else:  # a predicate has no place for what its outcomes mean
         described = [f"{action}: {meaning}" for action, meaning in meant.items() if meaning]
-        asked |= {
+        entry |= {
             "type": "predicate",
             "instructions": "\n".join([question.instructions, *described]),
         }
-    return {"model": card.weights, "input": content, "questions": [asked]}
+    return {"model": card.weights, "input": content, "questions": [entry]}
 
 
 def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:

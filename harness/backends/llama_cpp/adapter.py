@@ -41,9 +41,9 @@ def find_adapter_gguf(card: Card, base: Path) -> Path | None:
     try:
         values = read_metadata(base)
     except ValueError as error:
-        shown = f"{card.shown} in {printable(base)}"
+        subject = f"{card.shown} in {printable(base)}"
         raise UserError(
-            f"{shown} does not load: {error}; copy or download the file again"
+            f"{subject} does not load: {error}; copy or download the file again"
         ) from None
     architecture = str(values.get("general.architecture"))
     shape = [str(item) for item in values.items() if item[0].startswith(architecture)]

@@ -122,13 +122,13 @@ class Child:
     def _start(self) -> None:
         for _ in range(LOADS):
             context = get_context("spawn")
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, *self._opener), daemon=True)
+            our_end, child_end = context.Pipe()
+            process = context.Process(target=_serve, args=(child_end, *self._opener), daemon=True)
             with _uninterrupted():
                 process.start()
-            theirs.close()  # otherwise the child's death would not close the pipe
+            child_end.close()  # otherwise the child's death would not close the pipe
             Thread(target=_watch, args=(process.pid,), daemon=True).start()
-            self._running = process, ours
+            self._running = process, our_end
             try:
                 self._receive()
                 return
@@ -191,11 +191,11 @@ class LlamaBackend(Child):
 class _RemoteTokenizer:
     def __init__(self, child: Child) -> None:
         self._child = child
-        stated = (
+        facts = (
             child.call(f"chat.tokenizer.{name}")
             for name in ("template", "specials", "bos", "vocabulary")
         )
-        self.template, self.specials, self.bos, self.vocabulary = stated
+        self.template, self.specials, self.bos, self.vocabulary = facts
 
     def encode(self, text: str) -> list[int]:
         return list(self._call("encode", text))

@@ -77,12 +77,14 @@ class LlamaEngine:
         batch_size: int,
         projector: Projector | None = None,
     ) -> None:
-        shown = [text for text in _PICTURES if projector and text in model.template]
-        if projector and not shown:
+        picture_tokens = [text for text in _PICTURES if projector and text in model.template]
+        if projector and not picture_tokens:
             raise UserError(
                 f"{card.shown}: its chat template has none of {_PICTURES} for a picture"
             )
-        self.chat = Chat(card.name, model, shown[0] if shown else None, card.system)
+        self.chat = Chat(
+            card.name, model, picture_tokens[0] if picture_tokens else None, card.system
+        )
         self.context_tokens = card.context_tokens or model.trained_tokens
         self.stops: Sequence[int] = sorted({*model.stops, *self.chat.ends})
         self._card, self._file, self._model = card, file, model
@@ -118,8 +120,8 @@ class LlamaEngine:
         groups = []
         for members in group_by_beginning(heads):
             shared = common_beginning([heads[i] for i in members])
-            nearest, known = self._nearest(shared)
-            groups.append(_Group([places[i] for i in members], shared, nearest, known, known))
+            nearest, n_known = self._nearest(shared)
+            groups.append(_Group([places[i] for i in members], shared, nearest, n_known, n_known))
         if len(prompts) == 1:
             groups = [self._read_again(groups[0])]
         for group in groups:
@@ -159,8 +161,8 @@ class LlamaEngine:
         """
         if self._projector and group.known == len(group.shared):
             self._projector.forget(group.shared)
-        nearest, known = self._nearest(group.shared, but=len(group.shared))
-        return group._replace(nearest=nearest, known=known)
+        nearest, n_known = self._nearest(group.shared, but=len(group.shared))
+        return group._replace(nearest=nearest, known=n_known)
 
     def _used(self, beginning: int) -> None:
         self._beginnings.remove(beginning)

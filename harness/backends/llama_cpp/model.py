@@ -38,11 +38,11 @@ class LlamaModel:
         self, name: str, file: Path, device: str | None, adapter: Path | None = None
     ) -> None:
         c.llama_log_set(keep_errors, ctypes.c_void_p(0))
-        shown = f"model {name!r} in {printable(file)}"
+        subject = f"model {name!r} in {printable(file)}"
         if device not in (None, "cpu") and not (device == "gpu" and c.llama_supports_gpu_offload()):
-            known = "cpu, gpu" if c.llama_supports_gpu_offload() else "cpu"
+            devices = "cpu, gpu" if c.llama_supports_gpu_offload() else "cpu"
             raise UserError(
-                f"device {printable(device)!r}; llama.cpp as it is built here has: {known}"
+                f"device {printable(device)!r}; llama.cpp as it is built here has: {devices}"
             )
         params = c.llama_model_default_params()
         # ggml-org/llama.cpp#20824: repacked quantised weights crash on CPUs with AMX.
@@ -53,20 +53,20 @@ class LlamaModel:
         self.pointer = c.llama_model_load_from_file(bytes(file), params)
         if not self.pointer:
             raise UserError(
-                f"{shown} does not load: {last_error()}; copy or download the file again"
+                f"{subject} does not load: {last_error()}; copy or download the file again"
             )
         self.adapter_file = adapter
         self._adapter = adapter and c.llama_adapter_lora_init(self.pointer, bytes(adapter))
         if adapter and not self._adapter:
-            raise foreign(shown, adapter, last_error())
+            raise foreign(subject, adapter, last_error())
         self._vocab = c.llama_model_get_vocab(self.pointer)
         self.vocabulary: int = c.llama_vocab_n_tokens(self._vocab)
         if not self.vocabulary or c.llama_vocab_type(self._vocab) == c.LLAMA_VOCAB_TYPE_NONE:
-            raise UserError(f"{shown} has no tokenizer; give a GGUF file of a chat model")
+            raise UserError(f"{subject} has no tokenizer; give a GGUF file of a chat model")
         template = c.llama_model_chat_template(self.pointer, None)
         if not template:
             raise UserError(
-                f"{shown} has no chat template; give the GGUF file of its instruct version"
+                f"{subject} has no chat template; give the GGUF file of its instruct version"
             )
         self.template: str = template.decode(errors="replace")
         self.trained_tokens: int = c.llama_model_n_ctx_train(self.pointer)  # length of its context

@@ -63,7 +63,7 @@ class Projector:
         Raises UserError if it is none, not of this model, or makes another number of tokens than
         the card says.
         """
-        shown = f"model {name!r} with projector {printable(file)}"
+        subject = f"model {name!r} with projector {printable(file)}"
         try:
             m = import_module("llama_cpp.mtmd_cpp")
         except (ImportError, OSError):  # OSError: its library is missing
@@ -87,13 +87,15 @@ class Projector:
         self._context = m.mtmd_init_from_file(bytes(file), model.pointer, params)
         if not self._context:
             raise UserError(
-                f"{shown} does not load: {last_error()}; give the mmproj file of this very model"
+                f"{subject} does not load: {last_error()}; give the mmproj file of this very model"
             )
         if not m.mtmd_support_vision(self._context):
-            raise UserError(f"{shown} takes no pictures; give an mmproj file of a model that does")
+            raise UserError(
+                f"{subject} takes no pictures; give an mmproj file of a model that does"
+            )
         if m.mtmd_decode_use_non_causal(self._context, None):
             raise UserError(
-                f"{shown}: its pictures' tokens see those behind them, which is not done here"
+                f"{subject}: its pictures' tokens see those behind them, which is not done here"
             )
         self._mrope: bool = m.mtmd_decode_use_mrope(self._context)
         self._pictures = Pictures(lambda images: [self._encode(image) for image in images])
@@ -104,7 +106,7 @@ class Projector:
         )
         if count != vision.tokens:
             raise UserError(
-                f"{shown} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, "
+                f"{subject} makes {count} tokens of {vision.width_px} x {vision.height_px} pixels, "
                 f"and its card's [vision] {vision.tokens}; fix the card, or give the model's own "
                 "projector"
             )

@@ -181,13 +181,13 @@ class OpenAIBackend:
         """Keep which server gave an answer;
         say once if it names another model than it was asked for.
         """
-        model, asked = answering_model(reply.payload), self._card.weights
-        if model not in (None, asked, f"{asked}:latest", (self._pool.model.listed or {}).get("id")):
+        model, name = answering_model(reply.payload), self._card.weights
+        if model not in (None, name, f"{name}:latest", (self._pool.model.listed or {}).get("id")):
             model, url = printable(model), printable(reply.url)
             if not self._named_other:
                 self._named_other = True
                 self._pool.say(
-                    f"server {url} was asked for {printable(asked)}, and says that {model} answers"
+                    f"server {url} was asked for {printable(name)}, and says that {model} answers"
                 )
         if not answer.error:
             self._served.append(Served(request.id, reply.url, model))
@@ -229,8 +229,8 @@ def _over_orders(request: Request, completions: Sequence[Completion]) -> Complet
 
     def total(values: Iterable[Any]) -> Any:
         """Return the sum of some values; None if one is not known."""
-        known = list(values)
-        return None if None in known else sum(known)
+        summands = list(values)
+        return None if None in summands else sum(summands)
 
     # The shares come back as the actions' of the first order: each text names its letters by them.
     letters_p = []

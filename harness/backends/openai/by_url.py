@@ -92,19 +92,21 @@ async def _ask(server: Server, name: str) -> Card:
 
 def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     """Return the model of a name, or the only one. Raises what `served_card` raises."""
-    shown = printable(url)
+    address = printable(url)
     if reply.unreached or reply.again:
-        raise Unanswered(f"no server answers at {shown} ({reply.fault}); start it, or fix --model")
+        raise Unanswered(
+            f"no server answers at {address} ({reply.fault}); start it, or fix --model"
+        )
     if reply.status in (401, 403):
         raise Unanswered(
-            f"the server at {shown} refuses the key ({reply.fault}); set {KEY} in the environment"
+            f"the server at {address} refuses the key ({reply.fault}); set {KEY} in the environment"
         )
     listed = {model.id: model for model in _listed(reply.payload)}
     if not listed and not name:
         raise UserError(
-            f"{shown}/models lists no model "
+            f"{address}/models lists no model "
             f"({reply.fault or 'the list is empty or none of OpenAI'}); give "
-            f"the base URL up to and with /v1, or the model's name as well: --model {shown}#NAME"
+            f"the base URL up to and with /v1, or the model's name as well: --model {address}#NAME"
         )
     alike = [
         model
@@ -116,7 +118,7 @@ def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     if not listed:  # some servers have no list
         if len(name) > LONGEST or not name.isprintable():
             raise UserError(
-                f"--model: {printable(name)} is no model's name; give one that {shown} knows"
+                f"--model: {printable(name)} is no model's name; give one that {address} knows"
             )
         return _Listed(name, "", False)
     if not name and len(listed) == 1:
@@ -125,8 +127,8 @@ def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     reason = f"has no model {printable(name)!r}" if name else f"serves {len(names)} models"
     raise UserError(
-        f"{shown} {reason}: {', '.join(names[:SHOWN])}{more}; give one, as --model "
-        f"'{shown}#{names[0]}'"
+        f"{address} {reason}: {', '.join(names[:SHOWN])}{more}; give one, as --model "
+        f"'{address}#{names[0]}'"
     )
 
 

@@ -178,10 +178,12 @@ class _Reader:
         raise ValueError
 
     def _number(self, least: float, most: float, whole: bool) -> None:
-        number, begun = (_DECIMALS, _DECIMALS_BEGUN) if self._compact else (_NUMBER, _NUMBER_BEGUN)
+        number, beginning = (
+            (_DECIMALS, _DECIMALS_BEGUN) if self._compact else (_NUMBER, _NUMBER_BEGUN)
+        )
         match = number.match(self._text, self.at)
         open_ended = not match or not self._compact  # more digits or an exponent may follow
-        if open_ended and begun.fullmatch(self._text, self.at):
+        if open_ended and beginning.fullmatch(self._text, self.at):
             raise EOFError
         if (
             not match

@@ -55,8 +55,8 @@ def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
         return None
     choices = payload.get("choices")
     first = choices[0] if isinstance(choices, list) and choices else None
-    for stated in (payload, first):
-        if isinstance(stated, dict) and (error := stated.get("error")):
+    for part in (payload, first):
+        if isinstance(part, dict) and (error := part.get("error")):
             return Fault(error_words({"error": error}), _code(error) or _code(payload))
     finish = first.get("finish_reason") if isinstance(first, dict) else None
     if of_chat and ending(finish) == "broken":

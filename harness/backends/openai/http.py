@@ -101,7 +101,7 @@ class Client:
                 return await self._read(method, base, url, content)
         except (aiohttp.ClientError, UnicodeError) as error:
             kind, text = type(error).__name__, str(error)
-            fault = self._shown(f"{kind}: {text}" if text else kind)
+            fault = self._printable_text(f"{kind}: {text}" if text else kind)
             return Reply(fault=fault, unreached=isinstance(error, _UNREACHED), again=True)
         except TimeoutError:
             return Reply(fault=f"no whole answer within {within_s:g} s", again=True)
@@ -135,7 +135,7 @@ class Client:
         if streamed and status == 200:
             if stream.fault:
                 code = stream.code if stream.again and stream.code else status
-                return fault(self._shown(stream.fault), code, stream.again)
+                return fault(self._printable_text(stream.fault), code, stream.again)
             # Put together before the key is looked for, since pieces may cut through it.
             payload, _ = self._payload(json.dumps(stream.payload()).encode())
             return Reply(payload, status=status, first_at_s=stream.first_at_s)
@@ -148,14 +148,14 @@ class Client:
                 return Reply(
                     payload, fault=None if readable else self._no_json(data), status=status
                 )
-            words = f"with HTTP 200: {self._shown(error.words)}"
+            words = f"with HTTP 200: {self._printable_text(error.words)}"
             if error.code is None:
                 return fault(f"an error {words}", again=error.again)
             return fault(f"error {error.code} {words}", error.code, may_pass(error.code))
         if 300 <= status < 400:
             return fault(f"HTTP {status}: a redirect, which is not followed")
         message = error_words(payload) if readable else bytes(data).decode("utf-8", "replace")
-        return fault(f"HTTP {status}: {self._shown(message)}", again=may_pass(status))
+        return fault(f"HTTP {status}: {self._printable_text(message)}", again=may_pass(status))
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
         """Parse JSON and remove the key from it, however it is escaped.
@@ -184,7 +184,7 @@ class Client:
             return text
         return text.replace(json.dumps(self._key)[1:-1], "[key]").replace(self._key, "[key]")
 
-    def _shown(self, text: str) -> str:
+    def _printable_text(self, text: str) -> str:
         # The key is removed before the text is cut, or half of it might stay.
         return printable(" ".join(self._without_key(text).split()), 200)
 

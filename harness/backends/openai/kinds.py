@@ -23,7 +23,7 @@ class ServerKind:
 
     path = ""  # where it tells that it is one; empty if nowhere
 
-    def is_one(self, said: Mapping[str, Any]) -> bool:
+    def is_one(self, payload: Mapping[str, Any]) -> bool:
         """Return whether the JSON that a server has at `path` shows that it is of this kind."""
         return False
 
@@ -41,8 +41,8 @@ class LlamaServer(ServerKind):
 
     path = "/props"
 
-    def is_one(self, said: Mapping[str, Any]) -> bool:
-        return "default_generation_settings" in said
+    def is_one(self, payload: Mapping[str, Any]) -> bool:
+        return "default_generation_settings" in payload
 
     async def states(self, model: str, ask: Ask) -> Statement:
         props = fields_of(await ask(self.path, None))
@@ -72,8 +72,8 @@ class LMStudio(ServerKind):
 
     path = "/api/v0/models"
 
-    def is_one(self, said: Mapping[str, Any]) -> bool:
-        return isinstance(said.get("data"), list)
+    def is_one(self, payload: Mapping[str, Any]) -> bool:
+        return isinstance(payload.get("data"), list)
 
     async def states(self, model: str, ask: Ask) -> Statement:
         return None, entry_of(fields_of(await ask(self.path, None)), "data", model) or {}
@@ -84,8 +84,8 @@ class Ollama(ServerKind):
 
     path = "/api/version"
 
-    def is_one(self, said: Mapping[str, Any]) -> bool:
-        return isinstance(said.get("version"), str)
+    def is_one(self, payload: Mapping[str, Any]) -> bool:
+        return isinstance(payload.get("version"), str)
 
     async def states(self, model: str, ask: Ask) -> Statement:
         version = fields_of(await ask(self.path, None)).get("version")
@@ -110,8 +110,8 @@ class LlamaCppPython(ServerKind):
 
     path = "/openapi.json"
 
-    def is_one(self, said: Mapping[str, Any]) -> bool:
-        return "llama.cpp Python API" in str(said.get("info"))[:500]
+    def is_one(self, payload: Mapping[str, Any]) -> bool:
+        return "llama.cpp Python API" in str(payload.get("info"))[:500]
 
 
 class VLLM(ServerKind):
@@ -146,9 +146,9 @@ SERVER_KINDS: Mapping[Kind, ServerKind] = {
 
 async def kind_of(ask: Ask) -> Kind:
     """Return the kind of a server, by what it answers at each kind's `path`; or `generic`."""
-    known = {kind: server for kind, server in SERVER_KINDS.items() if server.path}
-    replies = await asyncio.gather(*(ask(server.path, None) for server in known.values()))
-    for (kind, server), reply in zip(known.items(), replies, strict=True):
+    probed_kinds = {kind: server for kind, server in SERVER_KINDS.items() if server.path}
+    replies = await asyncio.gather(*(ask(server.path, None) for server in probed_kinds.values()))
+    for (kind, server), reply in zip(probed_kinds.items(), replies, strict=True):
         if reply.status == 200 and server.is_one(fields_of(reply)):
             return kind
     return "generic"

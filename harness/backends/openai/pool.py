@@ -327,14 +327,14 @@ class ServerPool:
                 "have another model than others; fix weights in the card, or what is served"
             )
         if self.model.listed is not None and model != self.model:
-            first = f"server {printable(self._first.url)} has {_shown(self.model, model)}"
+            first = f"server {printable(self._first.url)} has {_statement(self.model, model)}"
             raise UserError(
-                f"model {self._name!r}: {first}, and server {url} {_shown(model, self.model)}; "
+                f"model {self._name!r}: {first}, and server {url} {_statement(model, self.model)}; "
                 "serve the same model, by the same version"
             )
 
 
-def _shown(model: Model, other: Model) -> str:
+def _statement(model: Model, other: Model) -> str:
     """Return a statement's name and version, and what else it states otherwise than another,
     in one line.
     """

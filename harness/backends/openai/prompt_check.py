@@ -70,14 +70,14 @@ class PromptCheck:
             "at its context length and log"
         )
 
-    async def _ask(self, base: str, asked: dict[str, Any]) -> None:
-        messages: Messages = asked["messages"]
+    async def _ask(self, base: str, fields: dict[str, Any]) -> None:
+        messages: Messages = fields["messages"]
         if self._server.kind == "llama-server":
-            prompt = await self._field(base, "/apply-template", "prompt", asked)
+            prompt = await self._field(base, "/apply-template", "prompt", fields)
             lacking = lost_message(messages, prompt) if isinstance(prompt, str) else None
         else:
-            without_first = {**asked, "messages": messages[1:]}
-            count = await self._field(base, "/tokenize", "count", asked)
+            without_first = {**fields, "messages": messages[1:]}
+            count = await self._field(base, "/tokenize", "count", fields)
             fewer = await self._field(base, "/tokenize", "count", without_first)
             counted = type(count) is int and type(fewer) is int
             lacking = messages[0] if counted and count <= fewer else None
@@ -89,9 +89,9 @@ class PromptCheck:
                 f"asked; start the server with the template that the model was trained with{way}"
             )
 
-    async def _field(self, base: str, path: str, field: str, asked: dict[str, Any]) -> Any:
+    async def _field(self, base: str, path: str, field: str, fields: dict[str, Any]) -> Any:
         """Return a field of what a server says of messages; None if it does not say."""
         keys = ("model", "messages", "chat_template_kwargs")
-        content = json.dumps({key: asked[key] for key in keys if key in asked}).encode()
+        content = json.dumps({key: fields[key] for key in keys if key in fields}).encode()
         reply = await self._client.get(base, base.removesuffix("/v1") + path, content)
         return reply.payload.get(field) if isinstance(reply.payload, dict) else None

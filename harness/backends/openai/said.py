@@ -40,17 +40,17 @@ def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
                 f"the answer's content has a part that is no text but {printable(kind, 40)}"
             )
         texts[field] = texts.get(field, "") + _text(part, kind)
-    stated = {name: value for name, value in message.items() if value and name != "content"}
-    return {**message, **texts, **stated}
+    other_fields = {name: value for name, value in message.items() if value and name != "content"}
+    return {**message, **texts, **other_fields}
 
 
 def _text(part: Mapping[str, Any], kind: str) -> str:
     """Return the text of a part, which a thought may have in parts of its own."""
     value = part.get(kind, part.get("text"))
     inner = value if isinstance(value, list) else [value]
-    stated = [each.get("text") if isinstance(each, dict) else each for each in inner]
-    texts = [text for text in stated if isinstance(text, str)]
-    if len(texts) < len(stated):
+    values = [each.get("text") if isinstance(each, dict) else each for each in inner]
+    texts = [text for text in values if isinstance(text, str)]
+    if len(texts) < len(values):
         raise NoText(f"the answer's content has a part of type {kind} without a text")
     return "".join(texts)
 

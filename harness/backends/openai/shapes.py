@@ -139,7 +139,7 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
 
 
 def _with_thought(
-    thought: str | None, content: str, finish_reason: FinishReason, asked: bool
+    thought: str | None, content: str, finish_reason: FinishReason, is_thinking: bool
 ) -> str:
     """Restore the text as the model wrote it, if the server took out the thought:
     the parser looks for it.
@@ -147,7 +147,7 @@ def _with_thought(
     An answer that was cut off with nothing after the thought was cut off inside it,
     so it stays open.
     """
-    if not thought and not (asked and thought is not None):
+    if not thought and not (is_thinking and thought is not None):
         return content
     if finish_reason == "length" and not content.strip():
         return f"<think>\n{thought}"

@@ -78,7 +78,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     _check_config(card, where)
-    shown = f"{card.shown} in {where}"
+    subject = f"{card.shown} in {where}"
     # trust_remote_code=False: otherwise a checkpoint with its own code asks at the terminal.
     options = {"local_files_only": True, "trust_remote_code": False}
     try:
@@ -90,7 +90,7 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
                 where, dtype=dtype, output_loading_info=True, use_safetensors=True, **options
             )
     except Exception as error:  # a broken file surfaces as any of a dozen exception types
-        raise UserError(f"{shown} does not load: {one_line(error)}; {fetching(card)}") from error
+        raise UserError(f"{subject} does not load: {one_line(error)}; {fetching(card)}") from error
     try:
         model = model.to(device).eval()
     except RuntimeError as error:
@@ -98,18 +98,18 @@ def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]
         raise UserError(f"{fault}; give another device or dtype") from error
     if absent := sorted(report["missing_keys"]):  # transformers fills them with random numbers
         fault = f"lacks {len(absent)} of its weights ({printable(absent[0])})"
-        raise UserError(f"{shown} {fault}; {fetching(card)}")
+        raise UserError(f"{subject} {fault}; {fetching(card)}")
     merge(card, model)
     rows = model.get_input_embeddings().num_embeddings
     if len(tokenizer) > rows:
         raise UserError(
-            f"{shown}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give "
+            f"{subject}: its tokenizer has {len(tokenizer)} tokens and the model only {rows}; give "
             "both from one checkpoint"
         )
     if not tokenizer.chat_template:
         raise UserError(
-            f"{shown} has no chat template; use its instruct version, or put a chat_template.jinja "
-            "beside its config.json"
+            f"{subject} has no chat template; use its instruct version, or put a "
+            "chat_template.jinja beside its config.json"
         )
     return tokenizer, model
 
@@ -121,7 +121,7 @@ def _check_config(card: Card, where: Path) -> None:
     Where the package `kernels` is installed, transformers fetches that repository and runs its
     code. It makes the layers before it looks at the weights.
     """
-    shown = f"{card.shown} in {printable(where)}"
+    subject = f"{card.shown} in {printable(where)}"
     try:
         rest: list[Any] = [json.loads(text_of(where / "config.json", "record"))]
     except (OSError, ValueError, RecursionError):
@@ -135,33 +135,33 @@ def _check_config(card: Card, where: Path) -> None:
             for key in ("attn_implementation", "_attn_implementation"):
                 if "/" in str(value.get(key, "")):
                     raise UserError(
-                        f"{shown}: {key} in its config.json "
+                        f"{subject}: {key} in its config.json "
                         "names code of the hub, which is never run; take it out of the file"
                     )
-            for key, stated in value.items():
+            for key, count in value.items():
                 is_count = any(word in key for word in ("layer", "depth", "expert"))
-                if is_count and isinstance(stated, int) and stated > MOST_LAYERS:
+                if is_count and isinstance(count, int) and count > MOST_LAYERS:
                     raise UserError(
-                        f"{shown}: {printable(key)} in its config.json is {printable(stated)}, and "
-                        f"at most {MOST_LAYERS}; {fetching(card)}"
+                        f"{subject}: {printable(key)} in its config.json is {printable(count)}, "
+                        f"and at most {MOST_LAYERS}; {fetching(card)}"
                     )
 
 
-def choose_device(asked: str | None) -> str:
+def choose_device(device: str | None) -> str:
     """Return the torch device that a user names; for None CUDA if there is any, else CPU.
 
     Raises UserError if this machine does not have it.
     """
     import torch
 
-    if asked is None:
+    if device is None:
         return "cuda" if torch.cuda.is_available() else "cpu"
-    known = ["cpu"]
+    devices = ["cpu"]
     if torch.cuda.is_available():
-        known += ["cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    if asked not in known:
-        raise UserError(f"device {printable(asked)!r}; this machine has: {', '.join(known)}")
-    return asked
+        devices += ["cuda", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if device not in devices:
+        raise UserError(f"device {printable(device)!r}; this machine has: {', '.join(devices)}")
+    return device
 
 
 def gpus() -> list[str]:

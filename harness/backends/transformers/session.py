@@ -125,12 +125,12 @@ class Reader:
         """
         shared = common_beginning(beginnings)
         prefix = self._prefixes.longest(shared)
-        known = len(prefix.ids)
-        if len(beginnings) > 1 and len(shared) - known >= LEAST_TOKENS:
+        n_known = len(prefix.ids)
+        if len(beginnings) > 1 and len(shared) - n_known >= LEAST_TOKENS:
             prefix = Prefix(
                 shared, Rows.read(self, prefix, [shared], self.positions([shared])).layers()
             )
-            if 2 * known < len(shared):
+            if 2 * n_known < len(shared):
                 self._prefixes.keep(prefix)
         return prefix
 
@@ -211,11 +211,11 @@ class Rows:
 
         `places` has the positions of each prompt's tokens; None if they are consecutive.
         """
-        n, known, cache = len(prompts), len(prefix.ids), reader.cache()
+        n, n_known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
             cache.update(keys.expand(n, -1, -1, -1), values.expand(n, -1, -1, -1), i)
-        rows = cls(reader, cache, torch.ones(n, known, dtype=torch.long), None, places)
-        rows.advance([prompt[known:] for prompt in prompts])
+        rows = cls(reader, cache, torch.ones(n, n_known, dtype=torch.long), None, places)
+        rows.advance([prompt[n_known:] for prompt in prompts])
         return rows
 
     @classmethod
@@ -257,20 +257,20 @@ class Rows:
         n, count = len(chunks), len(chunks[0])
         width = max(len(chunk) for each in chunks for chunk in each)
         ids = torch.zeros(n, count, width, dtype=torch.long)
-        own = torch.zeros(n, count, width, dtype=torch.bool)
+        is_token = torch.zeros(n, count, width, dtype=torch.bool)
         for row, each in enumerate(chunks):
             for i, chunk in enumerate(each):
                 ids[row, i, width - len(chunk) :] = torch.tensor(chunk)
-                own[row, i, width - len(chunk) :] = True
+                is_token[row, i, width - len(chunk) :] = True
         same = torch.eye(count, dtype=torch.bool)[:, None, :, None]
         earlier = torch.ones(width, width, dtype=torch.bool).tril()[:, None]
-        among = (same & earlier & own[:, None, None]).reshape(n, count * width, count * width)
+        among = (same & earlier & is_token[:, None, None]).reshape(n, count * width, count * width)
         before = self._mask.bool()[:, None].expand(-1, count * width, -1)
         if self._places is None:
             starts = self._mask.sum(-1)
         else:  # after the prompt, positions are consecutive
             starts = torch.stack([place.max() + 1 for place in self._places])
-        places = (starts[:, None, None] + (own.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
+        places = (starts[:, None, None] + (is_token.cumsum(-1) - 1).clamp(min=0)).reshape(n, -1)
         if self._places is not None:
             places = places.expand(3, -1, -1)
         mask = torch.cat([before, among], dim=-1)[:, None]
@@ -294,8 +294,8 @@ class Rows:
         both = [[*chunk, *guess] for chunk, guess in zip(chunks, guesses, strict=True)]
         logits = self._append(both, 1 + widest)
         counts = []
-        for guess, own in zip(guesses, logits.argmax(-1).tolist(), strict=True):
-            likeliest = zip(guess, own[widest - len(guess) :], strict=False)
+        for guess, choices in zip(guesses, logits.argmax(-1).tolist(), strict=True):
+            likeliest = zip(guess, choices[widest - len(guess) :], strict=False)
             counts.append(next((i for i, (a, b) in enumerate(likeliest) if a != b), len(guess)))
         wrong = [len(guess) - count for guess, count in zip(guesses, counts, strict=True)]
         for row, tokens in enumerate(wrong):

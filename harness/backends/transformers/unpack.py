@@ -35,7 +35,7 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
 
     made_by = [__version__, BUILT_IN["transformers"].answers]
     to = kept.folder() / "checkpoints" / digest([sha256_file(file), *made_by])[:16]
-    shown = f"{card.shown} in {printable(file)}"
+    subject = f"{card.shown} in {printable(file)}"
     try:
         to.parent.mkdir(parents=True, exist_ok=True)
         with alone(to.with_name(f".{to.name}.lock"), _PATIENCE_S):
@@ -43,19 +43,19 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
                 part = to.with_name(f".{to.name}.part")
                 shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
                 try:
-                    _unpack(file, part, shown)
+                    _unpack(file, part, subject)
                     os.replace(part, to)
                 finally:
                     shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
         raise UserError(
-            f"{shown}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a "
+            f"{subject}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a "
             f"weight in {printable(to.parent)}; SWARMDRIVE_CACHE names another folder"
         ) from None
     return to
 
 
-def _unpack(file: Path, to: Path, shown: str) -> None:
+def _unpack(file: Path, to: Path, subject: str) -> None:
     import torch
     import transformers
 
@@ -63,10 +63,12 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
         values = read_metadata(file, arrays=True)
     except ValueError as error:
         raise UserError(
-            f"{shown} does not load: {error}; copy or download the file again"
+            f"{subject} does not load: {error}; copy or download the file again"
         ) from None
     if not isinstance(values.get("tokenizer.chat_template"), str):
-        raise UserError(f"{shown} has no chat template; give the GGUF file of its instruct version")
+        raise UserError(
+            f"{subject} has no chat template; give the GGUF file of its instruct version"
+        )
     loaded = tokenizer(file)
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
@@ -82,12 +84,12 @@ def _unpack(file: Path, to: Path, shown: str) -> None:
         # the disk, and not transformers' words
         if isinstance(error, OSError) and error.errno is not None:
             raise
-        fault = f"{shown} does not load with transformers: {one_line(error)}"
+        fault = f"{subject} does not load with transformers: {one_line(error)}"
         raise UserError(f"{fault}; run it on llama-cpp") from error
     if report["missing_keys"]:
         absent = sorted(report["missing_keys"])
         raise UserError(
-            f"{shown} lacks {len(absent)} of its weights ({printable(absent[0])}); download the "
+            f"{subject} lacks {len(absent)} of its weights ({printable(absent[0])}); download the "
             "file again, or run it on llama-cpp"
         )
     model.hf_quantizer = None
