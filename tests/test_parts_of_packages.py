@@ -17,7 +17,7 @@ from harness.coordination.parts_of_packages import (
     change_by,
     obstacle,
     prepared,
-    shown,
+    shown_graph,
     sources,
 )
 from harness.coordination.sent import SentIntents
@@ -228,8 +228,8 @@ def test_what_a_part_asks_helpers_is_a_graph_of_the_helpers(small: Dataset) -> N
     scene: Scene = small.scenes(small.courses())[0]
     graph = scene.graphs[scene.viewers[1]]
     with pytest.raises(UserError, match=r"^part mine of .* no graph of the helper's"):
-        shown(question, graph)
-    assert shown(PLAIN, graph) is graph
+        shown_graph(question, graph)
+    assert shown_graph(PLAIN, graph) is graph
 
 
 def test_an_obstacle_is_one_line_or_none() -> None:

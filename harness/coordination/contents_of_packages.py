@@ -122,25 +122,26 @@ def words(call: Call, evidence: str) -> str:
     if is_ours(call):
         return call.words(evidence)
     with worded(_content(call.name)):
-        said = call.words(evidence)
-        if not isinstance(said, str):
-            raise ValueError(f"words of type {type(said).__name__}")
-        if len(line := _line(said)) > MOST_CHARACTERS:
+        text = call.words(evidence)
+        if not isinstance(text, str):
+            raise ValueError(f"words of type {type(text).__name__}")
+        if len(line := _line(text)) > MOST_CHARACTERS:
             raise ValueError(f"words of {len(line)} characters, more than {MOST_CHARACTERS}")
         line.encode()  # which no lone surrogate lets itself be
         return line
 
 
-def graph_like(given: object, own: SceneGraph, whose: str) -> SceneGraph:
+def graph_like(given: object, own_graph: SceneGraph, whose: str) -> SceneGraph:
     """Return a graph that a package gave as one that a file may have.
 
-    Raises ValueError or TypeError unless it is of the same viewer, role, step and ego as its `own`.
+    Raises ValueError or TypeError unless it is of the same viewer, role, step and ego as
+    `own_graph`, the graph of that vehicle here.
     """
     if not isinstance(given, SceneGraph):
         raise TypeError(f"it returns what is no graph of {whose}")
     graph = json.decode(json.encode(given), type=SceneGraph)
     for name in ("viewer", "role", "step", "ego"):
-        if getattr(graph, name) != getattr(own, name):
+        if getattr(graph, name) != getattr(own_graph, name):
             raise ValueError(f"it returns what is no graph of {whose}, whose {name} is another")
     return graph
 

@@ -108,38 +108,40 @@ class Exchange:
     @cached_property
     def observed_loss(self) -> Floats:
         """Share of asked helpers whose reply did not arrive, `(...)`; NaN if nobody was asked."""
-        asked = count_of(self.asked)
-        return np.where(asked > 0, self.lost / np.maximum(asked, 1), np.nan)
+        n_asked = count_of(self.asked)
+        return np.where(n_asked > 0, self.lost / np.maximum(n_asked, 1), np.nan)
 
 
 def exchange(
-    point: OperatingPoint, intents: Intents, draws: Draws, asked: Bools | None = None
+    point: OperatingPoint, intents: Intents, draws: Draws, asked_helpers: Bools | None = None
 ) -> Exchange:
     """Play schedule and radio channel for decisions `(...)` with up to H helpers; nothing is fused.
 
-    The point's schedule chooses whom the ego asks, unless `asked`, `(..., H)`, is given: then it
-    asks these of the helpers in the radius. An unknown inference time counts as 0 s. Raises
+    The point's schedule chooses whom the ego asks, unless `asked_helpers`, `(..., H)`, is given:
+    then it asks these of the helpers in the radius. An unknown inference time counts as 0 s. Raises
     UserError if the point needs what `intents` or `draws` lack, or if a package's plug-in fails.
     """
-    own_failed, known = _base_knowledge(point, intents)
-    in_radius = known.may_ask
+    own_failed, inputs = _base_knowledge(point, intents)
+    in_radius = inputs.may_ask
     if point.radio.profile is None:
-        asked = np.zeros_like(in_radius)
-    elif asked is None:
-        asked = _chosen(point, known, intents, draws)
+        asked_helpers = np.zeros_like(in_radius)
+    elif asked_helpers is None:
+        asked_helpers = _chosen(point, inputs, intents, draws)
     else:
-        asked = asked & in_radius
-    request_s, outcome, waits_until_s = _ask_helpers(point, intents, asked, in_radius, draws)
+        asked_helpers = asked_helpers & in_radius
+    request_s, outcome, waits_until_s = _ask_helpers(
+        point, intents, asked_helpers, in_radius, draws
+    )
     delivered = outcome.up if intents.silent is None else outcome.up & ~intents.silent
     loss, arrival_s = outcome.loss, np.where(delivered, request_s + outcome.end_s, np.inf)
     one_loss = loss.shape[-1] == 1
     # else they infer before they are asked
     in_turn = point.radio.profile is None or point.ask.on_demand
     return Exchange(
-        own=known.own,
+        own=inputs.own,
         own_failed=own_failed,
-        entropy_nats=known.entropy_nats,
-        triggered=any_of(asked),
+        entropy_nats=inputs.entropy_nats,
+        triggered=any_of(asked_helpers),
         asked=outcome.asked,
         infers=point.content.asks_helpers
         & (outcome.asked if in_turn else intents.range_m <= point.ask.radius_m),
@@ -172,33 +174,37 @@ def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
         return nobody
     if point.needs_all:
         return nobody | np.isfinite(intents.range_m)
-    known = _base_knowledge(point, intents)[1]
+    inputs = _base_knowledge(point, intents)[1]
     if getattr(SCHEDULES[point.ask.schedule], "by_presence", True):
-        return known.may_ask
-    asked = _chosen(point, known, intents, draws)
+        return inputs.may_ask
+    asked_helpers = _chosen(point, inputs, intents, draws)
     coupled = getattr(point.channel, "density_coupled", point.physical is None)
     return (
-        any_of(asked)[..., None] & known.may_ask if coupled or point.radio.helper_rounds else asked
+        any_of(asked_helpers)[..., None] & inputs.may_ask
+        if coupled or point.radio.helper_rounds
+        else asked_helpers
     )
 
 
-def _chosen(point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
+def _chosen(point: OperatingPoint, inputs: ScheduleInputs, intents: Intents, draws: Draws) -> Bools:
     """Return who is asked by the point's schedule, `(..., H)`."""
-    worth = _worth(point, _with_schedule_needs(point, known, intents, draws))
+    worth = _worth(point, _with_schedule_needs(point, inputs, intents, draws))
     name = point.ask.schedule
     with worded(f"schedule {name}", built_in=SCHEDULES.is_ours(name)):
-        return chosen(worth, point.ask.above, known.may_ask, intents.range_m, point.ask.max_helpers)
+        return chosen(
+            worth, point.ask.above, inputs.may_ask, intents.range_m, point.ask.max_helpers
+        )
 
 
 def _ask_helpers(
-    point: OperatingPoint, intents: Intents, asked: Bools, in_radius: Bools, draws: Draws
+    point: OperatingPoint, intents: Intents, asked_helpers: Bools, in_radius: Bools, draws: Draws
 ) -> tuple[Floats, Consulted, Floats]:
     """Return when the ego asks, `(..., 1)`, the outcome,
     and until when it waits at most, `(...)`.
     """
     intends = point.radio.helper_rounds and INTENTS in point.content.holds
     opens_round = (
-        triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked)
+        triggered(intents.helpers, point.ask.tau_nats) if intends else np.zeros_like(asked_helpers)
     )
     inference_s = np.nan_to_num(inferred_s(point, intents, draws))
     request_s, helpers_s = inference_s[..., :1], inference_s[..., 1:]
@@ -209,7 +215,7 @@ def _ask_helpers(
         return np.maximum(helpers_s - request_s, has_request_s)
 
     links = Links(
-        asked,
+        asked_helpers,
         ready(0.0),
         intents.range_m,
         intents.payload_bits,
@@ -244,14 +250,14 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     return _worth(point, known_of(point, intents, draws))
 
 
-def _worth(point: OperatingPoint, known: ScheduleInputs) -> Floats:
-    name, shape = point.ask.schedule, known.may_ask.shape
+def _worth(point: OperatingPoint, inputs: ScheduleInputs) -> Floats:
+    name, shape = point.ask.schedule, inputs.may_ask.shape
     if SCHEDULES.is_ours(name):
-        return SCHEDULES[name].worth(known)
+        return SCHEDULES[name].worth(inputs)
     with worded(f"schedule {name}"):
-        worth = SCHEDULES[name].worth(read_only(known))
+        worth = SCHEDULES[name].worth(read_only(inputs))
         worth = numbers("worths", worth, shape, (*shape[:-1], 1))
-        if np.any(np.isnan(worth) & known.may_ask):
+        if np.any(np.isnan(worth) & inputs.may_ask):
             raise ValueError("a worth that is NaN for a helper that may be asked")
     return worth
 
@@ -270,23 +276,23 @@ def _base_knowledge(point: OperatingPoint, intents: Intents) -> tuple[Bools, Sch
     failed, n_actions = any_of(np.isnan(intents.own)), intents.own.shape[-1]
     braking = point.fusion.fallback == "brake"
     fallback = np.eye(n_actions)[0] if braking else np.full(n_actions, 1.0 / n_actions)
-    own = np.where(failed[..., None], fallback, intents.own)
+    ego_intent = np.where(failed[..., None], fallback, intents.own)
     in_radius = intents.valid & (intents.range_m <= point.ask.radius_m)
     return failed, ScheduleInputs(
-        own, entropy_nats(own), in_radius, intents.range_m, intents.distance_m
+        ego_intent, entropy_nats(ego_intent), in_radius, intents.range_m, intents.distance_m
     )
 
 
 def _with_schedule_needs(
-    point: OperatingPoint, known: ScheduleInputs, intents: Intents, draws: Draws
+    point: OperatingPoint, inputs: ScheduleInputs, intents: Intents, draws: Draws
 ) -> ScheduleInputs:
     if (point.needs("outlook") and intents.outlook is None) or (
         point.needs("lot") and draws.trips is None
     ):
         raise UserError(NO_SCENE.format(printable(point.ask.schedule)))
     return replace(
-        known,
-        in_time=_in_time(point, intents, known.may_ask, draws) if point.needs("in_time") else None,
+        inputs,
+        in_time=_in_time(point, intents, inputs.may_ask, draws) if point.needs("in_time") else None,
         outlook=intents.outlook if point.needs("outlook") else None,
         lot=draws.of(".lot").wait if point.needs("lot") else None,
     )

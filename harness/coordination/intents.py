@@ -99,9 +99,9 @@ class Intents:
 
         A helper whose model was not asked yet stays valid.
         """
-        said = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
+        text_bytes = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
         unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
-        return replace(self, valid=self.valid & ((said > 0) | unasked))
+        return replace(self, valid=self.valid & ((text_bytes > 0) | unasked))
 
     def planned(self, senders: Ints) -> "Intents":
         """Return the intents of n agents, each with the plans of the H agents that it hears.

@@ -159,9 +159,9 @@ def question_under(settings: Mapping[str, Any]) -> Question:
     Settings that belong to no installed part are ignored.
     """
     for kind in more_parts().values():
-        own = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
-        if kind.questions and own:
-            return kind(**own).question
+        part_settings = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
+        if kind.questions and part_settings:
+            return kind(**part_settings).question
     return PLAIN
 
 
@@ -327,11 +327,11 @@ class OperatingPoint:
             }
         except ValueError as error:
             raise _error_of(name, error) from None
-        own: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
+        core_parts: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
         changed_kinds = {type(part) for part in parts.values()}
         others = [part for part in self.more if type(part) not in changed_kinds]
         more = (*others, *(parts[part] for part in more_parts() if part in parts))
-        return replace(self, name=name, more=more, **own)
+        return replace(self, name=name, more=more, **core_parts)
 
     @cached_property
     def channel(self) -> Channel:
@@ -360,9 +360,9 @@ class OperatingPoint:
         further: Mapping[str, str] = pairs(radio.further) if radio.further else {}
         if further:
             channel = changed(channel, further, f"channel profile {radio.profile}")
-        known = vars(channel) if isinstance(channel, Physical) else {}
-        if radio.encoding != JSON and "packet_bytes" in known and "packet_bytes" not in further:
-            overrides["packet_bytes"] = beacon_bytes(radio.encoding, known["rate_hz"])
+        values = vars(channel) if isinstance(channel, Physical) else {}
+        if radio.encoding != JSON and "packet_bytes" in values and "packet_bytes" not in further:
+            overrides["packet_bytes"] = beacon_bytes(radio.encoding, values["rate_hz"])
         channel = replace(channel, **overrides)
         if isinstance(channel, Physical):
             channel = channel if loss is None else AtLoss(channel, loss)
@@ -683,10 +683,10 @@ def _lacks(setting: str, value: object, gone: OfExtension) -> str:
 
 def _may_read(consensus: str, content: Content) -> bool:
     """Return whether a rule fuses what a content holds, or what the ego answers to it."""
-    told = content.holds
+    kinds = content.holds
     if content.call and consensus != EGO_PROMPT:
-        told = told | {INTENTS}
-    return not told.isdisjoint(reads(consensus))
+        kinds = kinds | {INTENTS}
+    return not kinds.isdisjoint(reads(consensus))
 
 
 def _any_of(names: Iterable[str]) -> str:

@@ -64,9 +64,9 @@ def prepared(part: Part, intents: Intents) -> Intents:
         for name in before.keys() - {"own", "helpers"}:
             if not np.array_equal(before[name], after[name], equal_nan=True):
                 raise ValueError(f"it changes {name}, which nobody intends")
-        own = _distributions("the ego's intents", after["own"], intents.own)
+        ego_intents = _distributions("the ego's intents", after["own"], intents.own)
         helpers = _distributions("helpers' intents", after["helpers"], intents.helpers)
-        return replace(intents, own=own, helpers=helpers)
+        return replace(intents, own=ego_intents, helpers=helpers)
 
 
 @dataclass(frozen=True)
@@ -144,17 +144,17 @@ class ChangeOfPart:
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         with worded(self.what):
-            own: dict[str, Any] = json.decode(json.encode(message))
+            plain_message: dict[str, Any] = json.decode(json.encode(message))
             changed: dict[str, Any] = json.decode(
-                json.encode(self.change.message(copy.deepcopy(own), actions))
+                json.encode(self.change.message(copy.deepcopy(plain_message), actions))
             )
-            if changed.keys() != own.keys():
+            if changed.keys() != plain_message.keys():
                 raise ValueError("it adds members to a message, or leaves some out")
             for name, value in changed.items():
-                kinds = (str, type(None)) if name == "evidence" else (type(own[name]),)
+                kinds = (str, type(None)) if name == "evidence" else (type(plain_message[name]),)
                 if type(value) not in kinds:
                     raise TypeError(f"it gives {name} of type {type(value).__name__}")
-            if changed["intent"] != own["intent"]:
+            if changed["intent"] != plain_message["intent"]:
                 intent = numbers("an intent", np.array(changed["intent"], float), (len(actions),))
                 check_distributions("an intent", intent, np.array(True))
             return changed
@@ -175,7 +175,7 @@ def change_by(kind: type[Part], text: str) -> Change | None:
     return None if change is None else ChangeOfPart(what, change)
 
 
-def shown(question: Question, graph: SceneGraph) -> SceneGraph:
+def shown_graph(question: Question, graph: SceneGraph) -> SceneGraph:
     """Return the scene graph that a question shows of a helper's own."""
     for kind, what in PACKAGES_PARTS.items():
         if question in kind.questions:

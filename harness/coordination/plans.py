@@ -55,8 +55,10 @@ class Plans:
         plan.
         """
 
-        def heard(own: Any, unknown: float) -> Any:
-            return np.concatenate([own, np.where(senders >= 0, own[senders, 0], unknown)], axis=1)
+        def heard(values: Any, unknown: float) -> Any:
+            return np.concatenate(
+                [values, np.where(senders >= 0, values[senders, 0], unknown)], axis=1
+            )
 
         return Plans(
             senders,

@@ -98,14 +98,14 @@ class Formula:
         return self.formula(known)
 
 
-def never(known: ScheduleInputs) -> Floats:
+def never(inputs: ScheduleInputs) -> Floats:
     """Return a worth of minus infinity, `(..., 1)`, so that nobody is ever asked."""
-    return np.full((*known.entropy_nats.shape, 1), -np.inf)
+    return np.full((*inputs.entropy_nats.shape, 1), -np.inf)
 
 
-def entropy(known: ScheduleInputs) -> Floats:
+def entropy(inputs: ScheduleInputs) -> Floats:
     """Return the entropy of the ego's intent in nats, `(..., 1)`, as the worth (paper Eq. 3)."""
-    return known.entropy_nats[..., None]
+    return inputs.entropy_nats[..., None]
 
 
 NEVER = "never"
@@ -120,9 +120,9 @@ def chosen(worth: Floats, threshold: float, may_ask: Bools, range_m: Floats, mos
     Those worth the most come first, and of equals the nearest. `worth` is `(..., H)` or `(..., 1)`;
     `may_ask` and `range_m`, the distance to the ego in m, are `(..., H)`.
     """
-    asked = may_ask & (worth > threshold)
-    if most >= asked.shape[-1]:
-        return asked
-    by_range = np.where(asked, range_m, np.inf)
-    order = np.lexsort((by_range, -np.where(asked, worth, -np.inf)), axis=-1)
-    return asked & (np.argsort(order, axis=-1, kind="stable") < most)
+    is_asked = may_ask & (worth > threshold)
+    if most >= is_asked.shape[-1]:
+        return is_asked
+    by_range = np.where(is_asked, range_m, np.inf)
+    order = np.lexsort((by_range, -np.where(is_asked, worth, -np.inf)), axis=-1)
+    return is_asked & (np.argsort(order, axis=-1, kind="stable") < most)

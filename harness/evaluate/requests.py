@@ -11,7 +11,7 @@ from harness.backends.base import Request
 from harness.backends.base import Role as AskedRole
 from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN, Question
-from harness.coordination.parts_of_packages import shown
+from harness.coordination.parts_of_packages import shown_graph
 from harness.core.arrays import Bools, Ints
 from harness.dataset.load import Scene
 from harness.evaluate.fusion import heard_in, key_of, messages_of
@@ -52,7 +52,10 @@ def requests(
                 asked_places is not None and place not in asked_places
             ):
                 continue
-            graph, index = shown(question, scene.graphs[viewer]), spec.agent(scene.place(place))
+            graph, index = (
+                shown_graph(question, scene.graphs[viewer]),
+                spec.agent(scene.place(place)),
+            )
             agent = agents[index]
             image = picture(spec, index, scene, viewer, question.pictured) if sees else None
             yield blank(index, graph.role).alike(

@@ -7,7 +7,7 @@ from msgspec import structs
 
 from harness.coordination.contents_of_packages import graphs as graphs_heard
 from harness.coordination.operating_point import change_of, questions
-from harness.coordination.parts_of_packages import shown
+from harness.coordination.parts_of_packages import shown_graph
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
@@ -68,7 +68,7 @@ def _without_ego(graph: SceneGraph) -> SceneGraph:
 def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
     sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
-    graph = shown(questions()[question], scene.graphs[sender])
+    graph = shown_graph(questions()[question], scene.graphs[sender])
     changes = [change_of(change) for change in marks_of(key).changes]
     for change in sorted(changes, key=lambda change: change.adds):
         graph = change.graph(graph, scenario, scene)
@@ -90,7 +90,7 @@ def as_asked(
     if answer.question:
         question = questions()[answer.question]
         return scene.changed(
-            graphs={viewer: shown(question, graph) for viewer, graph in scene.graphs.items()}
+            graphs={viewer: shown_graph(question, graph) for viewer, graph in scene.graphs.items()}
         )
     try:
         [graph] = shared_graphs(
