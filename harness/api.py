@@ -76,8 +76,8 @@ class Run(Tables):
         from harness.report.findings import Kind, findings
 
         def cell(score: Score) -> str:
-            shown = words.shown(score)
-            return shown["value"] + (f" [{shown['interval']}]" if shown["interval"] else "")
+            texts = words.shown(score)
+            return texts["value"] + (f" [{texts['interval']}]" if texts["interval"] else "")
 
         import pandas as pd
 
@@ -267,13 +267,13 @@ def run(
         name: _several(value) if names[kind][name].kind == list[str] else value
         for name, value in options.items()
     }
-    stated = settings.changed(settings.Settings(world=kind()), given)
+    run_settings = settings.changed(settings.Settings(world=kind()), given)
     source: Source
-    if isinstance(stated.world, settings.FrozenSettings):
-        source = resolve.frozen(stated.world, stated.world.dataset)
+    if isinstance(run_settings.world, settings.FrozenSettings):
+        source = resolve.frozen(run_settings.world, run_settings.world.dataset)
     else:
-        source = resolve.driven(stated.world)
-    spec = resolve.spec(stated, source)
+        source = resolve.driven(run_settings.world)
+    spec = resolve.spec(run_settings, source)
     folder = default_out(spec) if out is None else Path(out)
     trackers, kept = hooks.chosen(_several(tracker)), default_file() if cache else None
     with costs.budget(max_cost, [spec]) as limit:
